@@ -22,10 +22,8 @@ LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), Layout.V4
 STANDIN = Path(__file__).resolve().parent / "benchmarks"
 
 CANTOOLS = {"cantools", "argparse_addons", "bitstruct", "textparser", "crccheck", "diskcache"}
-PYTHON_CAN = {"can", "wrapt", "typing_extensions", "packaging"}
 ALWAYS = {"kontronik_can_gw", "serial"}
 """Libraries that every gateway may have."""
-CANOPEN = {"canopen"} | PYTHON_CAN
 OWN = {
     "cli": {"run", "common", "arguments", "recording"},
     "desk": set[str](),
@@ -62,11 +60,11 @@ CONFIGURATIONS = {
     "DBC": ("", CANTOOLS),
     "CANopen only": (
         '[dbc]\nenabled = false\n[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\nself_start = true\n',
-        CANOPEN,
+        set(),
     ),
     "DBC and CANopen": (
         '[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\n',
-        CANTOOLS | CANOPEN,
+        CANTOOLS,
     ),
     "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS),
     "status": ('[statistics]\nfile = "status.json"\n', CANTOOLS),
@@ -172,8 +170,7 @@ def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Pa
     assert [name for name in NEVER if name in modules] == []
     for key, own in ONLY_WITH.items():
         assert [module for module in own if (module in modules) != (key in tables)] == []
-    if not further & PYTHON_CAN:  # SocketCAN needs none of what python-can brings
-        assert modules & {"asyncio", "ssl", "sqlite3", "email"} == set()
+    assert modules & {"asyncio", "ssl", "sqlite3", "email"} == set()
 
 
 def test_the_list_can_fail(tmp_path: Path) -> None:

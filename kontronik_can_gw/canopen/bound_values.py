@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.data_types import BOOLEAN, FLOATS, SIGNED
-from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable, range_of
+from kontronik_can_gw.canopen.data_types import FLOATS, SIGNED, TYPE_BITS, range_of
+from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
 from kontronik_can_gw.esc.decoder import EscProtocol
@@ -33,13 +33,6 @@ _EVENT_OF_PACE = {
 _MAX_PDOS = 256  # kept; masters can write any
 
 
-class Mapped(NamedTuple):
-    """One object in a PDO. ``bound`` None: it shows no value of ESC or gateway."""
-
-    variable: Variable
-    bound: Bound | None
-
-
 @dataclass(frozen=True, slots=True)
 class CompiledPdo:
     """How a PDO is filled and what causes it."""
@@ -58,7 +51,7 @@ class CompiledPdo:
 
 def bits_of(variable: Variable) -> int:
     """Length of a variable in a PDO; 0 where it has no fixed one."""
-    return 1 if variable.entry.data_type == BOOLEAN else 8 * (variable.size or 0)
+    return TYPE_BITS.get(variable.entry.data_type, 0)
 
 
 def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatus) -> None:
@@ -66,51 +59,48 @@ def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatu
     for (index, sub), bound in bindings_of(esc.protocol).items():
         variable = dictionary.get(index, sub)
         if variable is not None:
-            low, high = range_of(variable)
-            variable.read = partial(_read, bound, low, high, dictionary, esc, gateway)
+            variable.bound = bound
+            variable.read = partial(_read, bound, variable.entry, dictionary, esc, gateway)
 
 
-def compile_pdo(mapped: Sequence[Mapped], protocol: EscProtocol) -> CompiledPdo:
+def compile_pdo(mapped: Sequence[Variable], protocol: EscProtocol) -> CompiledPdo:
     """The packer of a PDO with these objects."""
-    if all(entry.bound is not None for entry in mapped):
-        return _shared_pdo(tuple(entry.variable.entry for entry in mapped), protocol)
+    if all(variable.bound is not None for variable in mapped):
+        return _shared_pdo(tuple(variable.entry for variable in mapped), protocol)
     return _compile(mapped)
 
 
 @lru_cache(_MAX_PDOS)
 def _shared_pdo(entries: tuple[Entry, ...], protocol: EscProtocol) -> CompiledPdo:
     """Of values only: the same for all nodes."""
-    bindings = bindings_of(protocol)
-    return _compile([Mapped(Variable(e), bindings[e.index, e.sub]) for e in entries])
+    variables = [Variable(entry) for entry in entries]
+    for variable in variables:
+        variable.bound = bindings_of(protocol)[variable.entry.index, variable.entry.sub]
+    return _compile(variables)
 
 
 def _read(
     bound: Bound,
-    low: int,
-    high: int,
+    entry: Entry,
     dictionary: Dictionary,
     esc: EscTelemetry,
     gateway: GatewayStatus,
     now: int,
 ) -> Value:
     """The value of an object by SDO. Without one it aborts, or shows what 2100h:5 says."""
+    low, high = range_of(entry.data_type)
     behaviour = dictionary.number(at.SETTINGS, 5)
-    not_available = high if low == 0 else low
     if bound.source.group is Group.LIVE and esc.live is None:
-        if behaviour == _CODES:
-            return not_available
-        if esc.last_live is None:
-            raise SdoAbort(Abort.NO_DATA)
-        if behaviour != _LAST_VALUE:
-            raise SdoAbort(Abort.DEVICE_STATE)
-        value = bound.last(esc, high)
+        value, why = None, Abort.NO_DATA if esc.last_live is None else Abort.DEVICE_STATE
+        if behaviour == _LAST_VALUE and esc.last_live is not None:
+            value, why = bound.last(esc, high), Abort.NO_DATA
     else:
-        value = bound.read(esc, gateway, now, high)
+        value, why = bound.read(esc, gateway, now, high), Abort.NO_DATA
     if value is not None and low <= value <= high:
         return value
     if behaviour == _CODES:
-        return not_available
-    raise SdoAbort(Abort.NO_DATA)
+        return high if low == 0 else low
+    raise SdoAbort(why)
 
 
 def _stored(variable: Variable) -> EscValue:
@@ -127,15 +117,15 @@ def _stored(variable: Variable) -> EscValue:
     return EscValue(variable.entry.name, "", Group.GATEWAY, Kind.GATEWAY, read=read)
 
 
-def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePlan:
+def message_plan(name: str, cob_id: int, mapped: Sequence[Variable]) -> MessagePlan:
     """The plan of a PDO: one object after the other, the lowest bit first."""
     signals = []
     at_bit = 0
-    for entry in mapped:
-        signal = _signal_plan(entry, at_bit)
+    for variable in mapped:
+        signal = _signal_plan(variable, at_bit)
         signals.append(signal)
         at_bit += signal.length
-    sources = [entry.bound.source for entry in mapped if entry.bound is not None]
+    sources = [variable.bound.source for variable in mapped if variable.bound is not None]
     return MessagePlan(
         name=name,
         can_id=cob_id,
@@ -151,9 +141,8 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePla
     )
 
 
-def _signal_plan(mapped: Mapped, at_bit: int) -> SignalPlan:
-    variable, bound = mapped
-    entry = variable.entry
+def _signal_plan(variable: Variable, at_bit: int) -> SignalPlan:
+    entry, bound = variable.entry, variable.bound
     length = bits_of(variable)
     signed = entry.data_type in SIGNED
     source = _stored(variable) if bound is None else bound.source
@@ -176,19 +165,20 @@ def _signal_plan(mapped: Mapped, at_bit: int) -> SignalPlan:
     )
 
 
-def _compile(mapped: Sequence[Mapped]) -> CompiledPdo:
+def _compile(mapped: Sequence[Variable]) -> CompiledPdo:
     plan = message_plan("TPDO", 0, mapped)
     is_live = carries_link = False
     status = []
-    for entry, signal in zip(mapped, plan.signals, strict=True):
-        if entry.bound is None:
-            if entry.variable.read is not None:
+    for variable, signal in zip(mapped, plan.signals, strict=True):
+        bound = variable.bound
+        if bound is None:
+            if variable.read is not None:
                 # of a service: the error register, the error code
                 status.append(signal)
             continue
-        is_live |= entry.bound.source.group is Group.LIVE
-        if entry.bound.status:
-            carries_link |= entry.variable.entry.index == LINK
+        is_live |= bound.source.group is Group.LIVE
+        if bound.status:
+            carries_link |= variable.entry.index == LINK
             status.append(signal)
     triggers = Event.NONE
     for pace in plan.paces:

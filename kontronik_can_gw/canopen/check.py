@@ -5,7 +5,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.canopen.cob_ids import SDO_ANSWER, SDO_REQUEST, default_ids
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, fits, range_of
+from kontronik_can_gw.canopen.data_types import SIGNED, WHOLE, range_of
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.node_settings import NodeSettings, configured_settings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
@@ -18,17 +19,12 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.gateway_status import GatewayStatus
 
-_WHOLE = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15, 0x1B})  # data types
 _UNSIGNED = {
-    **dict.fromkeys(((at.SETTINGS, sub) for sub in range(1, 9)), 1),
-    (at.NODE_ID, 1): 1,
-    (at.NODE_ID, 2): 1,
-    (at.NODE_ID, 3): 4,
-    (at.NODE_ID, 4): 4,
-    (at.RESET_STATISTICS, 1): 4,
-    (at.ERROR_CODE, 0): 2,
+    1: (*((at.SETTINGS, sub) for sub in range(1, 9)), (at.NODE_ID, 1), (at.NODE_ID, 2)),
+    2: ((at.ERROR_CODE, 0),),
+    4: ((at.NODE_ID, 3), (at.NODE_ID, 4), (at.RESET_STATISTICS, 1)),
 }
-"""Objects that services read or write: the bytes they need at least."""
+"""Objects that services read or write, by the bytes they need at least."""
 _SHOWN = (
     *((index, 0) for index in (0x1001, 0x1002, 0x100A, 0x1021, at.ERROR_CODE)),
     *((0x1018, sub) for sub in range(1, 5)),
@@ -49,11 +45,7 @@ def check_eds(
     dictionary = Dictionary(eds)
     problems = [
         f"{eds.name}: {variable.entry.index:04X}h:{variable.entry.sub:02X} {variable.entry.name}: {what}"
-        for variable, what in (
-            *_objects(dictionary),
-            *_store_objects(dictionary),
-            *_settings(dictionary, all_escs),
-        )
+        for variable, what in (*_objects(dictionary), *_settings(dictionary, all_escs))
     ]
     if not problems:
         numbers = list(node_ids) or [1]  # where all wait for LSS any node-ID may come
@@ -66,59 +58,33 @@ def check_eds(
 
 def _objects(dictionary: Dictionary) -> Iterator[tuple[Variable, str]]:
     """Types and access of what telemetry and services show and read."""
-    for (index, sub), binding in BINDINGS.items():
-        variable = dictionary.get(index, sub)
-        if variable is None:
-            continue
-        if variable.entry.data_type not in _WHOLE:
-            yield variable, f"shows {binding.source.name}, so it must be of a whole-number type."
+
+    def there(places: Iterable[tuple[int, int]]) -> Iterator[Variable]:
+        return filter(None, (dictionary.get(*place) for place in places))
+
+    for variable in there(BINDINGS):
+        shown = BINDINGS[variable.entry.index, variable.entry.sub].source.name
+        if variable.entry.data_type not in WHOLE:
+            yield variable, f"shows {shown}, so it must be of a whole-number type."
         elif variable.writable or not variable.readable:
-            yield variable, f"shows {binding.source.name}, so it must be read only (AccessType=ro)."
-    for (index, sub), size in _UNSIGNED.items():
-        variable = dictionary.get(index, sub)
-        if variable is None:
-            continue
-        whole = variable.entry.data_type in _WHOLE
-        if not whole or range_of(variable)[0] < 0 or (variable.size or 0) < size:
-            yield variable, f"must be of an unsigned type of {8 * size} bits or more."
-    for sub in (6, 7):
-        variable = dictionary.get(at.INFO, sub)
-        if variable is not None and variable.size is not None:
+            yield variable, f"shows {shown}, so it must be read only (AccessType=ro)."
+    for size, places in _UNSIGNED.items():
+        for variable in there(places):
+            if variable.entry.data_type not in WHOLE - SIGNED or (variable.size or 0) < size:
+                yield variable, f"must be of an unsigned type of {8 * size} bits or more."
+    for variable in there((at.INFO, sub) for sub in (6, 7)):
+        if variable.size is not None:
             yield variable, "is a text, so it must be a VISIBLE_STRING."
-    for index, sub in _SHOWN:
-        variable = dictionary.get(index, sub)
-        if variable is not None and (variable.writable or not variable.readable):
+    for variable in there(_SHOWN):
+        if variable.writable or not variable.readable:
             yield (
                 variable,
                 "is shown by the node, so it must be read only (AccessType=ro or const).",
             )
     for sub, first in _SERVER.items():
-        variable = dictionary.get(0x1200, sub)
-        if variable is not None and (
-            variable.entry.default != first or not variable.entry.relative
-        ):
-            yield variable, f"must be $NODEID+0x{first:X}: the SDO server has no other."
-
-
-def _settings(
-    dictionary: Dictionary, escs: Sequence[EscSettings]
-) -> Iterator[tuple[Variable, str]]:
-    """Settings of the configuration that their objects cannot hold."""
-    for esc in escs:
-        for sub, value in configured_settings(esc).items():
-            variable = dictionary.get(at.SETTINGS, sub)
-            if variable is None or variable.entry.data_type not in _WHOLE:
-                continue
-            low, high = variable.entry.low, variable.entry.high
-            inside = (low is None or low <= value) and (high is None or value <= high)
-            if not inside or not fits(variable, value, value):
-                yield (
-                    variable,
-                    f"cannot hold {value}, which the configuration says of {esc.name}. Use a larger DataType or limit.",
-                )
-
-
-def _store_objects(dictionary: Dictionary) -> Iterator[tuple[Variable, str]]:
+        for variable in there([(0x1200, sub)]):
+            if variable.entry.default != first or not variable.entry.relative:
+                yield variable, f"must be $NODEID+0x{first:X}: the SDO server has no other."
     for index in (0x1010, 0x1011):
         for variable in dictionary.subs(index):
             if variable.entry.sub > 3:
@@ -128,12 +94,29 @@ def _store_objects(dictionary: Dictionary) -> Iterator[tuple[Variable, str]]:
                 )
 
 
+def _settings(
+    dictionary: Dictionary, escs: Sequence[EscSettings]
+) -> Iterator[tuple[Variable, str]]:
+    """Settings of the configuration that their objects cannot hold."""
+    for esc in escs:
+        for sub, value in configured_settings(esc).items():
+            variable = dictionary.get(at.SETTINGS, sub)
+            if variable is None or variable.entry.data_type not in WHOLE:
+                continue
+            low, high = range_of(variable.entry.data_type)
+            low = low if variable.entry.low is None else variable.entry.low
+            high = high if variable.entry.high is None else variable.entry.high
+            if not low <= value <= high:
+                yield (
+                    variable,
+                    f"cannot hold {value}, which the configuration says of {esc.name}. Use a larger DataType or limit.",
+                )
+
+
 def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     """Defaults that a download would be refused: of single services, then of the PDOs."""
     setup = CanopenSetup(eds, (NodeSettings(node_id),), (Stored(),))
-    (node,) = Nodes(
-        setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda _esc, _settings: None
-    ).nodes
+    node = Nodes(setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda *_: None).nodes[0]
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():
@@ -158,14 +141,8 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
 
 def without_objects(nodes: Nodes) -> list[str]:
     """A line for each TPDO that is valid by its defaults and maps nothing, of all nodes: none of them is ever sent."""
-    numbers = sorted(
-        {
-            tpdo.number
-            for node in nodes.nodes
-            for tpdo in node.tpdos
-            if tpdo.valid and not tpdo.mapped
-        }
-    )
+    tpdos = (tpdo for node in nodes.nodes for tpdo in node.tpdos)
+    numbers = sorted({tpdo.number for tpdo in tpdos if tpdo.valid and not tpdo.mapped})
     return [
         f"TPDO {number + 1} is never sent: {MAPPING + number:04X}h maps nothing, so {COMMUNICATION + number:04X}h:01 cannot be valid. "
         "Map objects, or set bit 31 of its DefaultValue."

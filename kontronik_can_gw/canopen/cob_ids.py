@@ -1,21 +1,24 @@
 """COB-IDs: the predefined connection set and the restricted ones (CiA 301, 7.3.3 and 7.3.5), and which of them a node uses."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, NamedTuple
 
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.node_state import UNCONFIGURED
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.node import Node
 
+Taken = Callable[[int, object], bool]
+"""Whether another user than this has a COB-ID, see ``Use``."""
+
 NMT, EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
 """Those of EMERGENCY and after are first ids: the node-ID is added."""
 LSS_ANSWER, LSS_REQUEST = 0x7E4, 0x7E5
 OF_NODE_ID = (EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
 INVALID_BIT = 1 << 31
-SYNC_USER = "SYNC"
-"""The one user of 1005h in ``chosen_ids``: all nodes may have the same."""
+SYNC = "SYNC"
 
 
 def restricted(cob_id: int) -> bool:
@@ -30,6 +33,14 @@ def restricted(cob_id: int) -> bool:
     )
 
 
+def check_free(cob_id: int, user: object, taken: Taken) -> None:
+    """Whether a service may have a COB-ID. SdoAbort 06090030h for a restricted one, 06040043h for one in use."""
+    if restricted(cob_id):
+        raise SdoAbort(Abort.VALUE)
+    if taken(cob_id, user):
+        raise SdoAbort(Abort.INCOMPATIBLE)
+
+
 def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int, int]]:
     """Valid COB-IDs of emergencies and PDOs by their defaults: index, sub-index, id."""
     if dictionary.get(0x1014) is None:
@@ -42,39 +53,37 @@ def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int
                 yield index, sub, cob_id & 0x7FF
 
 
-def all_ids(node: "Node") -> Iterator[tuple[int, str]]:
-    """COB-IDs a node sends with or listens to as its own, and what they are."""
-    yield NMT, "NMT"
-    yield LSS_REQUEST, "LSS"
-    yield LSS_ANSWER, "LSS"
-    if node.node_id == UNCONFIGURED:
-        return
-    yield node.sync.cob_id, "SYNC"
-    yield SDO_REQUEST + node.node_id, f"SDO requests to CANopen node {node.node_id}"
-    yield from transmit_ids(node)
+class Use(NamedTuple):
+    """A COB-ID that a node uses."""
+
+    cob_id: int
+    what: str
+    user: object = None
+    """The service for which a master can choose it; that of SYNC is one for all nodes. None: it cannot be chosen."""
+    own: bool = False
+    """No other device on the bus may send with it."""
 
 
-def transmit_ids(node: "Node") -> Iterator[tuple[int, str]]:
-    """COB-IDs that no other device on the bus may send with, and what they are."""
+def uses(node: "Node") -> Iterator[Use]:
+    """All COB-IDs that a node sends with or listens to as its own."""
+    yield Use(NMT, "NMT")
+    yield Use(LSS_REQUEST, "LSS")
+    yield Use(LSS_ANSWER, "LSS")
     if node.node_id == UNCONFIGURED:
         return
     name = f"CANopen node {node.node_id}"
-    yield HEARTBEAT + node.node_id, f"the heartbeat of {name}"
-    yield SDO_ANSWER + node.node_id, f"SDO answers of {name}"
-    if not node.emergencies.cob_id & INVALID_BIT:
-        yield node.emergencies.cob_id & 0x7FF, f"emergencies of {name}"
+    yield Use(node.sync.cob_id, "SYNC", SYNC)
+    yield Use(SDO_REQUEST + node.node_id, f"SDO requests to {name}")
+    yield Use(HEARTBEAT + node.node_id, f"the heartbeat of {name}", own=True)
+    yield Use(SDO_ANSWER + node.node_id, f"SDO answers of {name}", own=True)
+    emergencies = node.emergencies
+    if not emergencies.cob_id & INVALID_BIT:
+        yield Use(emergencies.cob_id & 0x7FF, f"emergencies of {name}", emergencies, own=True)
     for tpdo in node.tpdos:
         if tpdo.valid:
-            yield tpdo.cob_id, f"TPDO {tpdo.number + 1} of {name}"
+            yield Use(tpdo.cob_id, f"TPDO {tpdo.number + 1} of {name}", tpdo, own=True)
 
 
-def chosen_ids(node: "Node") -> Iterator[tuple[object, int]]:
-    """COB-IDs that a master can choose: (the service that uses it, id)."""
-    if node.node_id == UNCONFIGURED:
-        return
-    yield SYNC_USER, node.sync.cob_id
-    if not node.emergencies.cob_id & INVALID_BIT:
-        yield node.emergencies, node.emergencies.cob_id & 0x7FF
-    for tpdo in node.tpdos:
-        if tpdo.valid:
-            yield tpdo, tpdo.cob_id
+def all_ids(node: "Node") -> Iterator[tuple[int, str]]:
+    """All COB-IDs of a node, and what they are."""
+    return ((use.cob_id, use.what) for use in uses(node))

@@ -42,12 +42,20 @@ _CODECS = {
     0x15: struct.Struct("<q"),
     0x1B: struct.Struct("<Q"),
 }
-TYPE_BITS = {BOOLEAN: 1} | {
-    code: 8 * found.size for code, found in _CODECS.items() if code != BOOLEAN
-}
+TYPE_BITS = {code: 8 * found.size for code, found in _CODECS.items()} | {BOOLEAN: 1}
 """Bits of a number type."""
+WHOLE = TYPE_BITS.keys() - FLOATS - {BOOLEAN}
+"""The types of whole numbers."""
 
 
 def codec(data_type: int) -> struct.Struct | None:
     """The codec of a number type; None for texts and domains."""
     return _CODECS.get(data_type)
+
+
+def range_of(data_type: int) -> tuple[int, int]:
+    """Smallest and greatest value of a type of whole numbers, or BOOLEAN."""
+    bits = TYPE_BITS.get(data_type, 0)
+    if data_type in SIGNED:
+        return -(1 << bits - 1), (1 << bits - 1) - 1
+    return 0, (1 << bits) - 1

@@ -43,11 +43,8 @@ def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Rows:
 
 def waiting_for_lss(nodes: Nodes, escs: Sequence[EscSettings]) -> list[str]:
     """Names of the ESCs whose nodes have no node-ID, and so no frames."""
-    return [
-        esc.name
-        for node, esc in zip(nodes.nodes, escs, strict=True)
-        if node.node_id == UNCONFIGURED
-    ]
+    pairs = zip(nodes.nodes, escs, strict=True)
+    return [esc.name for node, esc in pairs if node.node_id == UNCONFIGURED]
 
 
 def _check_ids(messages: Sequence[Message]) -> None:

@@ -7,14 +7,15 @@ only the sign bit).
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
-from functools import partial
+from typing import Any
 
-from kontronik_can_gw.canopen import emergency_codes
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
+from kontronik_can_gw.canopen.bound_values import message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
+from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.emergency_codes import Register
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
@@ -27,7 +28,6 @@ from kontronik_can_gw.signals.plan import SignalPlan
 
 GATEWAY, LOGGER = "KontronikGateway", "Logger"
 _SENDERS = (GATEWAY,)
-_signal = partial(Signal, receivers=(LOGGER,))
 _MAX_START_VALUE_BITS = 32
 """That the range of GenSigStartValue holds."""
 _ASCII_UNITS = {"°C": "degC", "µs": "us"}
@@ -49,15 +49,6 @@ _NOTES = {
     "info_age": "65534 stands for that or more, NotAvailable: none has come yet.",
 }
 """What a reader must know of a source beside its name and unit."""
-
-_REGISTER = {
-    emergency_codes.GENERIC: "Generic",
-    emergency_codes.CURRENT: "Current",
-    emergency_codes.VOLTAGE: "Voltage",
-    emergency_codes.TEMPERATURE: "Temperature",
-    emergency_codes.COMMUNICATION: "Communication",
-    emergency_codes.MANUFACTURER: "Manufacturer",
-}
 
 
 class NodeMessages:
@@ -83,25 +74,25 @@ class NodeMessages:
         if not cob_id >> 31:
             yield self._emergency(cob_id & 0x7FF)
 
-    def _name(self, stem: str, end: str = "") -> str:
-        return self._signal_names.take(self._prefix, stem, end)
+    def _signal(
+        self, stem: str, start: int, length: int, comment: str, end: str = "", **more: Any
+    ) -> Signal:
+        """``stem`` and ``end``: the name, see ``Names``; ``more``: further fields."""
+        name = self._signal_names.take(self._prefix, stem, end)
+        return Signal(name, start, length, comment, receivers=(LOGGER,), **more)
 
     # --- heartbeat and emergency
 
     def _heartbeat(self) -> Message:
         period = self._node.dictionary.number(0x1017)
-        state = _signal(
-            self._name("NodeState"),
+        state = self._signal(
+            "NodeState",
             0,
             8,
             f"NMT state of {self._title}. BootUp is sent once, after each start and reset.",
             high=NmtState.PRE_OPERATIONAL,
-            choices={
-                NmtState.INITIALISING: "BootUp",
-                NmtState.STOPPED: "Stopped",
-                NmtState.OPERATIONAL: "Operational",
-                NmtState.PRE_OPERATIONAL: "PreOperational",
-            },
+            choices={state: pascal_case(state.name) for state in NmtState}
+            | {NmtState.INITIALISING: "BootUp"},
         )
         when = (
             f"every {period} ms" if period else "off (1017h is 0), only the boot-up message is sent"
@@ -116,41 +107,22 @@ class NodeMessages:
         names = emergency_names(self._errors)
         bits = {int(bit): pascal_case(bit.name) for bit in self._errors}
         sources = {bit: bits.get(bit, f"Bit{bit}") for bit in range(32)} | {0xFF: "Gateway"}
+        register = "Error register 1001h at the time of the emergency"
+        source = "Bit of the error word of the ESC that caused the emergency, or the gateway."
+        word = (
+            "Error word of the ESC. Of an emergency of the gateway its detail. For TelemetryFault 1 telemetry lost, 2 CRC errors, "
+            "3 port gone, 4 other device than configured. For HeartbeatLost the node-ID."
+        )
+        signal = self._signal
         signals = [
-            _signal(
-                self._name("EmergencyCode"),
-                0,
-                16,
-                "Emergency code.",
-                high=max(names),
-                choices=names,
-            ),
-            *(
-                _signal(
-                    self._name("ErrorRegister", what),
-                    16 + mask.bit_length() - 1,
-                    1,
-                    f"Error register 1001h at the time of the emergency, {what.lower()} error.",
-                )
-                for mask, what in _REGISTER.items()
-            ),
-            _signal(
-                self._name("EmergencySource"),
-                24,
-                8,
-                "Bit of the error word of the ESC that caused the emergency, or the gateway.",
-                high=0xFF,
-                start_value=0xFF,
-                choices=sources,
-            ),
-            _signal(
-                self._name("EmergencyWord"),
-                32,
-                32,
-                "Error word of the ESC. Of an emergency of the gateway its detail. For TelemetryFault 1 telemetry lost, 2 CRC errors, "
-                "3 port gone, 4 other device than configured. For HeartbeatLost the node-ID.",
-                high=0xFFFFFFFF,
-            ),
+            signal("EmergencyCode", 0, 16, "Emergency code.", high=max(names), choices=names)
+        ]
+        for what, mask in Register.__members__.items():
+            name, bit = f"ErrorRegister{what.title()}", mask.bit_length() - 1
+            signals.append(signal(name, 16 + bit, 1, f"{register}, {what.lower()} error."))
+        signals += [
+            signal("EmergencySource", 24, 8, source, high=0xFF, start_value=0xFF, choices=sources),
+            signal("EmergencyWord", 32, 32, word, high=0xFFFFFFFF),
         ]
         delay = self._node.dictionary.number(0x1015) // 10
         name = self._message_names.take(self._message_prefix, "Emergency")
@@ -162,39 +134,37 @@ class NodeMessages:
     def _tpdo(self, tpdo: Tpdo) -> Message:
         plan = message_plan("", tpdo.cob_id, tpdo.mapped)
         signals: list[Signal] = []
-        words: list[tuple[Mapped, SignalPlan, Sequence[ErrorBit]]] = []
+        words: list[tuple[Variable, SignalPlan, Sequence[ErrorBit]]] = []
         state_name = ""
-        for entry, place in zip(tpdo.mapped, plan.signals, strict=True):
-            if bits := self._error_bits(entry, place):
-                words.append((entry, place, bits))
+        for variable, place in zip(tpdo.mapped, plan.signals, strict=True):
+            if bits := self._error_bits(variable, place):
+                words.append((variable, place, bits))
                 continue
-            made = self._object(entry, place)
-            if entry.bound is not None and entry.bound.source.name == "operating_state_raw":
+            made = self._object(variable, place)
+            if variable.bound is not None and variable.bound.source.name == "operating_state_raw":
                 state_name = state_name or made[0].name
             signals += made
-        for entry, place, bits in words:
-            signals += self._flags(entry, place, bits, state_name)
+        for variable, place, bits in words:
+            signals += self._flags(variable, place, bits, state_name)
         name = self._message_names.take(self._message_prefix, f"Tpdo{tpdo.number + 1}")
         comment = f"TPDO {tpdo.number + 1} of {self._title}. {_when(tpdo)}"
         schedule = _schedule(tpdo)
         return Message(tpdo.cob_id, name, plan.length, comment, _SENDERS, *schedule, signals)
 
-    def _object(self, entry: Mapped, place: SignalPlan) -> list[Signal]:
+    def _object(self, variable: Variable, place: SignalPlan) -> list[Signal]:
         """The signals of one mapped object that is no error word."""
-        item, bound = entry.variable.entry, entry.bound
+        item, bound = variable.entry, variable.bound
         where = _where(item)
-        length, signed = place.length, place.signed
-        start = place.pieces[0].at
+        length, signed, start = place.length, place.signed, place.pieces[0].at
         lowest = -(1 << length - 1) if signed else 0
         highest = lowest + (1 << length) - 1
-        row = partial(
-            _signal, start=start, length=length, is_signed=signed, is_float=place.is_float
-        )
+        form: dict[str, Any] = {"is_signed": signed, "is_float": place.is_float}
         if bound is None:
             is_code = (item.index, item.sub, length, signed) == (at.ERROR_CODE, 0, 16, False)
-            names = emergency_names(self._errors) if is_code else {}
-            name = self._name(_stem(item))
-            return [row(name, comment=where, low=lowest, high=highest, choices=names)]
+            form |= {"choices": emergency_names(self._errors)} if is_code else {}
+            return [
+                self._signal(_stem(item), start, length, where, low=lowest, high=highest, **form)
+            ]
         source = bound.source
         if source.name == "link_status" and not signed:
             return self._link(start, where)
@@ -204,65 +174,48 @@ class NodeMessages:
         unit = _ASCII_UNITS.get(source.unit, source.unit)
         end = "Percent" if unit == "%" else ""
         comment = " ".join(filter(None, (where, _NOTES.get(source.name))))
-        row = partial(
-            row, self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit
-        )
         if source.rolls:
             comment += f" Starts again at 0 after {number(highest / bound.steps)}."
-            return [row(comment=comment, low=lowest, high=highest)]
-        not_available = lowest if signed else highest
-        lowest, highest = (lowest + 1, highest) if signed else (lowest, highest - 1)
-        names = {number: text for number, text in names.items() if lowest <= number <= highest}
-        return [
-            row(
-                comment=comment,
-                low=lowest,
-                high=max(names) if names else highest,
-                start_value=not_available if length <= _MAX_START_VALUE_BITS else 0,
-                choices=names | {not_available: "NotAvailable"},
-            )
-        ]
+        else:
+            not_available = lowest if signed else highest
+            lowest, highest = (lowest + 1, highest) if signed else (lowest, highest - 1)
+            names = {number: text for number, text in names.items() if lowest <= number <= highest}
+            form["start_value"] = not_available if length <= _MAX_START_VALUE_BITS else 0
+            form["choices"] = names | {not_available: "NotAvailable"}
+        form |= {"low": lowest, "high": max(names, default=highest), "unit": unit}
+        stem = stem.removesuffix(end)
+        factor = 1 / bound.steps
+        return [self._signal(stem, start, length, comment, end, factor=factor, **form)]
 
     def _link(self, start: int, where: str) -> list[Signal]:
         states = {int(state): pascal_case(state.name) for state in LinkState}
-        state = "State of the telemetry line between ESC and gateway."
-        replay = "The values come from a recording, not from an ESC."
-        info = "The information of the ESC (its info frame) is fresh."
+        state = f"{where} State of the telemetry line between ESC and gateway."
+        replay = f"{where} The values come from a recording, not from an ESC."
+        info = f"{where} The information of the ESC (its info frame) is fresh."
+        signal = self._signal
         return [
-            _signal(
-                self._name("LinkState"),
-                start,
-                _LINK_BITS,
-                f"{where} {state}",
-                high=max(states),
-                choices=states,
-            ),
-            _signal(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
-            _signal(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
+            signal("LinkState", start, _LINK_BITS, state, high=max(states), choices=states),
+            signal("Replay", start + _REPLAY_BIT, 1, replay),
+            signal("InfoValid", start + _INFO_BIT, 1, info),
         ]
 
     def _flags(
-        self, entry: Mapped, place: SignalPlan, bits: Sequence[ErrorBit], state_name: str
+        self, variable: Variable, place: SignalPlan, bits: Sequence[ErrorBit], state_name: str
     ) -> list[Signal]:
         then = f" and {state_name} is NotAvailable" if state_name else ""
         lost = f"While the word is not available all its bits are set{then}."
-        where = _where(entry.variable.entry)
+        where, start = _where(variable.entry), place.pieces[0].at
         return [
-            _signal(
-                self._name(pascal_case(bit.name)),
-                place.pieces[0].at + bit,
-                1,
-                f"{where} Bit {int(bit)}, {bit.meaning}. {lost}",
-            )
-            for bit in bits
+            self._signal(name, start + bit, 1, f"{where} Bit {int(bit)}, {bit.meaning}. {lost}")
+            for bit, name in ((bit, pascal_case(bit.name)) for bit in bits)
             if bit < place.length
         ]
 
-    def _error_bits(self, entry: Mapped, place: SignalPlan) -> Sequence[ErrorBit]:
+    def _error_bits(self, variable: Variable, place: SignalPlan) -> Sequence[ErrorBit]:
         """The bits of an error word that is shown unsigned; empty for every other object."""
-        if entry.bound is None or place.signed:
+        if variable.bound is None or place.signed:
             return ()
-        return self._protocol.errors.get(entry.bound.source.name, ())
+        return self._protocol.errors.get(variable.bound.source.name, ())
 
     def _table(self, name: str, names: Mapping[int, str]) -> tuple[dict[int, str], str]:
         """Value names and signal name of a source. An enumeration is closed: a number without a name gets one, because tools lose
@@ -301,41 +254,24 @@ def _schedule(tpdo: Tpdo) -> tuple[str, int, int]:
     """Send type, cycle and least distance in ms."""
     if tpdo.type not in EVENT_TYPES:
         return "None", 0, 0
-    delay = tpdo.inhibit_ns // MS
-    if tpdo.event_ns:
-        return (
-            "CyclicAndOnChange" if tpdo.on_change else "CyclicAndEvent",
-            tpdo.event_ns // MS,
-            delay,
-        )
-    return "OnChange" if tpdo.on_change else "Event", 0, delay
+    cause, cycle = "OnChange" if tpdo.on_change else "Event", tpdo.event_ns // MS
+    return f"CyclicAnd{cause}" if cycle else cause, cycle, tpdo.inhibit_ns // MS
 
 
 def _when(tpdo: Tpdo) -> str:
     """When a PDO is sent, in words."""
-    if tpdo.type not in EVENT_TYPES:
-        text = (
-            "Sent at a SYNC when there is news"
-            if tpdo.type == 0
-            else f"Sent at every SYNC number {tpdo.type}"
-        )
+    if tpdo.type == 0:
+        text = "Sent at a SYNC when there is news"
+    elif tpdo.type not in EVENT_TYPES:
+        text = f"Sent at every SYNC number {tpdo.type}"
     else:
         text = "Sent when its status changes" if tpdo.on_change else "Sent when its values are new"
         if tpdo.inhibit_ns:
             text += f", no closer than {number(Fraction(tpdo.inhibit_ns, MS))} ms"
         if tpdo.event_ns:
             text += f", at the latest after {tpdo.event_ns // MS} ms"
-    live = any(
-        entry.bound is not None and entry.bound.source.group is Group.LIVE for entry in tpdo.mapped
-    )
-    link = any(
-        entry.bound is not None and entry.bound.source.name == "link_status"
-        for entry in tpdo.mapped
-    )
-    if live:
-        text += (
-            ". Goes on while the telemetry is lost"
-            if link
-            else ". Not sent while the telemetry is lost"
-        )
+    sources = [variable.bound.source for variable in tpdo.mapped if variable.bound is not None]
+    if any(source.group is Group.LIVE for source in sources):
+        link = any(source.name == "link_status" for source in sources)
+        text += f". {'Goes on' if link else 'Not sent'} while the telemetry is lost"
     return f"{text}."

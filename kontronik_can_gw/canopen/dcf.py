@@ -73,8 +73,7 @@ def dcf(
     """The EDS as the DCF of one node (CiA 306, clause 5): its text with a ParameterValue for each of ``values``, and [DeviceComissioning].
 
     ``bitrate`` in bit/s. ``file_name`` is the DCF's; LastEDS names the EDS. Values are as they are in the node, with the node-ID worked in.
-    Domains are left out: a DCF names files for them. Real numbers are written as decimals,
-    which the canopen package reads. Lines end in
+    Domains are left out: a DCF names files for them. Real numbers are written as decimals, which the canopen package reads. Lines end in
     CR LF. KeyError for a value that has no entry, UserError for a text that an INI file cannot hold.
     """
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
@@ -116,12 +115,11 @@ def _commissioning(
         "NetNumber=0",
         "CANopenManager=0",
     ]
-    # 0: not known, so nothing that an LSS master could look for
-    return (
-        [*lines, f"LSS_SerialNumber=0x{serial:08X}"]
-        if isinstance(serial, int) and serial
-        else lines
-    )
+    if (
+        isinstance(serial, int) and serial
+    ):  # 0: not known, so nothing that an LSS master could look for
+        lines.append(f"LSS_SerialNumber=0x{serial:08X}")
+    return lines
 
 
 def _compact_values(index: int, texts: Mapping[tuple[int, int], str]) -> list[str]:

@@ -3,18 +3,21 @@
 Built from an EDS. A variable is either plain storage or bound: ``read`` then gives its value at each access.
 """
 
-import math
-import struct
 from collections.abc import Callable, Iterator, Mapping
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, codec
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.objects import Bound
 
 Value = int | float | bytes
 Read = Callable[[int], Value]
 """``now`` to value. Raises SdoAbort where there is none."""
+Check = Callable[[int], None]
+"""Raises SdoAbort for a value that is refused."""
+Written = Callable[[int], bool | None]
+"""What follows a download, given ``now``. False: its confirmation comes later."""
 
 _MAX_TEXT = 255
 _MAX_DOMAIN = 0x10000
@@ -38,16 +41,18 @@ _IF_ABSENT = {
 
 
 class Variable:
-    """One entry at work. ``check`` may refuse a new value; ``written`` follows one, and returns False if the confirmation comes later."""
+    """One entry at work. ``check`` may refuse a new value; ``written`` follows one."""
 
-    __slots__ = ("check", "codec", "entry", "power_on", "read", "value", "written")
+    __slots__ = ("bound", "check", "codec", "entry", "power_on", "read", "value", "written")
 
     def __init__(self, entry: Entry) -> None:
         self.entry = entry
         self.codec = codec(entry.data_type)
+        self.bound: Bound | None = None
+        """The value of ESC or gateway that it shows."""
         self.read: Read | None = None
-        self.check: Callable[[int], None] | None = None
-        self.written: Callable[[int], bool] | None = None
+        self.check: Check | None = None
+        self.written: Written | None = None
         self.power_on: Value = self.empty if entry.default is None else entry.default
         self.value: Value = self.power_on
 
@@ -59,9 +64,14 @@ class Variable:
     @property
     def size(self) -> int | None:
         """Bytes of the type; None for texts and domains."""
-        if self.codec is None:
-            return None
-        return self.codec.size
+        return None if self.codec is None else self.codec.size
+
+    @property
+    def max_size(self) -> int:
+        """The most bytes that can be written."""
+        if self.size is not None:
+            return self.size
+        return _MAX_DOMAIN if self.entry.data_type == DOMAIN_TYPE else _MAX_TEXT
 
     @property
     def readable(self) -> bool:
@@ -85,11 +95,29 @@ class Variable:
         value: Value = self.codec.unpack(data)[0]
         return value
 
+    def check_limits(self, value: Value) -> None:
+        """SdoAbort 06090031h or 06090032h for a number outside the limits of the EDS."""
+        high, low = self.entry.high, self.entry.low
+        if high is not None and not isinstance(value, bytes) and not value <= high:
+            raise SdoAbort(Abort.TOO_HIGH)
+        if low is not None and not isinstance(value, bytes) and not value >= low:
+            raise SdoAbort(Abort.TOO_LOW)
+
     def default(self, node_id: int) -> Value:
         """The power-on value of a node with this node-ID: ``$NODEID`` worked in."""
         if self.entry.relative and isinstance(self.power_on, int):
             return self.power_on + node_id
         return self.power_on
+
+
+def signature(word: bytes) -> Check:
+    """A check that refuses all numbers but that of these four letters: 08000020h."""
+
+    def check(value: int) -> None:
+        if value != int.from_bytes(word, "little"):
+            raise SdoAbort(Abort.TRANSFER)
+
+    return check
 
 
 class Dictionary:
@@ -113,8 +141,8 @@ class Dictionary:
         sub: int = 0,
         *,
         read: Read | None = None,
-        check: Callable[[int], None] | None = None,
-        written: Callable[[int], bool] | None = None,
+        check: Check | None = None,
+        written: Written | None = None,
     ) -> None:
         """Give an object to its service: what it shows, which values it refuses, what follows a download.
 
@@ -157,42 +185,36 @@ class Dictionary:
             raise SdoAbort(Abort.WRITE_ONLY)
         return variable.encode(self.value(variable, now))
 
-    def check_download(self, index: int, sub: int, size: int | None) -> None:
-        """Whether ``size`` bytes may be written there, before any is moved (CiA 301, 7.2.4.3.17: the abort code says why not)."""
+    def check_download(self, index: int, sub: int, size: int | None) -> int:
+        """Whether ``size`` bytes may be written there, before any is moved (CiA 301, 7.2.4.3.17: the abort code says why not).
+
+        Returns how many may be written at most.
+        """
         variable = self.find(index, sub)
         if self.read_only:
             raise SdoAbort(Abort.DEVICE_STATE)
         if not variable.writable:
             raise SdoAbort(Abort.READ_ONLY)
-        if size is not None:
-            _check_size(variable, size)
-
-    def max_size(self, index: int, sub: int) -> int | None:
-        """The most bytes that can be written there."""
-        variable = self.find(index, sub)
-        if variable.size is not None:
-            return variable.size
-        return _MAX_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _MAX_TEXT
+        if size is not None and size > variable.max_size:
+            raise SdoAbort(Abort.TOO_LONG)
+        if size is not None and size < (variable.size or 0):
+            raise SdoAbort(Abort.TOO_SHORT)
+        return variable.max_size
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         """Write. False where the confirmation comes later."""
         self.check_download(index, sub, len(data))
         variable = self.find(index, sub)
         value = variable.decode(data)
-        entry = variable.entry
-        if not isinstance(value, bytes):
-            if entry.high is not None and not value <= entry.high:
-                raise SdoAbort(Abort.TOO_HIGH)
-            if entry.low is not None and not value >= entry.low:
-                raise SdoAbort(Abort.TOO_LOW)
+        variable.check_limits(value)
         if variable.check is not None:
             assert isinstance(value, int)
             variable.check(value)
         changed = self.value(variable, now) != value
         variable.value = value
-        done = True if variable.written is None else variable.written(now)
+        later = variable.written is not None and variable.written(now) is False
         self.written(variable, changed, now)
-        return done
+        return not later
 
     # --- power-on and storage
 
@@ -212,13 +234,12 @@ class Dictionary:
                 rejected.append(number)
                 continue
             value = variable.decode(data)
-            entry = variable.entry
-            low = -math.inf if entry.low is None else entry.low
-            high = math.inf if entry.high is None else entry.high
-            if not isinstance(value, bytes) and not low <= value <= high:
+            try:
+                variable.check_limits(value)
+            except SdoAbort:
                 rejected.append(number)
-                continue
-            variable.value = value
+            else:
+                variable.value = value
         return rejected
 
     def to_store(self, profile: range, node_id: int) -> dict[int, bytes]:
@@ -231,37 +252,3 @@ class Dictionary:
             and variable.read is None
             and variable.value != variable.default(node_id)
         }
-
-
-def _check_size(variable: Variable, size: int) -> None:
-    most = _MAX_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _MAX_TEXT
-    least = 0
-    if variable.size is not None:
-        least = most = variable.size
-    if size > most:
-        raise SdoAbort(Abort.TOO_LONG)
-    if size < least:
-        raise SdoAbort(Abort.TOO_SHORT)
-
-
-def fits(variable: Variable, low: int, high: int) -> bool:
-    """Whether a variable's type holds all whole numbers from low to high."""
-    if variable.codec is None:
-        return False
-    try:
-        variable.codec.pack(low)
-        variable.codec.pack(high)
-    except (struct.error, ValueError, OverflowError):
-        return False
-    return True
-
-
-def range_of(variable: Variable) -> tuple[int, int]:
-    """Smallest and greatest value of a whole-number type; (0, -1) for other types."""
-    size = variable.size
-    if size is None:
-        return 0, -1
-    bits = 8 * size
-    if fits(variable, -1, 1):
-        return -(1 << bits - 1), (1 << bits - 1) - 1
-    return 0, (1 << bits) - 1

@@ -11,24 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from kontronik_can_gw.canopen import eds_rules
-from kontronik_can_gw.canopen.data_types import (
-    ARRAY,
-    DOMAIN,
-    KINDS,
-    RECORD,
-    U8,
-    VAR,
-)
-from kontronik_can_gw.canopen.eds_import import import_entries
+from kontronik_can_gw.canopen.data_types import ARRAY, DOMAIN, KINDS, RECORD, U8, VAR
 from kontronik_can_gw.canopen.eds_object import EdsObject, Entry
-from kontronik_can_gw.canopen.eds_sections import (
-    OBJECT,
-    Problems,
-    Section,
-    choices,
-    read_sections,
-)
-from kontronik_can_gw.canopen.eds_values import check_inside, data_type_of, default_value, limits
+from kontronik_can_gw.canopen.eds_sections import OBJECT, Problems, Section, choices, read_sections
+from kontronik_can_gw.canopen.eds_values import data_type_of, default_value, limits
 from kontronik_can_gw.errors import UserError
 
 MAX_BYTES = 2_000_000
@@ -63,19 +49,14 @@ def load(data: bytes, name: str) -> Eds:
         )
     problems = Problems(name)
     objects = _Reader(read_sections(data, problems), problems).read()
-    for section, text in eds_rules.mistakes(objects):
-        problems.add(section, text)
+    eds_rules.check(objects, problems.add)
     if problems.found:
         more = len(problems.found) - _MAX_PROBLEMS
         rest = [f"{name}: and {more} more mistakes."] if more > 0 else []
         raise UserError(*problems.found[:_MAX_PROBLEMS], *rest)
     ordered = [objects[index] for index in sorted(objects)]
-    return Eds(
-        data,
-        name,
-        tuple(import_entries(ordered)),
-        {item.index: item.name for item in ordered},
-    )
+    entries = tuple(item.subs[sub] for item in ordered for sub in sorted(item.subs))
+    return Eds(data, name, entries, {item.index: item.name for item in ordered})
 
 
 class _Reader:
@@ -84,8 +65,6 @@ class _Reader:
     def __init__(self, sections: Mapping[str, Section], problems: Problems) -> None:
         self._sections = sections
         self._problems = problems
-        self._say = problems.add
-        self._number = problems.number
 
     def read(self) -> dict[int, EdsObject]:
         """All objects."""
@@ -102,9 +81,7 @@ class _Reader:
             section_of_index = self._sections.get(f"{index:04x}")
             if section_of_index is None:
                 for sub in subs.values():
-                    self._say(
-                        sub.name, f"there is no section [{index:04X}]. Add it or remove this one."
-                    )
+                    sub.wrong(f"there is no section [{index:04X}]. Add it or remove this one.")
                 continue
             objects[index] = self._read_object(index, section_of_index, subs)
             count += len(objects[index].subs)
@@ -116,94 +93,85 @@ class _Reader:
 
     def _check_header(self) -> None:
         if "devicecomissioning" in self._sections:
-            self._say(
+            self._problems.add(
                 "DeviceComissioning",
                 "this is a DCF, the file of one node. Give the EDS it was made from.",
             )
         section = self._sections.get("deviceinfo")
-        if section is not None and self._number(section, "CompactPDO"):
-            self._say(
-                "DeviceInfo",
-                "CompactPDO: not supported. Describe each PDO by its own sections and write 0.",
+        if section is not None and section.number("CompactPDO"):
+            section.wrong(
+                "CompactPDO: not supported. Describe each PDO by its own sections and write 0."
             )
 
     def _read_object(self, index: int, section: Section, subs: Mapping[int, Section]) -> EdsObject:
-        kind = self._number(section, "ObjectType", VAR)
-        item = EdsObject(index, kind or 0, self._parameter_name(section), {})
+        kind = section.number("ObjectType", VAR)
+        item = EdsObject(index, kind or 0, _parameter_name(section), {})
         if kind in (DOMAIN, VAR):
             for sub in subs.values():
-                self._say(
-                    sub.name,
-                    f"[{index:04X}] is a {KINDS[kind]} and has no sub-indices. Remove this section.",
+                sub.wrong(
+                    f"[{index:04X}] is a {KINDS[kind]} and has no sub-indices. Remove this section."
                 )
-            item.subs[0] = self._entry(section, item, 0, item.name, kind)
+            item.subs[0] = _entry(section, item, 0, item.name, kind)
         elif kind in (ARRAY, RECORD):
             self._read_members(item, section, subs)
         elif kind is not None:
-            self._say(section.name, f"ObjectType=0x{kind:X}: not one of {choices(KINDS)}.")
+            section.wrong(f"ObjectType=0x{kind:X}: not one of {choices(KINDS)}.")
         return item
 
     def _read_members(self, item: EdsObject, section: Section, subs: Mapping[int, Section]) -> None:
-        compact = self._number(section, "CompactSubObj", 0)
+        compact = section.number("CompactSubObj", 0)
         if compact and not subs:
             self._read_compact(item, section, compact)
             return
         if compact:
-            self._say(
-                section.name,
-                "CompactSubObj excludes sections of sub-indices. Keep one way.",
-            )
+            section.wrong("CompactSubObj excludes sections of sub-indices. Keep one way.")
         for sub in sorted(subs):
             member = subs[sub]
-            kind = self._number(member, "ObjectType", VAR)
+            kind = member.number("ObjectType", VAR)
             if kind not in (None, DOMAIN, VAR):
-                self._say(member.name, f"ObjectType=0x{kind:X}: a sub-index is a VAR, 0x7.")
+                member.wrong(f"ObjectType=0x{kind:X}: a sub-index is a VAR, 0x7.")
             if sub > 0xFE:
-                self._say(member.name, "sub-indices end at FE. Remove this section.")
-            name = self._parameter_name(member)
-            item.subs[sub] = self._entry(member, item, sub, name, kind or VAR)
+                member.wrong("sub-indices end at FE. Remove this section.")
+            item.subs[sub] = _entry(member, item, sub, _parameter_name(member), kind or VAR)
         self._check_sub0(item)
 
     def _check_sub0(self, item: EdsObject) -> None:
         """Sub-index 0 is what masters read first (CiA 301, 7.4.5.2)."""
+        wrong = self._problems.add
         first = item.subs.get(0)
         if first is None:
-            self._say(
+            wrong(
                 f"{item.index:04X}",
                 "sub-index 0 is missing. Add it with the highest sub-index as DefaultValue.",
             )
             return
         where, highest = item.section(0), max(item.subs)
         if first.data_type != U8:
-            self._say(
-                where,
-                f"DataType=0x{first.data_type:04X}: sub-index 0 is an UNSIGNED8, 0x0005.",
-            )
+            wrong(where, f"DataType=0x{first.data_type:04X}: sub-index 0 is an UNSIGNED8, 0x0005.")
         elif not eds_rules.counts(item.index) and first.default != highest:
-            self._say(
-                where,
-                f"DefaultValue: the highest sub-index is {highest}. Write 0x{highest:02X}.",
+            wrong(
+                where, f"DefaultValue: the highest sub-index is {highest}. Write 0x{highest:02X}."
             )
 
     def _read_compact(self, item: EdsObject, section: Section, count: int) -> None:
         """CiA 306, CompactSubObj: sub-index 0 and ``count`` alike ones. Their names are the object's and a number, or in [xxxxName]."""
         if not 1 <= count <= 0xFE:
-            self._say(section.name, f"CompactSubObj={count}: not 1 to 254.")
+            section.wrong(f"CompactSubObj={count}: not 1 to 254.")
             return
-        first = self._entry(section, item, 1, item.name, VAR)
+        first = _entry(section, item, 1, item.name, VAR)
         names = {sub: f"{item.name}{sub}" for sub in range(1, count + 1)}
-        given = self._sections.get(f"{item.index:04x}name", Section(""))
-        for key, name in given.values.items():
-            number = int(key) if key.isdigit() and len(key) < 10 else 0
-            if number in names:
-                names[number] = name or names[number]
-            elif key != "nrofentries":
-                self._say(given.name, f"{key}: not a sub-index from 1 to {count}.")
+        if given := self._sections.get(f"{item.index:04x}name"):
+            for key, name in given.values.items():
+                number = int(key) if key.isdigit() and len(key) < 10 else 0
+                if number in names:
+                    names[number] = name or names[number]
+                elif key != "nrofentries":
+                    given.wrong(f"{key}: not a sub-index from 1 to {count}.")
         counts = eds_rules.counts(item.index)
-        item.subs[0] = replace(
-            first,
-            sub=0,
-            name=f"{item.name} highest sub-index",
+        item.subs[0] = Entry(
+            item.index,
+            0,
+            f"{item.name} highest sub-index",
             data_type=U8,
             access="rw" if counts else "const",
             mappable=False,
@@ -211,45 +179,29 @@ class _Reader:
             high=None,
             default=0 if counts else count,
             relative=False,
+            object_type=item.kind,
         )
         for sub, name in names.items():
             item.subs[sub] = replace(first, sub=sub, name=name)
 
-    def _parameter_name(self, section: Section) -> str:
-        name = section.get("ParameterName")
-        if not name:
-            self._say(section.name, "ParameterName: missing. Name it.")
-        elif len(name) > _MAX_NAME:
-            self._say(
-                section.name, f"ParameterName: longer than {_MAX_NAME} characters. Shorten it."
-            )
-        return name
 
-    def _entry(self, section: Section, item: EdsObject, sub: int, name: str, kind: int) -> Entry:
-        data_type = data_type_of(self._problems, section, kind, item.index)
-        access = section.get("AccessType").lower() or ("rw" if kind == DOMAIN else "")
-        if access not in _ACCESS:
-            self._say(
-                section.name,
-                f"AccessType={section.get('AccessType')}: not one of {', '.join(_ACCESS)}.",
-            )
-        mappable = bool(self._number(section, "PDOMapping", 0))
-        if section.get("ParameterValue"):
-            self._say(section.name, "ParameterValue: values belong in a DCF. Write DefaultValue.")
-        low, high = limits(self._problems, section, data_type)
-        default, relative = default_value(self._problems, section, data_type)
-        if isinstance(default, int) and not relative:
-            check_inside(self._problems, section, default, low, high)
-        return Entry(
-            item.index,
-            sub,
-            name,
-            data_type,
-            access,
-            mappable,
-            low,
-            high,
-            default,
-            relative,
-            item.kind,
-        )
+def _parameter_name(section: Section) -> str:
+    name = section.get("ParameterName")
+    if not name:
+        section.wrong("ParameterName: missing. Name it.")
+    elif len(name) > _MAX_NAME:
+        section.wrong(f"ParameterName: longer than {_MAX_NAME} characters. Shorten it.")
+    return name
+
+
+def _entry(section: Section, item: EdsObject, sub: int, name: str, kind: int) -> Entry:
+    data_type = data_type_of(section, kind, item.index)
+    access = section.get("AccessType").lower() or ("rw" if kind == DOMAIN else "")
+    if access not in _ACCESS:
+        section.wrong(f"{section.said('AccessType')}: not one of {', '.join(_ACCESS)}.")
+    mappable = bool(section.number("PDOMapping", 0))
+    if section.get("ParameterValue"):
+        section.wrong("ParameterValue: values belong in a DCF. Write DefaultValue.")
+    limit = limits(section, data_type)
+    default = default_value(section, data_type, *limit)
+    return Entry(item.index, sub, name, data_type, access, mappable, *limit, *default, item.kind)

@@ -1,8 +1,7 @@
 """What CiA 301 and 302 ask of communication objects, and of default PDO mappings: without it the services could not work."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen.data_types import (
     ARRAY,
@@ -18,9 +17,10 @@ from kontronik_can_gw.canopen.data_types import (
     VAR,
     VISIBLE_STRING,
 )
+from kontronik_can_gw.canopen.eds_object import EdsObject
 
-if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.eds_object import EdsObject, Entry
+Wrong = Callable[[str, str], None]
+"""Is given the section and the text of a mistake."""
 
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _MAX_MAPPED = 0x40
@@ -89,87 +89,76 @@ def _shape(index: int) -> _Shape | None:
     return _COMMUNICATION.get(index)
 
 
-def mistakes(objects: Mapping[int, "EdsObject"]) -> Iterator[tuple[str, str]]:
-    """What is wrong: section, text."""
+def check(objects: Mapping[int, EdsObject], wrong: Wrong) -> None:
+    """Report what is wrong."""
     for index in _MANDATORY:
         if index not in objects:
-            yield f"{index:04X}", "this object is mandatory and is not there. Add it."
+            wrong(f"{index:04X}", "this object is mandatory and is not there. Add it.")
     for index in sorted(objects):
         if index < 0x2000:
-            yield from _of_communication(objects[index])
+            _check_communication(objects[index], wrong)
     for index in sorted(objects):
         partner = index + 0x200 if index in _PDO_COMMUNICATIONS else index - 0x200
         if index in range(0x1800, 0x1C00) and partner not in objects:
-            yield (
-                f"{index:04X}",
-                f"[{partner:04X}] of the same PDO is not there. Add it or remove this object.",
-            )
+            text = f"[{partner:04X}] of the same PDO is not there. Add it or remove this object."
+            wrong(f"{index:04X}", text)
         if index in _PDO_MAPPINGS:
-            yield from _of_mapping(objects[index], objects)
+            _check_mapping(objects[index], objects, wrong)
 
 
-def _of_communication(item: "EdsObject") -> Iterator[tuple[str, str]]:
+def _check_communication(item: EdsObject, wrong: Wrong) -> None:
     where = f"{item.index:04X}"
     shape = _shape(item.index)
     if shape is None:
-        yield where, f"{item.name}: this node has no such service. Remove the object."
+        wrong(where, f"{item.name}: this node has no such service. Remove the object.")
         return
     if item.kind not in KINDS:
         return
     if item.kind not in shape.kinds:
-        kind = shape.kinds[0]
-        yield (
-            where,
-            f"ObjectType=0x{item.kind:X}: this object is of type {KINDS[kind]}, 0x{kind:X}.",
-        )
+        kind = f"{KINDS[shape.kinds[0]]}, 0x{shape.kinds[0]:X}"
+        wrong(where, f"ObjectType=0x{item.kind:X}: this object is of type {kind}.")
         return
     for sub in shape.needed:
         if sub not in item.subs:
-            yield where, f"sub-index {sub:X} is mandatory and is not there. Add it."
+            wrong(where, f"sub-index {sub:X} is mandatory and is not there. Add it.")
     for sub, entry in item.subs.items():
         types = shape.types.get(sub)
         if types is None:
-            yield item.section(sub), f"{where}h has no sub-index {sub:X}. Remove it."
+            wrong(item.section(sub), f"{where}h has no sub-index {sub:X}. Remove it.")
         elif entry.data_type not in (0, *types) and (sub or item.kind in (VAR, DOMAIN)):
-            yield (
-                item.section(sub),
-                f"DataType=0x{entry.data_type:04X}: this one is of type {TYPE_NAMES[types[0]]}, 0x{types[0]:04X}.",
-            )
+            wanted = f"{TYPE_NAMES[types[0]]}, 0x{types[0]:04X}"
+            text = f"DataType=0x{entry.data_type:04X}: this one is of type {wanted}."
+            wrong(item.section(sub), text)
 
 
-def _of_mapping(item: "EdsObject", objects: Mapping[int, "EdsObject"]) -> Iterator[tuple[str, str]]:
+def _check_mapping(item: EdsObject, objects: Mapping[int, EdsObject], wrong: Wrong) -> None:
     count = item.subs[0].default if 0 in item.subs else 0
     bits = 0
     for sub in range(1, min(count, _MAX_MAPPED) + 1) if isinstance(count, int) else ():
         entry = item.subs.get(sub)
         value = entry.default if entry else None
         if entry is None or not isinstance(value, int) or entry.relative:
-            yield (
-                f"{item.index:04X}sub{sub:X}",
-                "DefaultValue: this part of the mapping is not there.",
-            )
+            wrong(item.section(sub), "DefaultValue: this part of the mapping is not there.")
             continue
         bits += value & 0xFF
         if problem := _mapping_problem(value, objects):
-            yield item.section(sub), f"DefaultValue=0x{value:08X}: {problem}"
+            wrong(item.section(sub), f"DefaultValue=0x{value:08X}: {problem}")
     if bits > _PDO_BITS:
-        yield (
-            f"{item.index:04X}",
-            f"{bits} bits are mapped, a PDO has {_PDO_BITS}. Map fewer objects.",
-        )
+        text = f"{bits} bits are mapped, a PDO has {_PDO_BITS}. Map fewer objects."
+        wrong(f"{item.index:04X}", text)
 
 
-def _mapping_problem(value: int, objects: Mapping[int, "EdsObject"]) -> str | None:
+def _mapping_problem(value: int, objects: Mapping[int, EdsObject]) -> str | None:
     index, sub, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
-    item = objects.get(index)
-    target: Entry | None = item.subs.get(sub) if item else None
+    target = objects[index].subs.get(sub) if index in objects else None
+    place = f"{index:04X}h:{sub:02X}"
     if target is None:
-        return f"there is no {index:04X}h:{sub:02X}. Add it or map another."
+        return f"there is no {place}. Add it or map another."
     if not target.mappable or target.access == "rww":
-        return f"{index:04X}h:{sub:02X} is not for TPDOs. Write PDOMapping=1 there or map another."
+        return f"{place} is not for TPDOs. Write PDOMapping=1 there or map another."
     length = TYPE_BITS.get(target.data_type, 0)
     if target.data_type and (not length or target.access == "wo"):
-        return f"{index:04X}h:{sub:02X} cannot be sent: it is write-only or has no fixed length. Map another."
+        return f"{place} cannot be sent: it is write-only or has no fixed length. Map another."
     if target.data_type and length != bits:
-        return f"{index:04X}h:{sub:02X} has {length} bits. Write 0x{value & ~0xFF | length:08X}."
+        return f"{place} has {length} bits. Write 0x{value & ~0xFF | length:08X}."
     return None

@@ -17,17 +17,6 @@ OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
 _NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
 
 
-@dataclass
-class Section:
-    """One section: its name as written, and its keys in lower case with their values."""
-
-    name: str
-    values: dict[str, str] = field(default_factory=dict)
-
-    def get(self, key: str) -> str:
-        return self.values.get(key.lower(), "")
-
-
 class Problems:
     """The mistakes of one file, each by section and key."""
 
@@ -41,14 +30,34 @@ class Problems:
             text = f"{text[: _MAX_SAID // 2]} ... {text[-_MAX_SAID // 2 :]}"
         self.found.append(f"{self.file}: [{section}] {text}" if section else f"{self.file}: {text}")
 
-    def number(self, section: Section, key: str, otherwise: int | None = None) -> int | None:
+
+@dataclass
+class Section:
+    """One section: its name as written, and its keys in lower case with their values."""
+
+    name: str
+    problems: Problems
+    values: dict[str, str] = field(default_factory=dict)
+
+    def get(self, key: str) -> str:
+        return self.values.get(key.lower(), "")
+
+    def said(self, key: str) -> str:
+        """A key as a mistake quotes it."""
+        return f"{key}={self.get(key)}"
+
+    def wrong(self, text: str) -> None:
+        """Report a mistake."""
+        self.problems.add(self.name, text)
+
+    def number(self, key: str, otherwise: int | None = None) -> int | None:
         """The number of a key; ``otherwise`` where it has no value; None, after a complaint, where that is no number."""
-        text = section.get(key)
+        text = self.get(key)
         if not text:
             return otherwise
         number = integer(text)
         if number is None:
-            self.add(section.name, f"{key}={text}: not a number. Write 0x1F or 31.")
+            self.wrong(f"{key}={text}: not a number. Write 0x1F or 31.")
         return number
 
 
@@ -60,9 +69,9 @@ def read_sections(data: bytes, problems: Problems) -> dict[str, Section]:
             problems.add("", f"line {number} is not ASCII: {text}. Write it in plain letters.")
     found: dict[str, Section] = {}
     for name, lines in blocks(data.decode("ascii", "replace")):
-        section = Section(name)
+        section = Section(name, problems)
         for line in lines[1:] if name else lines:
-            _read_line(section, line, problems)
+            _read_line(section, line)
         if not name:
             continue
         match = OBJECT.match(name)
@@ -70,24 +79,21 @@ def read_sections(data: bytes, problems: Problems) -> dict[str, Section]:
             spelling(int(match[1], 16), int(match[2], 16) if match[2] else None) if match else name
         )
         if same.lower() in found:
-            problems.add(name, "this section is there twice. Remove one.")
+            section.wrong("this section is there twice. Remove one.")
         else:
             found[same.lower()] = section
     return found
 
 
-def _read_line(section: Section, line: str, problems: Problems) -> None:
+def _read_line(section: Section, line: str) -> None:
     text = bare(line)
     if not text:
         return
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals or not key or not section.name:
-        problems.add(
-            section.name,
-            f"'{text}' is neither a section, nor key=value, nor a comment after ';'.",
-        )
+        section.wrong(f"'{text}' is neither a section, nor key=value, nor a comment after ';'.")
     elif key.lower() in section.values:
-        problems.add(section.name, f"{key}: this key is there twice. Remove one.")
+        section.wrong(f"{key}: this key is there twice. Remove one.")
     else:
         section.values[key.lower()] = value
 

@@ -2,11 +2,12 @@
 
 from collections import deque
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
+from operator import or_
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.cob_ids import EMERGENCY, INVALID_BIT, restricted
+from kontronik_can_gw.canopen.cob_ids import EMERGENCY, INVALID_BIT, Taken, check_free
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.emergency_codes import (
     FROM_GATEWAY,
@@ -26,15 +27,14 @@ _MAX_PENDING = 64
 class Emergencies:
     """State of one node's errors.
 
-    ``send`` is called with COB-ID and the 8 bytes of each emergency. ``taken``: whether a COB-ID is in use by another service.
+    ``send`` is called with COB-ID and the 8 bytes of each emergency.
     """
 
     def __init__(
         self,
         dictionary: Dictionary,
         send: Callable[[int, bytes], None],
-        taken: Callable[[int, object], bool],
-        rerouted: Callable[[int], bool],
+        taken: Taken,
         bits: BitCodes,
     ) -> None:
         self._dictionary = dictionary
@@ -48,7 +48,8 @@ class Emergencies:
         self.mask = 0xFFFFFFFF
         self._inhibit_ns = 0
         self._word = 0  # of the ESC
-        self._word_register = 0
+        self._registered: set[int] = set()
+        """Codes of the ESC's bits that set bits of 1001h."""
         self._active: dict[Condition, None] = {}
         self._unreported: dict[Condition, None] = {}
         self._last_is_error = False  # what was sent last is an error, not 0000h
@@ -56,9 +57,9 @@ class Emergencies:
         self._open = False
         self._last_ns = -NEVER
         self._risen = False  # since the last reset something was wrong
-        self._bind(rerouted)
+        self._bind()
 
-    def _bind(self, rerouted: Callable[[int], bool]) -> None:
+    def _bind(self) -> None:
         bind = self._dictionary.bind
         bind(0x1001, read=lambda _now: self.register)
         bind(
@@ -69,8 +70,8 @@ class Emergencies:
         )
         for variable in self._dictionary.subs(0x1003):
             variable.read = partial(self._kept, variable.entry.sub)
-        bind(0x1014, check=self._check_cob_id, written=rerouted)
-        bind(0x1015, written=self._inhibit_written)
+        bind(0x1014, check=self._check_cob_id)
+        bind(0x1015, written=lambda _now: self.configure(self._node_id))
         bind(at.ERROR_CODE, read=lambda _now: self.code)
 
     @property
@@ -81,10 +82,8 @@ class Emergencies:
     @property
     def register(self) -> int:
         """1001h."""
-        register = self._word_register
-        for condition in self._active:
-            register |= register_of(condition.code)
-        return register
+        codes = {condition.code for condition in self._active} | self._registered
+        return reduce(or_, map(register_of, codes), 0)
 
     @property
     def code(self) -> int:
@@ -101,11 +100,7 @@ class Emergencies:
             return
         self._word = word
         bits, code = self._bits.reported(word, self.mask), self._bits.code
-        self._word_register = 0
-        registered = self._bits.registered(word, self.mask)
-        for bit in range(32):
-            if registered >> bit & 1:
-                self._word_register |= register_of(code(bit))
+        self._registered = self._bits.registered(word, self.mask)
         wanted = {Condition(code(bit), bit, 0): None for bit in range(32) if bits >> bit & 1}
         gone = [c for c in self._active if c.source != FROM_GATEWAY and c not in wanted]
         for condition in gone:
@@ -222,23 +217,16 @@ class Emergencies:
             raise SdoAbort(Abort.NO_DATA)
         return self.history[number - 1]
 
-    def _clear_history(self, _now: int) -> bool:
+    def _clear_history(self, _now: int) -> None:
         self.history.clear()
-        return True
-
-    def _inhibit_written(self, _now: int) -> bool:
-        self.configure(self._node_id)
-        return True
 
     def _check_cob_id(self, value: int) -> None:
         """1014h: bits 0..30 cannot change while it is valid; no 29-bit or restricted id, none that is taken."""
         old, valid = self.cob_id, not value & INVALID_BIT
-        if value & 0x7FFFF800 or (valid and restricted(value & 0x7FF)):
+        if value & 0x7FFFF800 or (valid and not old & INVALID_BIT and old != value):
             raise SdoAbort(Abort.VALUE)
-        if valid and not old & INVALID_BIT and old != value:
-            raise SdoAbort(Abort.VALUE)
-        if valid and self._taken(value & 0x7FF, self):
-            raise SdoAbort(Abort.INCOMPATIBLE)
+        if valid:
+            check_free(value & 0x7FF, self, self._taken)
 
 
 def _only_zero(value: int) -> None:

@@ -7,25 +7,29 @@
 """
 
 from collections.abc import Sequence
-from enum import Enum
+from enum import Enum, IntFlag
 from typing import NamedTuple, Self
 
 from kontronik_can_gw.esc.decoder import ErrorBit, Severity
 
-GENERIC, CURRENT, VOLTAGE, TEMPERATURE, COMMUNICATION, MANUFACTURER = (
-    0x01,
-    0x02,
-    0x04,
-    0x08,
-    0x10,
-    0x80,
-)
+
+class Register(IntFlag):
+    """Bits of the error register 1001h."""
+
+    GENERIC = 0x01
+    CURRENT = 0x02
+    VOLTAGE = 0x04
+    TEMPERATURE = 0x08
+    COMMUNICATION = 0x10
+    MANUFACTURER = 0x80
+
+
 _REGISTER_OF_CLASS = {
-    0x2: CURRENT,
-    0x3: VOLTAGE,
-    0x4: TEMPERATURE,
-    0x8: COMMUNICATION,
-    0xF: MANUFACTURER,
+    0x2: Register.CURRENT,
+    0x3: Register.VOLTAGE,
+    0x4: Register.TEMPERATURE,
+    0x8: Register.COMMUNICATION,
+    0xF: Register.MANUFACTURER,
 }
 FROM_GATEWAY = 0xFF
 
@@ -87,7 +91,7 @@ class Condition(NamedTuple):
 
 def register_of(code: int) -> int:
     """The bits of 1001h that an error code sets: the generic one and that of its class."""
-    return GENERIC | _REGISTER_OF_CLASS.get(code >> 12, 0)
+    return int(Register.GENERIC | _REGISTER_OF_CLASS.get(code >> 12, 0))
 
 
 class BitCodes:
@@ -115,6 +119,7 @@ class BitCodes:
                 bits &= ~summary
         return bits
 
-    def registered(self, word: int, mask: int) -> int:
-        """The bits that set bits of 1001h: all errors, and the warnings in the mask."""
-        return word & self._error_bits & ~self._summary_bits | self.reported(word, mask)
+    def registered(self, word: int, mask: int) -> set[int]:
+        """The codes that set bits of 1001h: of all errors, and of the warnings in the mask."""
+        bits = word & self._error_bits & ~self._summary_bits | self.reported(word, mask)
+        return {self.code(bit) for bit in range(32) if bits >> bit & 1}

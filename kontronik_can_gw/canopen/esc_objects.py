@@ -4,14 +4,12 @@ from collections.abc import Callable
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.dictionary import Dictionary, signature
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
-from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
-
-RESET = int.from_bytes(b"rset", "little")
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 
 class EscObjects:
@@ -41,8 +39,13 @@ class EscObjects:
         dictionary.bind(at.INFO, 6, read=self._device_name)
         dictionary.bind(at.INFO, 7, read=self._firmware)
         for variable in dictionary.subs(at.SETTINGS):
-            variable.written = self._settings_written
-        dictionary.bind(at.RESET_STATISTICS, 1, check=_check_reset, written=self._reset_statistics)
+            variable.written = self.apply_settings
+        dictionary.bind(
+            at.RESET_STATISTICS,
+            1,
+            check=signature(b"rset"),
+            written=lambda _now: esc.reset_statistics(),
+        )
 
     def apply_settings(self, now: int) -> None:
         """Take over 2100h."""
@@ -79,17 +82,11 @@ class EscObjects:
 
     # --- objects
 
-    def _status_register(self, _now: int) -> int:
+    def _status_register(self, now: int) -> int:
         """1002h: bits 7..0 link status as 2020h:1, 15..8 CAN state, 16 telemetry fresh, 17 information fresh."""
-        esc = self._esc
-        return (
-            int(esc.link)
-            | (self._gateway.state is GatewayState.REPLAY) << 6
-            | (esc.info is not None) << 7
-            | int(self._gateway.can_state) << 8
-            | (esc.live is not None) << 16
-            | (esc.info is not None) << 17
-        )
+        esc, gateway = self._esc, self._gateway
+        fresh = (esc.live is not None) | (esc.info is not None) << 1
+        return at.link_status(esc, gateway, now) | int(gateway.can_state) << 8 | fresh << 16
 
     def _device_name(self, _now: int) -> bytes:
         protocol, info = self._esc.protocol, self._esc.last_info
@@ -103,17 +100,3 @@ class EscObjects:
         if text is None:
             raise SdoAbort(Abort.NO_DATA)
         return text.encode("ascii")
-
-    def _settings_written(self, now: int) -> bool:
-        self.apply_settings(now)
-        return True
-
-    def _reset_statistics(self, _now: int) -> bool:
-        self._esc.reset_statistics()
-        return True
-
-
-def _check_reset(value: int) -> None:
-    """A new 2102h:1: the signature ``rset``."""
-    if value != RESET:
-        raise SdoAbort(Abort.TRANSFER)

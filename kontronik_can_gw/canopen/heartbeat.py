@@ -1,10 +1,11 @@
 """Heartbeat: the producer's tick (1017h) and the watch over other nodes (1016h). CiA 301, 7.2.8.2.2 and 7.5.2.19/20."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
+from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.output import NEVER
 
@@ -13,13 +14,14 @@ _CATCHING_UP_NS = SECOND // 2
 
 
 class Producer:
-    """When the next heartbeat is due. A period of 0 produces none."""
+    """Has heartbeats sent. A period of 0 produces none."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: Dictionary, send: Callable[[], None]) -> None:
         self.due = NEVER
         self._dictionary = dictionary
+        self._send = send
         self._period = 0
-        dictionary.bind(0x1017, written=self._written)
+        dictionary.bind(0x1017, written=self.configure)
 
     def configure(self, now: int) -> None:
         """Take over 1017h. A changed period holds from now on: the first heartbeat comes one period later."""
@@ -35,26 +37,21 @@ class Producer:
         if self._period:
             self.due = now
 
-    def ticks(self, now: int) -> bool:
-        """True when one is due. Missed ones are not made up for: one heartbeat says all."""
+    def advance(self, now: int) -> None:
+        """Send one if it is due. Missed ones are not made up for: one heartbeat says all."""
         if now < self.due:
-            return False
+            return
         self.due += self._period
         if self.due <= now:
             self.due = now + self._period
-        return True
-
-    def _written(self, now: int) -> bool:
-        self.configure(now)
-        return True
+        self._send()
 
 
+@dataclass
 class _Watched:
-    def __init__(self, node_id: int, timeout: int) -> None:
-        self.node_id = node_id
-        self.timeout = timeout
-        self.due = NEVER  # the watch begins with the first heartbeat
-        self.lost = False
+    timeout: int
+    due: int = NEVER  # the watch begins with the first heartbeat
+    lost: bool = False
 
 
 class Consumer:
@@ -63,15 +60,9 @@ class Consumer:
     ``changed`` is called with a node-ID, whether its heartbeat is lost (or no longer), and the time.
     """
 
-    def __init__(
-        self,
-        dictionary: Dictionary,
-        changed: Callable[[int, bool, int], None],
-        rerouted: Callable[[int], bool],
-    ) -> None:
+    def __init__(self, dictionary: Dictionary, changed: Callable[[int, bool, int], None]) -> None:
         self._dictionary = dictionary
         self._changed = changed
-        self._rerouted = rerouted
         self._watched: dict[int, _Watched] = {}
         self._judged_from = -NEVER
         for variable in dictionary.subs(0x1016):
@@ -114,53 +105,44 @@ class Consumer:
             self._judge(now, now)
 
     def _judge(self, until: int, now: int) -> None:
-        late = [watched for watched in self._watched.values() if until >= watched.due]
-        for watched in late:
+        late = {node_id: each for node_id, each in self._watched.items() if until >= each.due}
+        for watched in late.values():
             watched.due, watched.lost = NEVER, True
-        for watched in late:
-            self._changed(watched.node_id, True, now)
+        for node_id in late:
+            self._changed(node_id, True, now)
 
     def _configure(self) -> None:
-        """Bits 23..16 of an entry are the node-ID, bits 15..0 the time in ms; 0 in either leaves it unused.
-
-        A watch that stays as it was goes on.
-        """
+        """Take over 1016h. A watch that stays as it was goes on."""
         before, self._watched = self._watched, {}
-        for value in _values(self._dictionary):
-            node_id, timeout = value >> 16 & 0xFF, (value & 0xFFFF) * MS
-            if 1 <= node_id <= 127 and timeout:
-                old = before.get(node_id)
-                kept = old if old is not None and old.timeout == timeout else None
-                self._watched[node_id] = kept or _Watched(node_id, timeout)
+        for node_id, timeout in self._entries():
+            old = before.get(node_id)
+            kept = old if old is not None and old.timeout == timeout else None
+            self._watched[node_id] = kept or _Watched(timeout)
 
-    def _written(self, now: int) -> bool:
-        lost = [watched.node_id for watched in self._watched.values() if watched.lost]
+    def _written(self, now: int) -> None:
+        lost = [node_id for node_id, watched in self._watched.items() if watched.lost]
         self._configure()
         for node_id in lost:
             if node_id not in self._watched or not self._watched[node_id].lost:
                 self._changed(node_id, False, now)
-        return self._rerouted(now)
 
     def _check(self, own: Variable, value: int) -> None:
         """A new entry. SdoAbort 06040043h where another entry watches the node already (CiA 301, 7.5.2.19)."""
-        node_id = value >> 16 & 0xFF
         if value >> 24:
             raise SdoAbort(Abort.VALUE)  # reserved bits
-        if (
-            value & 0xFFFF
-            and 1 <= node_id <= 127
-            and any(
-                other & 0xFFFF and other >> 16 & 0xFF == node_id
-                for other in _values(self._dictionary, own)
-            )
-        ):
+        used = _used(value)
+        if used is not None and used[0] in dict(self._entries(own)):
             raise SdoAbort(Abort.INCOMPATIBLE)
 
+    def _entries(self, but: Variable | None = None) -> Iterator[tuple[int, int]]:
+        for variable in self._dictionary.subs(0x1016):
+            if variable is not but and (used := _used(variable.value)) is not None:
+                yield used
 
-def _values(dictionary: Dictionary, but: Variable | None = None) -> list[int]:
-    """The entries of 1016h."""
-    return [
-        variable.value
-        for variable in dictionary.subs(0x1016)
-        if variable is not but and isinstance(variable.value, int)
-    ]
+
+def _used(value: Value) -> tuple[int, int] | None:
+    """An entry's node-ID (bits 23..16) and time (bits 15..0, ms) in ns; None where either is none."""
+    if not isinstance(value, int):
+        return None
+    node_id, timeout = value >> 16 & 0xFF, (value & 0xFFFF) * MS
+    return (node_id, timeout) if 1 <= node_id <= 127 and timeout else None

@@ -79,6 +79,5 @@ class Identity:
         if self._taken(value):
             raise SdoAbort(Abort.INCOMPATIBLE)
 
-    def _node_id_written(self, _now: int) -> bool:
+    def _node_id_written(self, _now: int) -> None:
         self._set_pending(self._dictionary.number(at.NODE_ID, 2))
-        return True

@@ -69,19 +69,18 @@ SCAN_RESET = 0x80
 
 
 class Host(Protocol):
-    """The node as LSS sees it."""
+    """The node as LSS sees it. Node-IDs: 1..127, or 255: unconfigured."""
 
     @property
     def identity(self) -> tuple[int, int, int, int]:
         """1018h:1..4: vendor-ID, product code, revision number, serial number; 32 bit each."""
 
     @property
-    def active_node_id(self) -> int:
-        """1..127, or 255: unconfigured."""
+    def active_node_id(self) -> int: ...
 
     @property
     def pending_node_id(self) -> int:
-        """1..127 or 255; becomes the active one at reset communication."""
+        """Becomes the active one at reset communication."""
 
     def configure_node_id(self, node_id: int) -> bool:
         """Set the pending node-ID, 1..127 or 255. False: refused (bus writes switched off)."""
@@ -184,23 +183,18 @@ class LssSlave:
 
     def _fits(self, service: int, number: int) -> bool:
         vendor, product, revision, serial = self._host.identity
-        match service:
-            case Service.SELECT_VENDOR | Service.IDENTIFY_VENDOR:
-                return number == vendor
-            case Service.SELECT_PRODUCT | Service.IDENTIFY_PRODUCT:
-                return number == product
-            case Service.SELECT_REVISION:
-                return number == revision
-            case Service.SELECT_SERIAL:
-                return number == serial
-            case Service.IDENTIFY_REVISION_LOW:
-                return number <= revision
-            case Service.IDENTIFY_REVISION_HIGH:
-                return revision <= number
-            case Service.IDENTIFY_SERIAL_LOW:
-                return number <= serial
-            case _:
-                return serial <= number
+        return {
+            Service.SELECT_VENDOR: number == vendor,
+            Service.SELECT_PRODUCT: number == product,
+            Service.SELECT_REVISION: number == revision,
+            Service.SELECT_SERIAL: number == serial,
+            Service.IDENTIFY_VENDOR: number == vendor,
+            Service.IDENTIFY_PRODUCT: number == product,
+            Service.IDENTIFY_REVISION_LOW: number <= revision,
+            Service.IDENTIFY_REVISION_HIGH: revision <= number,
+            Service.IDENTIFY_SERIAL_LOW: number <= serial,
+            Service.IDENTIFY_SERIAL_HIGH: serial <= number,
+        }[Service(service)]
 
     def _fastscan(self, number: int, bit_checked: int, sub: int, following: int) -> None:
         """51h | IDNumber u32 | BitChecked 0..31 or 80h | LSSSub 0..3 | LSSNext 0..3."""

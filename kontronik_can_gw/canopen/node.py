@@ -5,13 +5,13 @@ service is plain storage. The node itself has what several services have a part 
 """
 
 from functools import partial
+from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen.abort import Abort
 from kontronik_can_gw.canopen.bound_values import bind_values
 from kontronik_can_gw.canopen.can_faults import CanFaults
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT, LSS_ANSWER, SDO_ANSWER
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
-from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects
@@ -19,48 +19,51 @@ from kontronik_can_gw.canopen.heartbeat import Consumer, Producer
 from kontronik_can_gw.canopen.identity import Identity
 from kontronik_can_gw.canopen.lss import LssSlave
 from kontronik_can_gw.canopen.nmt import Nmt
-from kontronik_can_gw.canopen.node_settings import NodeSettings
-from kontronik_can_gw.canopen.owner import Owner
 from kontronik_can_gw.canopen.parameters import Parameters
-from kontronik_can_gw.canopen.reception import Reception
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.canopen.sync import SyncConsumer
 from kontronik_can_gw.canopen.tpdos import Tpdos
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.output import NEVER
 
+if TYPE_CHECKING:
+    from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
+
+_WITH_COB_ID = frozenset({0x1005, 0x1014, 0x1016, *range(0x1800, 0x1A00)})
+"""Objects whose download may change COB-IDs."""
+
 
 class Node:
-    """One ESC's node. ``set_due`` follows each call of one of its services."""
+    """One ESC's node. ``set_due`` follows each call of one of its services. ``number``: of its ESC in the setup."""
 
     def __init__(
         self,
-        eds: Eds,
-        dictionary: Dictionary,
+        number: int,
+        setup: "CanopenSetup",
         esc: EscTelemetry,
         gateway: GatewayStatus,
-        settings: NodeSettings,
-        stored: Stored,
-        owner: Owner,
+        owner: "Nodes",
     ) -> None:
         self.esc = esc
-        self.dictionary = dictionary
-        self.settings = settings
+        base = setup.escs[number] if setup.escs else esc.settings
+        self.dictionary = dictionary = setup.dictionary(number, base)
+        self.settings = settings = setup.settings[number]
+        self._number = number
         self.due = NEVER
         self._owner = owner
         taken = owner.cob_id_taken
         self.nmt = Nmt(dictionary, settings.self_start, self._entered)
         codes = BitCodes(esc.protocol.errors.get("operating_errors", ()))
-        self.emergencies = Emergencies(dictionary, self._send, taken, self._rerouted, codes)
-        self._producer = Producer(dictionary)
-        self.consumer = Consumer(dictionary, self._watch_changed, self._rerouted)
-        self.sync = SyncConsumer(dictionary, taken, self._rerouted)
+        self.emergencies = Emergencies(dictionary, self._send, taken, codes)
+        self._producer = Producer(dictionary, self._send_heartbeat)
+        self.consumer = Consumer(dictionary, self._watch_changed)
+        self.sync = SyncConsumer(dictionary, taken)
         self.sdo = SdoServer(dictionary, self._send_sdo, settings.segment_ns)
-        self.parameters = Parameters(dictionary, stored, self.sdo, partial(owner.save, self))
+        self.parameters = Parameters(dictionary, setup.stored[number], self.sdo, self._save)
         self.identity = Identity(
             dictionary,
             settings,
@@ -70,28 +73,21 @@ class Node:
         )
         self.lss = LssSlave(self.identity, partial(self._send, LSS_ANSWER))
         bind_values(dictionary, esc, gateway)
-        self.tpdos = Tpdos(dictionary, esc, gateway, owner.send, taken, self._rerouted)
+        self.tpdos = Tpdos(dictionary, esc, gateway, owner.send, taken)
         self._esc_objects = EscObjects(
             dictionary,
             esc,
             gateway,
             self.emergencies,
             settings.device,
-            self._settings_changed,
+            partial(owner.settings_changed, number),
             self.nmt.telemetry_lost,
         )
-        self.can_faults = CanFaults(
-            self.emergencies, self.nmt, self._return_from_outage, self._repeat
-        )
-        self.reception = Reception(self)
-        self._bind_texts(eds)
+        self.can_faults = CanFaults(self.emergencies, self.nmt, self._returned, self._repeat)
+        self._timers = (self._producer, self.consumer, self.sdo, self.emergencies, self.tpdos)
+        dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
+        dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS
         dictionary.written = self._on_download
-
-    def _bind_texts(self, eds: Eds) -> None:
-        """100Ah, and the stored EDS 1021h."""
-        version = self.settings.version.encode("ascii", "replace")
-        self.dictionary.bind(0x100A, read=lambda _now: version)
-        self.dictionary.bind(0x1021, read=lambda _now: eds.data)
 
     @property
     def state(self) -> NmtState:
@@ -160,10 +156,10 @@ class Node:
             if self.nmt.starts_itself:
                 self.nmt.enter(NmtState.OPERATIONAL, now)
         if parameters.rejected:
-            self._owner.rejected(self, parameters.rejected)
+            self._owner.rejected_parameters += [(self._number, key) for key in parameters.rejected]
         parameters.verify()
-        self._owner.routes_changed()
-        self._owner.state_changed()
+        self._owner.rerouted = True
+        self._owner.state_changes += 1
         self.set_due()
 
     # --- what happens
@@ -179,12 +175,8 @@ class Node:
         """Let time pass."""
         if now < self.due:
             return
-        if self._producer.ticks(now):
-            self._send_heartbeat()
-        self.consumer.advance(now)
-        self.sdo.advance(now)
-        self.emergencies.advance(now)
-        self.tpdos.advance(now)
+        for timer in self._timers:
+            timer.advance(now)
         self.set_due()
 
     def saved(self, error: str | None, now: int) -> None:
@@ -195,13 +187,16 @@ class Node:
         if ticket is None:
             self.lss.stored(error is None)
         else:
-            self.sdo.confirm(None if error is None else Abort.HARDWARE, now, ticket)
+            self.sdo.confirm(None if error is None else Abort.HARDWARE, ticket)
         self.set_due()
 
-    # --- frames out
+    # --- what services give out
 
     def _send(self, cob_id: int, data: bytes) -> None:
         self._owner.send(CanFrame(cob_id, data, queued=True))
+
+    def _save(self, stored: Stored) -> None:
+        self._owner.saves.append((self._number, stored))
 
     def _send_sdo(self, data: bytes) -> None:
         self._send(SDO_ANSWER + self.node_id, data)
@@ -214,7 +209,7 @@ class Node:
     def _entered(self, now: int) -> None:
         """The NMT state is another one."""
         self.tpdos.stop()
-        self._owner.state_changed()
+        self._owner.state_changes += 1
         if self.state is NmtState.STOPPED:
             self.emergencies.close()
             self.sdo.reset()
@@ -223,26 +218,19 @@ class Node:
         if self.state is NmtState.OPERATIONAL:
             self.tpdos.start(now)
 
-    def _rerouted(self, _now: int) -> bool:
-        """After a download: a COB-ID is another one."""
-        self._owner.routes_changed()
-        return True
-
     def _watch_changed(self, node_id: int, lost: bool, now: int) -> None:
         """A watched heartbeat stays away, or no longer."""
         self.emergencies.set(GatewayError.HEARTBEAT_LOST, lost, now, node_id)
         if lost:
             self.nmt.communication_error(now)
 
-    def _settings_changed(self, settings: EscSettings) -> None:
-        """2100h: other settings of the ESC."""
-        self._owner.settings_changed(self, settings)
-
     def _on_download(self, variable: Variable, changed: bool, now: int) -> None:
         self.tpdos.on_download(variable, now)
         self.parameters.on_download(variable, changed)
+        if variable.entry.index in _WITH_COB_ID:
+            self._owner.rerouted = True
 
-    def _return_from_outage(self, now: int) -> None:
+    def _returned(self, now: int) -> None:
         """The controller left bus-off, or the interface is back. With 1029h:1 = 0 the node boots, so that its master sets it up anew.
 
         CiA 301 asks for PRE-OPERATIONAL then; a boot-up besides is what brings a node without a master, self-starting, to work again.
@@ -259,11 +247,4 @@ class Node:
 
     def set_due(self) -> None:
         """Look when ``advance`` has something to do: after each call of a service."""
-        sdo = self.sdo.next_deadline()
-        self.due = min(
-            self._producer.due,
-            self.consumer.due,
-            NEVER if sdo is None else sdo,
-            self.emergencies.due,
-            self.tpdos.due,
-        )
+        self.due = min([timer.due for timer in self._timers])

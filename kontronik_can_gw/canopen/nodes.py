@@ -9,16 +9,16 @@ from kontronik_can_gw.canopen.cob_ids import (
     LSS_REQUEST,
     NMT,
     OF_NODE_ID,
-    chosen_ids,
     default_ids,
-    transmit_ids,
+    uses,
 )
+from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import is_reset_of_all
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
-from kontronik_can_gw.canopen.reception import FrameTaker
+from kontronik_can_gw.canopen.reception import FrameTaker, routes
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
@@ -43,10 +43,11 @@ class CanopenSetup:
 
     def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
         """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""
-        return [
-            esc_settings(make_dictionary(self.eds, esc, node, stored), esc)
-            for esc, node, stored in zip(escs, self.settings, self.stored, strict=True)
-        ]
+        return [esc_settings(self.dictionary(n, esc), esc) for n, esc in enumerate(escs)]
+
+    def dictionary(self, number: int, esc: EscSettings) -> Dictionary:
+        """The dictionary of a node before its first reset."""
+        return make_dictionary(self.eds, esc, self.settings[number], self.stored[number])
 
     def nodes(
         self, escs: Sequence[EscSettings], foreign_ids: Mapping[int, str] | None = None
@@ -75,29 +76,22 @@ class Nodes(Output):
     ) -> None:
         super().__init__()
         self.due = NEVER
-        self._settings_changed = settings_changed
+        self.settings_changed = settings_changed
         self._foreign_ids = foreign_ids or {}
-        self._routes: dict[int, list[FrameTaker]] = {}
-        self._rerouted = True
+        self._routes: dict[int, list[tuple[Node, FrameTaker]]] = {}
+        self.rerouted = True
+        """A node uses other COB-IDs now."""
         self._watched: frozenset[int] = frozenset()
         self._to_watchers: deque[CanFrame] = deque()
         self._started = False
-        self.nodes: list[Node] = []
-        bases = setup.escs or tuple(esc.settings for esc in escs)
-        for esc, base, settings, stored in zip(
-            escs, bases, setup.settings, setup.stored, strict=True
-        ):
-            dictionary = make_dictionary(setup.eds, base, settings, stored)
-            self.nodes.append(Node(setup.eds, dictionary, esc, gateway, settings, stored, self))
+        self.nodes = [Node(n, setup, esc, gateway, self) for n, esc in enumerate(escs)]
 
     # --- what happens
 
     def start(self, now: int, can_open: bool) -> None:
         """Power on; without a bus that can hear it the nodes boot when there is one."""
-        if can_open:
-            self._power_on(now)
-
-    def _power_on(self, now: int) -> None:
+        if not can_open:
+            return
         self._started = True
         for node in self.nodes:
             node.power_on(now)
@@ -111,8 +105,7 @@ class Nodes(Output):
         if frame.can_id == NMT and is_reset_of_all(frame.data):
             for node in self.nodes:
                 node.tpdos.release_ids()
-        for taker in self._routes.get(frame.can_id, ()):
-            taker(frame.data, now, at)
+        self._route(frame, now, at)
         if frame.can_id == LSS_REQUEST:
             # what several slaves send at the same time is one frame on a bus
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
@@ -122,7 +115,6 @@ class Nodes(Output):
         return self.due
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        """Something of an ESC changed."""
         self.nodes[esc].on_event(events, now)
         self._after(now)
 
@@ -137,14 +129,13 @@ class Nodes(Output):
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost, or for the first time."""
         if not self._started:
-            self._power_on(now)
+            self.start(now, can_open=True)
             return
         for node in self.nodes:
             node.can_faults.frames_pass(now)
         self._after_all(now)
 
     def held_up(self, now: int) -> None:
-        """The process was held up until ``now``."""
         for node in self.nodes:
             node.tpdos.held_up(now)
             node.consumer.held_up(now)
@@ -169,13 +160,13 @@ class Nodes(Output):
     def own_ids(self) -> dict[int, Owner]:
         """COB-IDs that only our nodes send with."""
         return {
-            cob_id: Owner(index, what)
+            use.cob_id: Owner(index, use.what)
             for index, node in enumerate(self.nodes)
-            for cob_id, what in transmit_ids(node)
+            for use in uses(node)
+            if use.own
         }
 
     def overrun(self, now: int) -> None:
-        """The CAN controller lost received frames."""
         for node in self.nodes:
             node.can_faults.overrun(now)
         self._after_all(now)
@@ -191,7 +182,6 @@ class Nodes(Output):
         self._after(now)
 
     def advance(self, now: int) -> None:
-        """Let time pass."""
         if now < self.due:
             return
         for node in self.nodes:
@@ -199,46 +189,37 @@ class Nodes(Output):
                 node.advance(now)
         self._after(now)
 
-    # --- what nodes ask (owner.Owner)
+    # --- what nodes ask
 
     def send(self, frame: CanFrame) -> None:
+        """Put a frame out."""
         self.frames.append(frame)
         if frame.can_id in self._watched:
             self._to_watchers.append(frame)
 
-    def save(self, node: Node, stored: Stored) -> None:
-        self.saves.append((self.nodes.index(node), stored))
-
-    def settings_changed(self, node: Node, settings: EscSettings) -> None:
-        self._settings_changed(self.nodes.index(node), settings)
-
-    def routes_changed(self) -> None:
-        self._rerouted = True
-
-    def rejected(self, node: Node, keys: list[int]) -> None:
-        self.rejected_parameters += [(self.nodes.index(node), key) for key in keys]
-
-    def state_changed(self) -> None:
-        self.state_changes += 1
-
     def cob_id_taken(self, cob_id: int, user: object) -> bool:
-        if cob_id in self._foreign_ids:
-            return True
-        used = (chosen for node in self.nodes for chosen in chosen_ids(node))
-        return any(other is not user and other_id == cob_id for other, other_id in used)
+        """Whether something else of the gateway uses this id; ``user`` as in ``Use``."""
+        used = (use for node in self.nodes for use in uses(node))
+        return cob_id in self._foreign_ids or any(
+            use.cob_id == cob_id and use.user is not user for use in used
+        )
 
     def node_id_taken(self, node_id: int, node: Node) -> bool:
+        """Whether another node has this node-ID, now or from its next reset on, or another message a COB-ID of it."""
         if node_id == UNCONFIGURED:
             return False
-        if any(first + node_id in self._foreign_ids for first in OF_NODE_ID):
-            return True
         others = [other for other in self.nodes if other is not node]
-        used = {cob_id for other in others for _, cob_id in chosen_ids(other)} | set(
-            self._foreign_ids
-        )
-        if any(cob_id in used for _, _, cob_id in default_ids(node.dictionary, node_id)):
+        if any(node_id in (other.node_id, other.pending_node_id) for other in others):
             return True
-        return any(node_id in (other.node_id, other.pending_node_id) for other in others)
+        wanted = {first + node_id for first in OF_NODE_ID}
+        wanted |= {cob_id for _, _, cob_id in default_ids(node.dictionary, node_id)}
+        used = {use.cob_id for other in others for use in uses(other)}
+        return not wanted.isdisjoint(used | self._foreign_ids.keys())
+
+    def _route(self, frame: CanFrame, now: int, at: int) -> None:
+        for node, taker in self._routes.get(frame.can_id, ()):
+            taker(frame.data, now, at)
+            node.set_due()
 
     def _after_all(self, now: int) -> None:
         for node in self.nodes:
@@ -249,16 +230,15 @@ class Nodes(Output):
         while self._to_watchers:
             # what we send does not come back from the bus: one of our nodes may watch another
             frame = self._to_watchers.popleft()
-            for taker in self._routes.get(frame.can_id, ()):
-                taker(frame.data, now, now)
-        if self._rerouted:
-            self._rerouted = False
+            self._route(frame, now, now)
+        if self.rerouted:
+            self.rerouted = False
             self._watched = frozenset(
                 HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids
             )
             self._routes = {}
             for node in self.nodes:
-                for cob_id, taker in node.reception.routes():
-                    self._routes.setdefault(cob_id, []).append(taker)
+                for cob_id, taker in routes(node):
+                    self._routes.setdefault(cob_id, []).append((node, taker))
             self.receive_ids = frozenset(self._routes)
         self.due = min([node.due for node in self.nodes])

@@ -3,7 +3,7 @@
 The objects' types, names, limits and PDO defaults are in the EDS; the values, units and ranges in ``VALUES``.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
@@ -29,60 +29,73 @@ UNITS = 0x2002
 SETTINGS, NODE_ID, RESET_STATISTICS = 0x2100, 0x2101, 0x2102
 ERROR_CODE, VELOCITY, DC_LINK_VOLTAGE = 0x603F, 0x606C, 0x6079
 
-# Sub-index to the name of a value, and steps of the object to one of the value's units.
-_LIVE_VALUES = {
-    1: ("electrical_speed", 1),
-    2: ("battery_voltage", 100),
-    3: ("battery_current", 10),
-    4: ("motor_current", 10),
-    5: ("peak_current", 10),
-    6: ("consumed_charge", 1),
-    7: ("bec_current", 1000),
-    8: ("bec_voltage", 1000),
-    9: ("pwm_input", 1),
-    10: ("throttle", 1),
-    11: ("output_opening", 1),
-    12: ("power_stage_temperature", 1),
-    13: ("bec_temperature", 1),
-    14: ("operating_errors", 1),
-    15: ("operating_state_raw", 1),
-    16: ("timing", 1),
+_VALUES: Mapping[int, Mapping[int, tuple[str, int]]] = {
+    LIVE: {
+        1: ("electrical_speed", 1),
+        2: ("battery_voltage", 100),
+        3: ("battery_current", 10),
+        4: ("motor_current", 10),
+        5: ("peak_current", 10),
+        6: ("consumed_charge", 1),
+        7: ("bec_current", 1000),
+        8: ("bec_voltage", 1000),
+        9: ("pwm_input", 1),
+        10: ("throttle", 1),
+        11: ("output_opening", 1),
+        12: ("power_stage_temperature", 1),
+        13: ("bec_temperature", 1),
+        14: ("operating_errors", 1),
+        15: ("operating_state_raw", 1),
+        16: ("timing", 1),
+    },
+    DERIVED: {
+        1: ("motor_speed", 1),
+        2: ("output_speed", 1),
+        3: ("battery_power", 10),
+        4: ("energy_used", 10),
+        5: ("mean_cell_voltage", 1000),
+        6: ("motor_run_time", 1),
+    },
+    INFO: {
+        1: ("device_raw", 1),
+        2: ("variant", 1),
+        3: ("firmware", 1),
+        4: ("selftest_errors", 1),
+        5: ("cell_count", 1),
+    },
+    EXTREMES: {
+        1: ("max_electrical_speed", 1),
+        2: ("min_battery_voltage", 100),
+        3: ("max_battery_voltage", 100),
+        4: ("max_battery_current", 10),
+        5: ("max_motor_current", 10),
+        6: ("max_peak_current", 10),
+        7: ("max_bec_current", 1000),
+        8: ("min_bec_voltage", 1000),
+        9: ("max_throttle", 1),
+        10: ("max_output_opening", 1),
+        11: ("min_power_stage_temperature", 1),
+        12: ("max_power_stage_temperature", 1),
+        13: ("min_bec_temperature", 1),
+        14: ("max_bec_temperature", 1),
+    },
+    GATEWAY: {
+        1: ("uptime", 1),
+        2: ("can_state", 1),
+        3: ("sent_frames", 1),
+        4: ("received_frames", 1),
+        5: ("send_failures", 1),
+        6: ("bus_off_count", 1),
+        7: ("replaced_frames", 1),
+        8: ("esc_count", 1),
+        9: ("escs_ok", 1),
+    },
+    VELOCITY: {0: ("motor_speed", 1)},
+    DC_LINK_VOLTAGE: {0: ("battery_voltage", 1000)},
 }
-_DERIVED_VALUES = {
-    1: ("motor_speed", 1),
-    2: ("output_speed", 1),
-    3: ("battery_power", 10),
-    4: ("energy_used", 10),
-    5: ("mean_cell_voltage", 1000),
-    6: ("motor_run_time", 1),
-}
-_EXTREMES = {
-    1: ("max_electrical_speed", 1),
-    2: ("min_battery_voltage", 100),
-    3: ("max_battery_voltage", 100),
-    4: ("max_battery_current", 10),
-    5: ("max_motor_current", 10),
-    6: ("max_peak_current", 10),
-    7: ("max_bec_current", 1000),
-    8: ("min_bec_voltage", 1000),
-    9: ("max_throttle", 1),
-    10: ("max_output_opening", 1),
-    11: ("min_power_stage_temperature", 1),
-    12: ("max_power_stage_temperature", 1),
-    13: ("min_bec_temperature", 1),
-    14: ("max_bec_temperature", 1),
-}
-_GATEWAY_VALUES = {
-    1: ("uptime", 1),
-    2: ("can_state", 1),
-    3: ("sent_frames", 1),
-    4: ("received_frames", 1),
-    5: ("send_failures", 1),
-    6: ("bus_off_count", 1),
-    7: ("replaced_frames", 1),
-    8: ("esc_count", 1),
-    9: ("escs_ok", 1),
-}
+"""By index and sub-index the name of a value, and steps of the object to one of the value's units."""
+_ROLL = frozenset({(DERIVED, 4), (DERIVED, 6)})
+"""These start again at 0 after the greatest number of their type."""
 _STATUS = frozenset({"operating_errors", "operating_state_raw", "link_status"})
 """A change of these is news by itself; a PDO that carries one is sent on that change."""
 
@@ -117,11 +130,7 @@ class Bound:
         return value % (high + 1) if value is not None and self.source.rolls else value
 
 
-def _of_link(
-    name: str,
-    read: Callable[[EscTelemetry], int],
-    pace: Group | None = None,
-) -> Value:
+def _of_link(name: str, read: Callable[[EscTelemetry], int], pace: Group | None = None) -> Value:
     """A counter as the objects show it: since it was reset."""
     return Value(
         *(name, "", Group.LINK, Kind.COUNT),
@@ -142,7 +151,7 @@ def _age(name: str, stamp: Callable[[EscTelemetry], int | None]) -> Value:
     return Value(name, "ms", Group.LINK, Kind.AGE, read=read, low=0, high=U16)
 
 
-def _link_status(esc: EscTelemetry, gateway: GatewayStatus, _now: int) -> int:
+def link_status(esc: EscTelemetry, gateway: GatewayStatus, _now: int) -> int:
     return esc.link | (gateway.state is GatewayState.REPLAY) << 6 | (esc.info is not None) << 7
 
 
@@ -159,7 +168,7 @@ def _firmware(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | No
 
 _FIRMWARE = Value("firmware", "", Group.INFO, Kind.BITS, read=_firmware, low=0, high=U16)
 _LINK_VALUES = {
-    1: Value("link_status", "", Group.LINK, Kind.STATE, read=_link_status, low=0, high=U8),
+    1: Value("link_status", "", Group.LINK, Kind.STATE, read=link_status, low=0, high=U8),
     2: _of_link("live_counter", lambda esc: esc.counters.live, Group.LIVE),
     3: _age("data_age", lambda esc: esc.live_ns),
     4: _age("info_age", lambda esc: esc.last_info_ns),
@@ -173,35 +182,23 @@ _LINK_VALUES = {
 }
 
 
-def _bindings(values: Mapping[str, Value]) -> Iterator[tuple[int, int, Value, int]]:
-    """Index, sub-index, value and steps of the object to one unit."""
-    for sub, (name, per_unit) in _LIVE_VALUES.items():
-        yield LIVE, sub, values[name], per_unit
-    for sub, (name, per_unit) in _DERIVED_VALUES.items():
-        rolls = name in ("energy_used", "motor_run_time")
-        yield DERIVED, sub, replace(values[name], rolls=rolls), per_unit
-    yield INFO, 1, _kept(values["device_raw"]), 1
-    yield INFO, 2, _kept(values["variant"]), 1
-    yield INFO, 3, _kept(_FIRMWARE), 1
-    yield INFO, 4, _kept(values["selftest_errors"]), 1
-    yield INFO, 5, _kept(values["cell_count"]), 1
-    for sub, (name, per_unit) in _EXTREMES.items():
-        yield EXTREMES, sub, _kept(values[name]), per_unit
-    for sub, value in _LINK_VALUES.items():
-        yield LINK, sub, value, value.per_unit
-    for sub, (name, per_unit) in _GATEWAY_VALUES.items():
-        yield GATEWAY, sub, values[name], per_unit
-    yield VELOCITY, 0, values["motor_speed"], 1
-    yield DC_LINK_VOLTAGE, 0, values["battery_voltage"], 1000
-
-
 @cache
 def bindings_of(protocol: EscProtocol) -> Mapping[tuple[int, int], Bound]:
     """(Index, sub-index) to what the object shows of an ESC of this protocol."""
-    return {
-        (index, sub): Bound(value, Fraction(per_unit))
-        for index, sub, value, per_unit in _bindings(values_of(protocol))
+    values = {**values_of(protocol), _FIRMWARE.name: _FIRMWARE}
+    found = {}
+    for index, subs in _VALUES.items():
+        for sub, (name, per_unit) in subs.items():
+            value = values[name]
+            if index in (INFO, EXTREMES):
+                value = _kept(value)
+            elif (index, sub) in _ROLL:
+                value = replace(value, rolls=True)
+            found[index, sub] = Bound(value, Fraction(per_unit))
+    link = {
+        (LINK, sub): Bound(value, Fraction(value.per_unit)) for sub, value in _LINK_VALUES.items()
     }
+    return found | link
 
 
 BINDINGS = bindings_of(PROTOCOLS[0])

@@ -7,12 +7,11 @@ from functools import partial
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, signature
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import APPLICATION, COMMUNICATION, VERIFY, Stored
 from kontronik_can_gw.node_state import UNCONFIGURED
 
-SAVE, LOAD = (int.from_bytes(word, "little") for word in (b"save", b"load"))
 CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 """Objects of services whose values have rules beyond type and limits (those of PDOs have their own)."""
 _NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTICS})
@@ -43,21 +42,15 @@ class Parameters:
         self._wanted = stored
         # the SDO server's ticket, None for LSS
         self._pending: deque[tuple[int | None, Stored]] = deque()
-        for part in (1, 2, 3):
-            dictionary.bind(
-                0x1010,
-                part,
-                read=self._stores_on_command,
-                check=partial(_check_signature, SAVE),
-                written=partial(self._store, part),
-            )
-            dictionary.bind(
-                0x1011,
-                part,
-                read=self._stores_on_command,
-                check=partial(_check_signature, LOAD),
-                written=partial(self._restore, part),
-            )
+        for index, word, written in (
+            (0x1010, b"save", self._store),
+            (0x1011, b"load", self._restore),
+        ):
+            for part in (1, 2, 3):
+                check, then = signature(word), partial(written, part)
+                dictionary.bind(
+                    index, part, read=self._stores_on_command, check=check, written=then
+                )
 
     # --- reset
 
@@ -152,8 +145,3 @@ class Parameters:
         self._wanted = stored
         self._pending.append((ticket, stored))
         self._begin_save(stored)
-
-
-def _check_signature(wanted: int, value: int) -> None:
-    if value != wanted:
-        raise SdoAbort(Abort.TRANSFER)

@@ -10,6 +10,7 @@ carry the link status: those go on, with all ones (80..0h for signed types) for 
 from collections.abc import Callable
 
 from kontronik_can_gw.canopen.bound_values import CompiledPdo, compile_pdo
+from kontronik_can_gw.canopen.cob_ids import Taken
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES, TpdoParameters
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
@@ -29,9 +30,9 @@ class Tpdo(TpdoParameters):
         esc: EscTelemetry,
         gateway: GatewayStatus,
         send: Callable[[CanFrame], None],
-        taken: Callable[[int, object], bool],
+        taken: Taken,
     ) -> None:
-        super().__init__(number, dictionary, taken, esc.protocol)
+        super().__init__(number, dictionary, taken)
         self.due = NEVER
         self.sent = 0
         """Frames so far."""
@@ -53,6 +54,7 @@ class Tpdo(TpdoParameters):
         self._fresh = False
         self._syncs = 0
         self._sync_waits = False
+        self.bind(self.configure)
 
     @property
     def on_change(self) -> bool:
@@ -80,17 +82,13 @@ class Tpdo(TpdoParameters):
         self._held_until = self._last_ns + self.inhibit_ns
         self._compiled = compile_pdo(self.mapped, self._esc.protocol) if self.mapped else None
         self.triggers = 0 if self._compiled is None else self._compiled.triggers
-        if self._started and self._running:
-            if was_running:
-                self.pending = self.pending and self._by_event
-                self._event_due = self._next_event(now)
-                self._set_due()
-            else:
-                self.start(now)
-        else:
-            self._event_due = NEVER
-            self.pending = False
-            self._set_due()
+        if self._started and self._running and not was_running:
+            self.start(now)
+            return
+        goes_on = self._started and self._running
+        self.pending = self.pending and self._by_event and goes_on
+        self._event_due = self._next_event(now) if goes_on else NEVER
+        self._set_due()
 
     @property
     def _running(self) -> bool:
@@ -135,7 +133,7 @@ class Tpdo(TpdoParameters):
 
     def on_download(self, variable: Variable, now: int) -> None:
         """An object was written over the bus."""
-        mapped = any(entry.variable is variable for entry in self.mapped)
+        mapped = any(entry is variable for entry in self.mapped)
         if mapped and self._started and self._running:
             self._news(now)
 

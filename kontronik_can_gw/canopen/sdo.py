@@ -32,12 +32,8 @@ from kontronik_can_gw.canopen.sdo_block import (
     Pace,
     check_block_size,
 )
-from kontronik_can_gw.canopen.sdo_segments import (
-    Incoming,
-    SegmentedDownload,
-    SegmentedUpload,
-    expected,
-)
+from kontronik_can_gw.canopen.sdo_segments import Incoming, SegmentedDownload, SegmentedUpload
+from kontronik_can_gw.output import NEVER
 
 TIMEOUT_NS = 2_000_000_000
 """A transfer ends with 05040000h this long after the last frame of either side."""
@@ -52,14 +48,11 @@ class Objects(Protocol):
     def upload(self, index: int, sub: int, now: int) -> bytes:
         """The whole value, as one snapshot."""
 
-    def check_download(self, index: int, sub: int, size: int | None) -> None:
-        """Existence, access and length, before data moves. ``size`` in bytes; None: not indicated."""
+    def check_download(self, index: int, sub: int, size: int | None) -> int:
+        """Existence, access and length, before data moves. ``size`` in bytes; None: not indicated. Returns the most there can be."""
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         """Write a value. False: the confirmation comes later through ``SdoServer.confirm``."""
-
-    def max_size(self, index: int, sub: int) -> int | None:
-        """Bytes that a download may have at most; None: no limit of the object's own."""
 
 
 _Transfer = SegmentedDownload | SegmentedUpload | BlockDownload | BlockUpload
@@ -67,7 +60,7 @@ _T = TypeVar("_T", SegmentedDownload, SegmentedUpload, BlockDownload, BlockUploa
 
 
 class SdoServer:
-    """One SDO server. ``send`` is called with the 8 bytes of each answer, from within any method that takes ``now``.
+    """One SDO server. ``send`` is called with the 8 bytes of each answer.
 
     ``segment_ns``: distance that block upload segments keep on average, in bursts of up to four, driven by ``advance``; 0: a whole
     sub-block at once. No input raises.
@@ -82,7 +75,7 @@ class SdoServer:
         self._transfer: _Transfer | None = None
         self._confirming = False
         """All data is here, the result of the dictionary is pending."""
-        self._deadline: int | None = None
+        self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
         self._index = 0
         self._sub = 0
@@ -104,7 +97,7 @@ class SdoServer:
         """The data of one request frame, of any length."""
         if len(data) != 8:
             return
-        if self._deadline is not None and now >= self._deadline:
+        if now >= self._deadline:
             self._abort(Abort.TIMEOUT)
         try:
             download = self._open_block_download()
@@ -116,15 +109,14 @@ class SdoServer:
                 self._serve(data, now)
         except SdoAbort as abort:
             self._abort(abort.code)
-        self._deadline = None if self._transfer is None else now + TIMEOUT_NS
+        self._deadline = NEVER if self._transfer is None else now + TIMEOUT_NS
 
-    def confirm(self, code: Abort | None, now: int, ticket: int | None = None) -> None:
+    def confirm(self, code: Abort | None, ticket: int | None = None) -> None:
         """The result of a download that returned False: ``code`` is why it failed, None that it is done.
 
         Ignored if the transfer is no longer waiting. A caller that can have several results under way passes the ``ticket`` that
         ``waiting`` gave, so that the result of a dropped transfer does not confirm the one after it.
         """
-        del now  # nothing follows a confirmation; taken for the sake of one form of all inputs
         if not self._confirming or (ticket is not None and ticket != self._ticket):
             return
         if code is not None:
@@ -136,19 +128,20 @@ class SdoServer:
 
     def advance(self, now: int) -> None:
         """Let time pass: the time-out of a transfer, and the paced segments of a block upload."""
+        if now < self.due:
+            return
         transfer = self._transfer
-        if isinstance(transfer, BlockUpload) and transfer.next_burst is not None:
-            if now >= transfer.next_burst:
-                transfer.advance(now)
-                self._deadline = now + TIMEOUT_NS
-        elif self._deadline is not None and now >= self._deadline:
+        if isinstance(transfer, BlockUpload) and transfer.bursts:
+            transfer.advance(now)
+            self._deadline = now + TIMEOUT_NS
+        else:
             self._abort(Abort.TIMEOUT)
 
-    def next_deadline(self) -> int | None:
+    @property
+    def due(self) -> int:
         """When ``advance`` has something to do."""
-        transfer = self._transfer
-        burst = transfer.next_burst if isinstance(transfer, BlockUpload) else None
-        return self._deadline if burst is None else burst
+        bursts = isinstance(self._transfer, BlockUpload) and self._transfer.bursts
+        return self._pace.next_burst if bursts else self._deadline
 
     # ---- requests
 
@@ -203,7 +196,7 @@ class SdoServer:
         expedited, indicated = command & 2, command & 1
         if expedited:
             size = 4 - (command >> 2 & 3) if indicated else None
-            limit = self._prepare_download(size).limit
+            limit = self._objects.check_download(self._index, self._sub, size)
             # without a size the object's own length counts (e = 1, s = 0: "unspecified number of bytes")
             value = data[4 : 4 + (min(4, limit) if size is None else size)]
             self._store(value, self._initiated(0x60), now)
@@ -214,8 +207,8 @@ class SdoServer:
 
     def _prepare_download(self, size: int | None) -> Incoming:
         """Have everything checked that can be before data moves."""
-        self._objects.check_download(self._index, self._sub, size)
-        return expected(size, self._objects.max_size(self._index, self._sub))
+        limit = self._objects.check_download(self._index, self._sub, size)
+        return Incoming(size, limit if size is None else size)
 
     def _take_segment(self, data: bytes, now: int) -> None:
         download = self._running(SegmentedDownload)
@@ -233,7 +226,7 @@ class SdoServer:
         self._answer = answer
         ticket = self._ticket
         if self._objects.download(self._index, self._sub, data, now):
-            self.confirm(None, now, ticket)
+            self.confirm(None, ticket)
 
     # ---- upload, expedited and segmented
 
@@ -314,7 +307,7 @@ class SdoServer:
         if (download := self._open_block_download()) is not None:
             self._in_flight.expect(download.next_segment)
         self._transfer, self._confirming = None, False
-        self._deadline = None
+        self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
 
 

@@ -129,10 +129,9 @@ class BlockUpload:
         self._sent = 0
 
     @property
-    def next_burst(self) -> int | None:
-        """When ``advance`` sends more of a sub-block; None: it is out, or none was asked for."""
-        waits = self._phase is _Phase.SENDING and self._sent < self._sub_block
-        return self._pace.next_burst if waits else None
+    def bursts(self) -> bool:
+        """Whether ``advance`` sends more of a sub-block; False: it is out, or none was asked for."""
+        return self._phase is _Phase.SENDING and self._sent < self._sub_block
 
     def start(self, now: int) -> None:
         """1010 0011, 0 (7). Answer: the first sub-block."""

@@ -2,23 +2,20 @@
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 
-UNLIMITED_SIZE = 65536
-"""Bytes taken for an object that states no limit."""
 _TOGGLE = 0x10
 
 
 class Incoming:
-    """The data of a download. ``size``: as the client indicated, or None; more than ``limit`` bytes are refused with ``too_long``."""
+    """The data of a download. ``size``: as the client indicated, or None; more than ``limit`` bytes are refused."""
 
-    def __init__(self, size: int | None, limit: int, too_long: Abort) -> None:
+    def __init__(self, size: int | None, limit: int) -> None:
         self.data = bytearray()
-        self.limit = limit
         self._size = size
-        self._too_long = too_long
+        self._limit = limit
 
     def check_limit(self) -> None:
-        if len(self.data) > self.limit:
-            raise SdoAbort(self._too_long)
+        if len(self.data) > self._limit:
+            raise SdoAbort(Abort.TOO_LONG)
 
     def whole(self) -> bytes:
         """All data, its length checked."""
@@ -26,17 +23,6 @@ class Incoming:
         if self._size is not None and len(self.data) < self._size:
             raise SdoAbort(Abort.TOO_SHORT)
         return bytes(self.data)
-
-
-def expected(size: int | None, limit: int | None) -> Incoming:
-    """A download of ``size`` bytes, None: not indicated, to an object that holds at most ``limit``."""
-    too_long = Abort.MEMORY if limit is None else Abort.TOO_LONG
-    limit = UNLIMITED_SIZE if limit is None else limit
-    if size is None:
-        return Incoming(None, limit, too_long)
-    if size > limit:
-        raise SdoAbort(too_long)
-    return Incoming(size, size, Abort.TOO_LONG)
 
 
 class SegmentedDownload:

@@ -16,6 +16,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from kontronik_can_gw.node_state import UNCONFIGURED
+
 VERSION = 1
 VERIFY = 0x1020
 COMMUNICATION = range(0x1000, 0x2000)
@@ -23,8 +25,6 @@ APPLICATION = range(0x2000, 0x10000)
 
 _HEADER_START = re.compile(rb'\{"format":"kontronik-can-gw parameters","version":([0-9]{1,9})[,}]')
 _CRC = re.compile(rb'"crc32":"([0-9A-F]{8})"\}')
-_KEY = re.compile(r"([0-9A-F]{4}):([0-9A-F]{2})")
-_VALUE = re.compile(r"(?:[0-9A-F]{2})*")
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,14 @@ class Stored:
 
 
 def encode(stored: Stored) -> bytes:
-    """Write the file's text: ASCII, the same for equal content. ValueError for what ``decode`` would refuse."""
-    _check_node_id(stored.node_id)
+    """Write the file's text: ASCII, the same for equal content. ValueError for what is no node-ID, or no key of its mapping."""
+    node_id = stored.node_id
+    if node_id is not None and (
+        type(node_id) is not int or not (1 <= node_id <= 127 or node_id == UNCONFIGURED)
+    ):
+        raise ValueError(f"node_id {node_id!r} is not 1..127, 255 or null")
     content = {
-        "node_id": stored.node_id,
+        "node_id": node_id,
         "communication": _texts(stored.communication, COMMUNICATION),
         "application": _texts(stored.application, APPLICATION),
     }
@@ -82,57 +86,25 @@ def decode(data: bytes) -> Stored:
         raise ValueError("the content does not fit its CRC-32: damaged or truncated")
     try:
         content = json.loads(body)
-    except (ValueError, RecursionError):
-        raise ValueError("the content is not JSON") from None
-    if not isinstance(content, dict) or set(content) != {"node_id", "communication", "application"}:
-        raise ValueError("the content does not consist of node_id, communication and application")
-    _check_node_id(content["node_id"])
-    stored = Stored(
-        content["node_id"],
-        _values(content["communication"], "communication", COMMUNICATION),
-        _values(content["application"], "application", APPLICATION),
-    )
-    if encode(stored) != data:  # a key twice, other order, blanks: nothing of ours wrote that
-        raise ValueError("the content is not in the form in which this program writes it")
-    return stored
+        values = [_values(content[profile]) for profile in ("communication", "application")]
+        stored = Stored(content["node_id"], *values)
+        if encode(stored) == data:
+            return stored
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        pass  # written by hand or by another program, for the CRC fits
+    raise ValueError("the content is not in the form in which this program writes it")
 
 
 def _line(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, separators=(",", ":")).encode("ascii") + b"\n"
 
 
-def _check_node_id(node_id: object) -> None:
-    if node_id is None or (type(node_id) is int and (1 <= node_id <= 127 or node_id == 255)):
-        return
-    raise ValueError(f"node_id {node_id!r} is not 1..127, 255 or null")
-
-
-def _check_key(key: int, indices: range) -> None:
-    if key >> 8 not in indices:
-        raise ValueError(
-            f"object {key >> 8:04X}h is not one of {indices[0]:04X}h to {indices[-1]:04X}h"
-        )
-
-
 def _texts(values: Mapping[int, bytes], indices: range) -> dict[str, str]:
-    texts = {}
-    for key in sorted(values):
-        _check_key(key, indices)
-        texts[f"{key >> 8:04X}:{key & 0xFF:02X}"] = values[key].hex().upper()
-    return texts
+    for key in values:
+        if key >> 8 not in indices:
+            raise ValueError(f"{key >> 8:04X}h is not {indices[0]:04X}h to {indices[-1]:04X}h")
+    return {f"{key >> 8:04X}:{key & 0xFF:02X}": values[key].hex().upper() for key in sorted(values)}
 
 
-def _values(texts: object, name: str, indices: range) -> dict[int, bytes]:
-    if not isinstance(texts, dict):
-        raise ValueError(f"{name} is not an object of keys and values")
-    values = {}
-    for text, value in texts.items():
-        match = _KEY.fullmatch(text)
-        if match is None:
-            raise ValueError(f"{name}: {text!r} is not index:sub-index")
-        if not isinstance(value, str) or _VALUE.fullmatch(value) is None:
-            raise ValueError(f"{name}: the value of {text} is not a row of hexadecimal bytes")
-        key = int(match[1], 16) << 8 | int(match[2], 16)
-        _check_key(key, indices)
-        values[key] = bytes.fromhex(value)
-    return values
+def _values(texts: Mapping[str, str]) -> dict[int, bytes]:
+    return {int(key.replace(":", ""), 16): bytes.fromhex(text) for key, text in texts.items()}

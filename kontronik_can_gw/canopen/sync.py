@@ -1,26 +1,19 @@
 """SYNC, consumer side (CiA 301, 7.2.5): objects 1005h COB-ID and 1019h counter overflow."""
 
-from collections.abc import Callable
-
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.cob_ids import SYNC_USER, restricted
+from kontronik_can_gw.canopen.cob_ids import SYNC, Taken, check_free
 from kontronik_can_gw.canopen.dictionary import Dictionary
 
 _PRODUCER_BIT, _FRAME_BIT = 1 << 30, 1 << 29
 
 
 class SyncConsumer:
-    """Which SYNC message a node follows. ``taken``: whether a COB-ID is in use by another service."""
+    """Which SYNC message a node follows."""
 
-    def __init__(
-        self,
-        dictionary: Dictionary,
-        taken: Callable[[int, object], bool],
-        rerouted: Callable[[int], bool],
-    ) -> None:
+    def __init__(self, dictionary: Dictionary, taken: Taken) -> None:
         self._dictionary = dictionary
         self._taken = taken
-        dictionary.bind(0x1005, check=self._check_cob_id, written=rerouted)
+        dictionary.bind(0x1005, check=self._check_cob_id)
         dictionary.bind(0x1019, check=_check_overflow)
 
     @property
@@ -39,10 +32,9 @@ class SyncConsumer:
 
     def _check_cob_id(self, value: int) -> None:
         """A new 1005h. SdoAbort 06090030h for a producer (there is none), 29-bit ids, reserved bits and restricted ids."""
-        if value & (_PRODUCER_BIT | _FRAME_BIT) or value & 0x1FFFF800 or restricted(value & 0x7FF):
+        if value & (_PRODUCER_BIT | _FRAME_BIT | 0x1FFFF800):
             raise SdoAbort(Abort.VALUE)
-        if self._taken(value & 0x7FF, SYNC_USER):
-            raise SdoAbort(Abort.INCOMPATIBLE)
+        check_free(value & 0x7FF, SYNC, self._taken)
 
 
 def _check_overflow(value: int) -> None:

@@ -1,13 +1,12 @@
 """All transmit PDOs of one node: made from the dictionary, set up at a reset, given events, SYNC and time."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
 
 from kontronik_can_gw.canopen.abort import SdoAbort
-from kontronik_can_gw.canopen.cob_ids import INVALID_BIT
+from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, Taken
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, key
 from kontronik_can_gw.canopen.pdo import Tpdo
-from kontronik_can_gw.canopen.pdo_parameters import COB_ID, COMMUNICATION, MAPPING, MAX_TPDOS
+from kontronik_can_gw.canopen.pdo_parameters import COB_ID, COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -15,7 +14,7 @@ from kontronik_can_gw.output import NEVER
 
 
 class Tpdos:
-    """``taken``: whether a COB-ID is in use by another service. ``rerouted`` is called when one may have changed."""
+    """Given in ascending numbers, as many as the EDS has."""
 
     def __init__(
         self,
@@ -23,19 +22,15 @@ class Tpdos:
         esc: EscTelemetry,
         gateway: GatewayStatus,
         send: Callable[[CanFrame], None],
-        taken: Callable[[int, object], bool],
-        rerouted: Callable[[int], bool],
+        taken: Taken,
     ) -> None:
         self._dictionary = dictionary
-        self._rerouted = rerouted
         self._held_up_ns = -NEVER
         self._tpdos = [
             Tpdo(number, dictionary, esc, gateway, send, taken)
             for number in range(MAX_TPDOS)
             if dictionary.get(COMMUNICATION + number) is not None
         ]
-        for tpdo in self._tpdos:
-            tpdo.bind(partial(self._written, tpdo))
 
     def __iter__(self) -> Iterator[Tpdo]:
         return iter(self._tpdos)
@@ -55,10 +50,6 @@ class Tpdos:
         """Take over the parameters as they are after a reset. Returns the keys of those that were rejected."""
         return [number for tpdo in self._tpdos for number in self._reset(tpdo, node_id, now)]
 
-    def _written(self, tpdo: Tpdo, now: int) -> bool:
-        tpdo.configure(now)
-        return self._rerouted(now)  # its COB-ID may be another one
-
     def _reset(self, tpdo: Tpdo, node_id: int, now: int) -> list[int]:
         """Stored parameters that no longer make sense with this EDS give way to the defaults; without a free COB-ID there is no PDO."""
         rejected = []
@@ -67,15 +58,15 @@ class Tpdos:
             tpdo.check()
         except SdoAbort:
             for number, variable in self._dictionary.variables.items():
-                if number >> 8 in (COMMUNICATION + tpdo.number, MAPPING + tpdo.number):
+                if number >> 8 in tpdo.indices:
                     if variable.value != (default := variable.default(node_id)):
                         rejected.append(number)
                     variable.value = default
             tpdo.configure(now)
-            cob_id = self._dictionary.get(COMMUNICATION + tpdo.number, COB_ID)
+            cob_id = self._dictionary.get(tpdo.indices[0], COB_ID)
             if cob_id is not None and tpdo.valid and not tpdo.is_free():
                 cob_id.value = int(cob_id.value) | INVALID_BIT
-                rejected.append(key(COMMUNICATION + tpdo.number, COB_ID))
+                rejected.append(key(tpdo.indices[0], COB_ID))
                 tpdo.configure(now)
         return rejected
 

@@ -2,15 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 
-from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals.plan import classic_bits
-
-
-def cob_ids(nodes: Sequence[Node]) -> dict[int, str]:
-    """Every COB-ID the nodes use, and what for."""
-    return {cob_id: what for node in nodes for cob_id, what in all_ids(node)}
 
 
 def frames_per_second(nodes: Sequence[Node]) -> float:

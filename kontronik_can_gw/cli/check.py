@@ -71,7 +71,7 @@ def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
             sent, objects = "", ""
             if (tpdo := tpdos.get(cob_id)) is not None:
                 sent = pdo_timing(tpdo)
-                objects = ", ".join(entry.variable.entry.name for entry in tpdo.mapped)
+                objects = ", ".join(variable.entry.name for variable in tpdo.mapped)
             what = re.sub(rf" (of|to) CANopen node {node.node_id}$", "", what)
             rows.append((first, f"{cob_id:03X}h", what, sent, objects))
             first = ""

@@ -17,7 +17,7 @@ from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.storage import Stored, decode
-from kontronik_can_gw.canopen.traffic import bits_per_second, cob_ids
+from kontronik_can_gw.canopen.traffic import bits_per_second
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
@@ -96,7 +96,8 @@ def needs(
     """COB-IDs of the nodes and what each is for, what they need of the bus in bit/s, and warnings for objects that the EDS lacks."""
     made = setup.nodes(escs)
     lacks = [f"{setup.eds.name}: {line}" for line in without_objects(made)]
-    return cob_ids(made.nodes), bits_per_second(made.nodes), lacks
+    ids = {cob_id: what for node in made.nodes for cob_id, what in all_ids(node)}
+    return ids, bits_per_second(made.nodes), lacks
 
 
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:

@@ -122,14 +122,8 @@ class Bench:
         if node_ids is None:
             node_ids = range(1, (len(own) or nodes) + 1)
         base = own or tuple(EscSettings(f"esc{n}", **same) for n in range(len(node_ids)))
-        self._arguments = {
-            "changes": changes,
-            "eds": eds,
-            "node_ids": node_ids,
-            "layout": layout,
-            "escs": escs,
-            **settings,
-        }
+        self._arguments: dict[str, Any] = {"changes": changes, "eds": eds, "node_ids": node_ids}
+        self._arguments |= {"layout": layout, "escs": escs, **settings}
         self.setup = CanopenSetup(
             changed(eds or shipped_eds(), changes or {}),
             tuple(NodeSettings(i, serial=77 + n, **settings) for n, i in enumerate(node_ids)),
@@ -314,34 +308,20 @@ class Bench:
                 return f"listens {' '.join(f'{cob_id:03X}' for cob_id in sorted(self.listened_to))}"
             case "rejected", [node, *_]:
                 keys = sorted(self.nodes[int(node) - 1].rejected)
-                return " ".join(
-                    [
-                        "rejected",
-                        node,
-                        *(f"{number >> 8:04X}:{number & 0xFF:02X}" for number in keys),
-                    ]
-                )
+                return " ".join(["rejected", node, *map(_name, keys)])
             case _:
                 raise AssertionError(f"what is {what!r}?")
         return what
 
     def _say_sdo(self, verb: str, rest: str) -> str:
-        match = re.fullmatch(
-            r"(\d+) ([0-9A-F]{4}):([0-9A-F]{2})((?: [0-9A-F]{2})*)(?: [=!].*)?", rest
-        )
+        match = re.fullmatch(r"(\d+) (\w{4}:\w\w)((?: [0-9A-F]{2})*)(?: [=!].*)?", rest)
         assert match is not None, f"what is {rest!r}?"
-        node, index, sub = int(match[1]), int(match[2], 16), int(match[3], 16)
-        data = bytes.fromhex(match[4])
-        said = f"{verb} {node} {match[2]}:{match[3]}"
-        if verb == "read":
-            found = self.read(index, sub, node)
-            return (
-                f"{said} ! {found:08X}"
-                if isinstance(found, int)
-                else f"{said} = {hexadecimal(found)}".rstrip()
-            )
-        refused = self.write(index, sub, data, node)
-        return f"{said} {hexadecimal(data)}" + ("" if refused is None else f" ! {refused:08X}")
+        node, place, data = int(match[1]), _place(match[2]), bytes.fromhex(match[3])
+        said = f"{verb} {node} {match[2]} {hexadecimal(data)}".rstrip()
+        found = self.read(*place, node) if verb == "read" else self.write(*place, data, node)
+        if isinstance(found, int):
+            return f"{said} ! {found:08X}"
+        return said if found is None else f"{said} = {hexadecimal(found)}".rstrip()
 
     def _collect(self) -> None:
         self.heard += [(self.now, frame) for frame in self.gateway.take_frames(self.now)]
@@ -359,27 +339,32 @@ class Bench:
         return lines
 
 
+def _name(number: int) -> str:
+    """``1017:00``."""
+    return f"{number >> 8:04X}:{number & 0xFF:02X}"
+
+
+def _place(name: str) -> tuple[int, int]:
+    """Index and sub-index of ``1017:00``."""
+    return int(name[:4], 16), int(name[5:], 16)
+
+
 def _stored_text(stored: Stored) -> str:
     """``node-id 7 1017:00=F401 2100:01=05``."""
     values = sorted({**stored.communication, **stored.application}.items())
-    texts = [
-        f"{number >> 8:04X}:{number & 0xFF:02X}={data.hex().upper()}" for number, data in values
-    ]
-    return " ".join(
-        ["node-id", str(stored.node_id), *texts] if stored.node_id is not None else texts
-    )
+    texts = [f"{_name(number)}={data.hex().upper()}" for number, data in values]
+    node_id = [] if stored.node_id is None else ["node-id", str(stored.node_id)]
+    return " ".join([*node_id, *texts])
 
 
 def _stored(words: Sequence[str]) -> Stored:
-    values = {}
+    node_id = int(words[1]) if words[:1] == ["node-id"] else None
+    kept: tuple[dict[int, bytes], dict[int, bytes]] = ({}, {})
     for word in words[2:] if words[:1] == ["node-id"] else words:
-        place, _, data = word.partition("=")
-        values[int(place[:4], 16) << 8 | int(place[5:], 16)] = bytes.fromhex(data)
-    return Stored(
-        int(words[1]) if words[:1] == ["node-id"] else None,
-        {number: data for number, data in values.items() if number < 0x200000},
-        {number: data for number, data in values.items() if number >= 0x200000},
-    )
+        name, _, data = word.partition("=")
+        index, sub = _place(name)
+        kept[index >= 0x2000][index << 8 | sub] = bytes.fromhex(data)
+    return Stored(node_id, *kept)
 
 
 def bench_of(options: Sequence[str]) -> Bench:
@@ -387,7 +372,6 @@ def bench_of(options: Sequence[str]) -> Bench:
     changes: dict[tuple[int, int], Any] = {}
     arguments: dict[str, Any] = {}
     kept: Changes = QUIET
-    started = False
     for option in options:
         match option.split():
             case ["nodes", count]:
@@ -400,65 +384,41 @@ def bench_of(options: Sequence[str]) -> Bench:
                 kept = {key: change for key, change in kept.items() if key[0] < 0x1800}
             case ["spare"]:
                 changes.update(SPARE)
-            case [
-                "tpdo",
-                number,
-                "type",
-                kind,
-                "inhibit",
-                inhibit,
-                "timer",
-                timer,
-                "maps",
-                *mapped,
-            ]:
-                changes.update(
-                    tpdo(
-                        int(number),
-                        int(kind),
-                        int(inhibit),
-                        int(timer),
-                        *(int(m, 16) for m in mapped),
-                    )
-                )
+            case ["tpdo", number, _, kind, _, inhibit, _, timer, _, *mapped]:
+                entries = [int(each, 16) for each in mapped]
+                changes.update(tpdo(int(number), int(kind), int(inhibit), int(timer), *entries))
             case ["boot"]:
                 arguments["boot"] = False
             case ["started"]:
-                started = True
+                pass
             case ["self-start" | "read-only" as flag]:
                 arguments[flag.replace("-", "_")] = True
             case ["device", name]:
                 arguments["device"] = Device[name]
             case ["bitrate", value]:
                 arguments["bitrate"] = int(value)
-            case ["esc", *settings]:
+            case ["esc", *words]:
+                pairs = (word.split("=") for word in words)
                 arguments["escs"] = {
-                    key: _setting(value) for key, value in (each.split("=") for each in settings)
+                    key: Fraction(value) if "/" in value else int(value) for key, value in pairs
                 }
             case ["stored", *words]:
                 arguments.setdefault("stored", []).append(_stored(words))
             case ["drop", *indices]:
-                arguments["eds"] = load(
-                    without(shipped_eds().data, {int(index, 16) for index in indices}), "my.eds"
-                )
+                dropped = {int(index, 16) for index in indices}
+                arguments["eds"] = load(without(shipped_eds().data, dropped), "my.eds")
             case [place, "=", value] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
-                relative = value.startswith("$NODEID+")
-                change = {"default": int(value.removeprefix("$NODEID+"), 16), "relative": relative}
-                changes.setdefault((int(place[:4], 16), int(place[5:], 16)), {}).update(change)
-            case [place, *attributes] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
-                change = {
-                    key: _attribute(value)
-                    for key, value in (each.split("=") for each in attributes)
-                }
-                changes.setdefault((int(place[:4], 16), int(place[5:], 16)), {}).update(change)
+                base = int(value.removeprefix("$NODEID+"), 16)
+                change = {"default": base, "relative": value.startswith("$NODEID+")}
+                changes.setdefault(_place(place), {}).update(change)
+            case [place, *words] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
+                pairs = (word.split("=") for word in words)
+                change = {key: _attribute(value) for key, value in pairs}
+                changes.setdefault(_place(place), {}).update(change)
             case _:
                 raise AssertionError(f"what is 'with {option}'?")
     bench = Bench(changes={**kept, **changes}, **arguments)
-    return bench.start() if started else bench
-
-
-def _setting(text: str) -> int | Fraction:
-    return Fraction(text) if "/" in text else int(text)
+    return bench.start() if "started" in options else bench
 
 
 def _attribute(text: str) -> Any:
@@ -475,15 +435,8 @@ def tpdo(number: int, kind: int = 254, inhibit: int = 0, timer: int = 0, *mapped
     """A TPDO with its shipped COB-ID, mapped to battery voltage where nothing is named."""
     mapped = mapped or (0x20000210,)
     index = 0x1800 + number - 1
-    values = {
-        (index, 2): kind,
-        (index, 3): inhibit,
-        (index, 5): timer,
-        (index + 0x200, 0): len(mapped),
-    }
-    values |= {(index + 0x200, n): entry for n, entry in enumerate(mapped, 1)}
-    changes: dict[tuple[int, int], Any] = {
-        place: {"default": value} for place, value in values.items()
-    }
+    values = {(index, 2): kind, (index, 3): inhibit, (index, 5): timer}
+    values |= {(index + 0x200, n): entry for n, entry in enumerate((len(mapped), *mapped))}
+    changes: dict[tuple[int, int], Any] = {at: {"default": value} for at, value in values.items()}
     changes[index, 1] = {"default": 0x40000080 + 0x100 * number, "relative": True}
     return changes

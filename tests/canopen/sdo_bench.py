@@ -7,6 +7,7 @@ from script import MS, Heard, bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.sdo import SdoServer
+from kontronik_can_gw.output import NEVER
 
 
 @dataclass
@@ -16,9 +17,16 @@ class Entry:
     value: bytes = b""
     access: str = "rw"
     size: int | None = None
-    most: int | None = None
+    most: int = 65536
     high: int | None = None
     late: bool = False
+
+    def check_size(self, size: int | None) -> int:
+        """Returns the greatest length."""
+        most = self.most if self.size is None else self.size
+        if size is not None and not (self.size or 0) <= size <= most:
+            raise SdoAbort(Abort.TOO_LONG if size > most else Abort.TOO_SHORT)
+        return most
 
 
 def usual_entries() -> dict[tuple[int, int], Entry]:
@@ -61,27 +69,21 @@ class Dictionary:
             raise SdoAbort(Abort.WRITE_ONLY)
         return entry.value
 
-    def check_download(self, index: int, sub: int, size: int | None) -> None:
+    def check_download(self, index: int, sub: int, size: int | None) -> int:
         self.checks.append((index, sub, size))
         entry = self.entry(index, sub)
         if entry.access == "ro":
             raise SdoAbort(Abort.READ_ONLY)
-        if size is not None and entry.size is not None and size != entry.size:
-            raise SdoAbort(Abort.TOO_LONG if size > entry.size else Abort.TOO_SHORT)
+        return entry.check_size(size)
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         entry = self.entry(index, sub)
-        if entry.size is not None and len(data) != entry.size:
-            raise SdoAbort(Abort.TYPE)
+        entry.check_size(len(data))
         if entry.high is not None and int.from_bytes(data, "little") > entry.high:
             raise SdoAbort(Abort.TOO_HIGH)
         entry.value = data
         self.written.append((index, sub, data))
         return not entry.late
-
-    def max_size(self, index: int, sub: int) -> int | None:
-        entry = self.entry(index, sub)
-        return entry.most if entry.size is None else entry.size
 
 
 class Bench(Heard):
@@ -103,13 +105,10 @@ class Bench(Heard):
 
     def pass_time(self, until: int) -> None:
         """Let time pass as the runtime does: from deadline to deadline."""
-        while (deadline := self.server.next_deadline()) is not None and deadline <= until:
-            self.now = max(self.now, deadline)
+        while (due := self.server.due) <= until:
+            self.now = max(self.now, due)
             self.server.advance(self.now)
-            following = self.server.next_deadline()
-            assert following is None or following > self.now, (
-                "a deadline that advance does not settle"
-            )
+            assert self.server.due > self.now, "a deadline that advance does not settle"
         self.now = until
 
     def jump(self, now: int) -> None:
@@ -150,8 +149,8 @@ class Bench(Heard):
             case "server", _:
                 return f"server {'busy' if self.server.busy else 'idle'}"
             case "deadline", _:
-                deadline = self.server.next_deadline()
-                return f"deadline {'none' if deadline is None else ms(deadline)}"
+                due = self.server.due
+                return f"deadline {'none' if due == NEVER else ms(due)}"
             case "value", [place, "=", *data]:
                 self.objects.entries[int(place[:4], 16), int(place[5:], 16)].value = bytes_of(
                     " ".join(data)
@@ -159,12 +158,12 @@ class Bench(Heard):
             case "reset", []:
                 self.server.reset()
             case "confirm", []:
-                self.server.confirm(None, self.now)
+                self.server.confirm(None)
             case "confirm", ["!", code]:
-                self.server.confirm(Abort[code], self.now)
+                self.server.confirm(Abort[code])
             case "confirm", ["the", "first"]:
                 assert len(set(self._tickets)) == len(self._tickets) > 1
-                self.server.confirm(None, self.now, self._tickets[0])
+                self.server.confirm(None, self._tickets[0])
             case _:
                 raise AssertionError(f"what is {what!r}?")
         return what

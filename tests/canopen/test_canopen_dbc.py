@@ -182,6 +182,7 @@ def expected(esc: EscTelemetry) -> dict[str, Any]:
 def test_the_shipped_file_is_what_the_command_writes(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["dbc", "--canopen"]) == 0
     assert capsys.readouterr().out == SHIPPED.read_text()
+    assert dbc_text(read(SHIPPED.read_text())) == SHIPPED.read_text(), "it can be written again"
 
 
 OF_THE_OTHER_FILE = {"limits_leave_out_the_codes", "enums_are_closed"}
@@ -261,6 +262,11 @@ def test_names_are_those_of_the_shipped_dbc_where_both_show_a_value() -> None:
     assert all(ours[name].unit == others[name].unit for name in common)
 
 
+def emergencies(bench: Bench) -> list[tuple[str, str, int]]:
+    names = ("EmergencyCode", "EmergencySource", "EmergencyWord")
+    return [(v[names[0]], v[names[1]], v[names[2]]) for v in bench.seen["EscEmergency"]]
+
+
 # --- decoding what nodes send --------------------------------------------------------------------------------------------
 
 
@@ -281,23 +287,12 @@ def test_every_frame_of_a_running_node_decodes_to_the_telemetry() -> None:
         "BootUp",
         *["Operational"] * 8,
     ]
-    told = [
-        (v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"])
-        for v in bench.seen["EscEmergency"]
+    hot = "PowerStageOvertempWarning"
+    codes = ["Undervoltage", "NoError", hot, "NoError"]
+    sources = ["Undervoltage", "Gateway", hot, "Gateway"]
+    assert [(code, source, word & 0x1F) for code, source, word in emergencies(bench)] == [
+        *zip(codes, sources, [1, 0, 16, 0], strict=True)
     ]
-    assert [code for code, _, _ in told] == [
-        "Undervoltage",
-        "NoError",
-        "PowerStageOvertempWarning",
-        "NoError",
-    ]
-    assert [source for _, source, _ in told] == [
-        "Undervoltage",
-        "Gateway",
-        "PowerStageOvertempWarning",
-        "Gateway",
-    ]
-    assert [word & 0x1F for _, _, word in told] == [1, 0, 16, 0]
     first = bench.seen["EscEmergency"][0]
     register = {
         name.removeprefix("ErrorRegister")
@@ -312,47 +307,34 @@ def test_every_frame_of_a_running_node_decodes_to_the_telemetry() -> None:
     }
 
 
-def test_lost_telemetry_is_not_available_and_told_as_an_emergency() -> None:
+def test_lost_telemetry_is_not_available_and_an_emergency() -> None:
     lost = EscOptions(faults=Faults(dropout=Dropout(2 * SECOND, 4 * SECOND)))
     bench = Bench(ONE, [lost])
     bench.start()
     bench.run(5 * SECOND)
     states = bench.seen["EscTpdo4"]
-    assert [s["LinkState"] for s in states[:1]] == ["NeverSeen"]
+    assert states[0]["LinkState"] == "NeverSeen"
     assert "Lost" in {s["LinkState"] for s in states}
     for values in states:
         fresh = values["LinkState"] in ("Ok", "Degraded")
-        assert (values["OperatingState"] == NA) == (not fresh)
-        assert (values["Timing"] == NA) == (not fresh)
+        assert (values["OperatingState"] == NA) == (values["Timing"] == NA) == (not fresh)
     assert any(values["InfoValid"] for values in states)
-    told = [
-        (v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"])
-        for v in bench.seen["EscEmergency"]
-    ]
-    assert told == [("TelemetryFault", "Gateway", 1), ("NoError", "Gateway", 0)]
+    assert emergencies(bench) == [("TelemetryFault", "Gateway", 1), ("NoError", "Gateway", 0)]
 
 
-def test_a_jivepro_supplies_no_bec_current() -> None:
-    bench = Bench(ONE, [EscOptions(device=Device.JIVEPRO)])
+def test_several_escs_have_their_names_in_front_and_a_jivepro_supplies_no_bec_current() -> None:
+    bench = Bench(PAIR, [EscOptions(), EscOptions(device=Device.JIVEPRO)], node_ids=(5, 9))
     bench.start()
     bench.run(3 * SECOND)
-    assert bench.seen["EscTpdo3"][-1]["BecCurrent"] == NA
-    assert bench.seen["EscTpdo3"][-1]["BecVoltage"] > 4
-
-
-def test_several_escs_have_their_names_in_front() -> None:
-    bench = Bench(PAIR, node_ids=(5, 9))
-    bench.start()
-    bench.run(3 * SECOND)
-    assert set(bench.seen) == {
-        f"{prefix}{stem}"
-        for prefix in ("Left", "RightR")
-        for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat")
-    }
+    stems = ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat")
+    assert set(bench.seen) == {prefix + stem for prefix in ("Left", "RightR") for stem in stems}
     ids = {message.name: message.frame_id for message in bench.database.messages}
     assert (ids["LeftTpdo1"], ids["RightRTpdo1"], ids["RightRHeartbeat"]) == (0x185, 0x189, 0x709)
     assert ids["LeftEmergency"] == 0x85
     assert "node 5 (left), node 9 (right_r)" in str(bench.database.buses[0].comment)
+    assert bench.seen["RightRTpdo3"][-1]["RightRBecCurrent"] == NA
+    assert bench.seen["RightRTpdo3"][-1]["RightRBecVoltage"] > 4
+    assert bench.seen["LeftTpdo3"][-1]["LeftBecCurrent"] != NA
 
 
 # --- other mappings ------------------------------------------------------------------------------------------------------
@@ -532,13 +514,6 @@ def test_a_name_in_any_spelling_becomes_pascal_case() -> None:
         ("X1", ("x1",)),
     ):
         assert {dbc_names.pascal_case(name) for name in spellings} == {pascal_case}
-
-
-# --- other readers -------------------------------------------------------------------------------------------------------
-
-
-def test_the_shipped_file_can_be_written_again() -> None:
-    assert dbc_text(read(SHIPPED.read_text())) == SHIPPED.read_text()
 
 
 # --- the command ---------------------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from typing import Any
 from dialogue import NO_HEARTBEAT, Bench, default, info, live, shipped_eds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from script import MS
 
 from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.frames import CanFrame
@@ -267,28 +266,6 @@ def test_the_state_changes_only_by_nmt_commands(story: list[CanFrame]) -> None:
             assert node.state == model.state
             told = [f for f in heard if f.can_id == 0x700 + model.node_id]
             assert [f.data for f in told] == [b"\0"] * (model.boot_ups - boot_ups)
-
-
-@given(st.lists(st.one_of(nmt_frames, st.integers(1, 5000)), max_size=30))
-@FEW
-def test_heartbeats_tell_the_state_at_their_times(story: list[CanFrame | int]) -> None:
-    bench = Bench(1)
-    model, booted = Model(1), 0
-    for part in story:
-        if isinstance(part, CanFrame):
-            boot_ups = model.boot_ups
-            model.take(part)
-            bench.gateway.receive_frame(part, bench.now, bench.now)
-            bench.gateway.take_frames(bench.now)
-            booted = bench.now if model.boot_ups > boot_ups else booted
-            continue
-        begin = bench.now
-        bench.wait(part)
-        told = [(time, frame.data[0]) for time, frame in bench.heard if frame.can_id == 0x701]
-        bench.take()
-        period = 1000 * MS
-        first = booted + ((begin - booted) // period + 1) * period
-        assert told == [(time, model.state) for time in range(first, bench.now + 1, period)]
 
 
 @given(

@@ -79,14 +79,8 @@ def test_2100h_8_is_how_many_crc_errors_in_a_second_make_a_link_degraded(
 
 def test_a_restricted_cob_id_is_refused_and_every_other_accepted() -> None:
     bench = Bench(changes={**QUIET, **SPARE})
-    reserved = {
-        *range(0x080),
-        *range(0x101, 0x181),
-        *range(0x581, 0x600),
-        *range(0x601, 0x680),
-        *range(0x6E0, 0x700),
-        *range(0x701, 0x800),
-    }
+    ends = (0, 0x80), (0x101, 0x181), (0x581, 0x600), (0x601, 0x680), (0x6E0, 0x700), (0x701, 0x800)
+    reserved = {cob_id for pair in ends for cob_id in range(*pair)}
     ours = {0x80, 0x81}
     for cob_id in range(0x800):
         wanted = VALUE if cob_id in reserved else TAKEN if cob_id in ours else None
@@ -116,15 +110,8 @@ def test_a_node_id_whose_cob_ids_the_dbc_has_is_refused() -> None:
 
 def test_each_mappable_object_can_be_sent_and_carries_what_sdo_reads() -> None:
     bench = Bench(changes={**QUIET, **default(0x2100, 5, 2)})
-    bench.uart(
-        live(
-            electrical_speed=66051,
-            battery_voltage=2442,
-            bec_current=5,
-            operating_state=26,
-            throttle=-5,
-        )
-    )
+    fields = {"electrical_speed": 66051, "battery_voltage": 2442, "bec_current": 5}
+    bench.uart(live(**fields, operating_state=26, throttle=-5))
     bench.start()
     tried = 0
     for entry in shipped_eds().entries:
@@ -190,30 +177,21 @@ def u32(value: int) -> bytes:
     return value.to_bytes(4, "little")
 
 
+SPARE_ON, MAPPED = {0x180501: u32(0x40000680)}, {0x1A0500: b"\1", 0x1A0501: u32(0x20000220)}
+EVENT_TIMERS = {(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
+
+
 @pytest.mark.parametrize(
     "stored",
     [
         {"esc1": Stored(2)},
         {"esc1": Stored(7), "esc2": Stored(7)},
-        {"esc1": Stored(communication={0x180501: u32(0x40000087)}), "esc2": Stored(7)},
-        {"esc1": Stored(communication={0x100500: u32(0x90), 0x180501: u32(0x40000080)})},
-        {"esc1": Stored(communication={0x100500: u32(0x87)}), "esc2": Stored(7)},
-        {"esc1": Stored(communication={0x101400: u32(0x82)})},
-        {
-            "esc1": Stored(
-                communication={
-                    0x180501: u32(0x40000680),
-                    0x1A0500: b"\1",
-                    0x1A0501: u32(0x20000220),
-                }
-            )
-        },
-        {
-            "esc1": Stored(
-                communication={(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
-                | {0x101700: b"\1\0"}
-            )
-        },
+        {"esc1": Stored(None, {0x180501: u32(0x40000087)}), "esc2": Stored(7)},
+        {"esc1": Stored(None, {0x100500: u32(0x90), 0x180501: u32(0x40000080)})},
+        {"esc1": Stored(None, {0x100500: u32(0x87)}), "esc2": Stored(7)},
+        {"esc1": Stored(None, {0x101400: u32(0x82)})},
+        {"esc1": Stored(None, SPARE_ON | MAPPED)},
+        {"esc1": Stored(None, EVENT_TIMERS | {0x101700: b"\1\0"})},
     ],
 )
 def test_nothing_a_master_stored_keeps_the_gateway_from_starting(

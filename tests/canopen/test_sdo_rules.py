@@ -3,6 +3,7 @@
 from sdo_bench import Bench, Dictionary, Entry
 
 from kontronik_can_gw.canopen.sdo import SdoServer
+from kontronik_can_gw.output import NEVER
 
 WRITE_LATE = bytes.fromhex("2305200073617665")
 LATE_OK = bytes.fromhex("6005200000000000")
@@ -24,7 +25,7 @@ def test_a_dictionary_may_confirm_from_within_the_download() -> None:
     class Eager(Dictionary):
         def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
             super().download(index, sub, data, now)
-            server.confirm(None, now)
+            server.confirm(None)
             return sub == 0
 
     answers: list[bytes] = []
@@ -48,4 +49,4 @@ def test_a_dictionary_may_reset_the_server_from_within_the_download() -> None:
     server = SdoServer(Restarting(), answers.append)
     server.receive(WRITE_LATE, 0)
     assert answers == []
-    assert not server.busy and server.next_deadline() is None
+    assert not server.busy and server.due == NEVER

@@ -1,6 +1,7 @@
-"""The shipped EDS against its sources: the rows of the sheet, the configuration's ranges, and rules of fussy readers."""
+"""The shipped EDS against the rows of the sheet, the configuration's ranges and rules of fussy readers; what others make of it."""
 
 import io
+import logging
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 from eds_text import SHIPPED as SHIPPED_TEXT
-from eds_text import dcfchk, device_info
+from eds_text import dcfchk, device_info, with_key
 
 from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
@@ -68,15 +69,11 @@ def extremes() -> dict[str, Row]:
 # --- the text -------------------------------------------------------------------------------------------------------
 
 
-def test_it_is_ascii_with_cr_lf_at_every_end_and_no_blanks_before_it() -> None:
+def test_its_lines_end_in_cr_lf_have_no_blanks_around_them_and_no_key_without_a_value() -> None:
     assert DATA.isascii()
     assert DATA.endswith(b"\r\n")
     assert DATA.count(b"\r\n") == DATA.count(b"\n") == DATA.count(b"\r")
-    assert [line for line in LINES if line != line.strip()] == []
-
-
-def test_no_key_is_without_a_value() -> None:
-    assert [line for line in LINES if line.endswith("=")] == []
+    assert [line for line in LINES if line != line.strip() or line.endswith("=")] == []
 
 
 def test_numbers_of_objects_are_hexadecimal_and_the_node_id_stands_in_front() -> None:
@@ -329,3 +326,50 @@ def test_the_dcf_keeps_every_line_of_the_eds_in_its_place(shipped: Eds) -> None:
         "ParameterValue=0x01F4",
         "ParameterValue=0x0009",
     ]
+
+
+# --- readers of others ----------------------------------------------------------------------------------------------
+
+PDO_NAMES = [
+    ["Electrical_speed", "Battery_voltage", "Battery_current"],
+    ["Motor_current", "Peak_current", "Consumed_charge", "Throttle", "Output_opening"],
+    ["BEC_voltage", "PWM_input", "BEC_current", "Power_stage_temperature", "BEC_temperature"],
+    ["Operating_errors", "Operating_state", "Timing", "Link_status", "Live_counter"],
+]
+
+
+@pytest.mark.parametrize("node_id", [1, 5, 127])
+def test_dcfchk_has_no_finding_in_the_eds_and_in_its_dcf(
+    shipped: Eds, tmp_path: Path, node_id: int
+) -> None:
+    values: dict[tuple[int, int], int | float | bytes] = {}
+    for entry in shipped.entries:
+        if entry.access != "wo" and entry.default is not None:
+            relative = node_id if entry.relative else 0
+            text = isinstance(entry.default, bytes)
+            values[entry.index, entry.sub] = entry.default if text else entry.default + relative  # type: ignore[operator]
+    file = tmp_path / "left.dcf"
+    file.write_bytes(dcf.dcf(shipped, node_id, 250_000, values, "left", "left.dcf").encode("ascii"))
+    assert dcfchk(SHIPPED, node_id) == dcfchk(file, node_id) == ""
+    file.write_bytes(with_key(SHIPPED_TEXT, "2100", "SubNumber", "0x8").encode("ascii"))
+    assert "1 extra sub-object(s) for object 0x2100" in dcfchk(file, 1), "it can find something"
+
+
+@pytest.mark.parametrize("node_id", [1, 127])
+def test_canmatrix_makes_the_default_pdos_of_it(
+    entries: dict[tuple[int, int], Entry], caplog: pytest.LogCaptureFixture, node_id: int
+) -> None:
+    from canmatrix.formats import eds  # type: ignore[import-untyped]  # missing in its list where asammdf loads it
+
+    with caplog.at_level(logging.WARNING), SHIPPED.open("rb") as file:
+        matrix = eds.load(file, eds_node_id=node_id)
+    assert caplog.records == []
+    types = {entry.name.replace(" ", "_"): entry.data_type for entry in entries.values()}
+    for number, names in enumerate(PDO_NAMES):
+        frame = matrix.frame_by_name(f"TPDO_{number + 1}_communication_parameter")
+        assert (frame.arbitration_id.id, frame.size) == (0x180 + 0x100 * number + node_id, 8)
+        assert [signal.name for signal in frame.signals] == names
+        for signal in frame.signals:
+            assert signal.is_signed == (types[signal.name] in (0x02, 0x03, 0x04))
+    sdo = {signal.name for signal in matrix.frame_by_name("SDO_transmit").signals}
+    assert {"Throttle", "Pole_pairs", "Reset_of_statistics"} < sdo

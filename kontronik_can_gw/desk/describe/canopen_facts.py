@@ -124,7 +124,7 @@ def _node(node: Node, esc: EscSettings) -> Facts:
 
 def _pdo(tpdo: Tpdo) -> Facts:
     """An enabled transmit PDO. ``mapped``: as ``2000h:02 Battery voltage``, from the lowest bit up."""
-    entries = [mapped.variable.entry for mapped in tpdo.mapped]
+    entries = [variable.entry for variable in tpdo.mapped]
     return {
         "number": tpdo.number + 1,
         "cob_id": tpdo.cob_id,
