@@ -1,12 +1,11 @@
 """The bench of the fault programme: fed ESCs, a gateway process, a judge of the bus, and the account of each injected fault.
 
-    bench = Bench(interfaces, [PtyPort(...)], report)           # or any port with ``fed``, ``close`` and ``received``
-    with bench.injection(fault, escs=(0,)) as injection:        # who is disturbed by it; () : nobody may be
+    @injected("Serial", "port gone and back", 2.0, escs=[0])    # who is disturbed by it; []: nobody may be; all unless given
+    def gone(bench, injection, n):                              # the n-th of as many as a run asks for
         ...the fault is on...
-        injection.cleared()                                     # its cause is gone: from now on the recovery counts
-        injection.wait_recovery()                               # the first right value that was sent since then
+        injection.cleared()                                     # its cause is gone: until the first right value sent since then
 
-At the end of the ``with`` the bus is watched a while longer, then wrong and lost values are put down to the fault. Times are
+Then the bus is watched a while longer, then wrong and lost values are put down to the fault. Times are
 monotonic nanoseconds, of frames the kernel's.
 """
 
@@ -17,13 +16,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from bus_watch import MS, SECOND, BusWatch, Fresh
 from encoding import GEAR, POLE_PAIRS, Identity
-from fault_report import Fault, Report, Row
+from fault_report import Fault, Report, Row, fault
 from feeder import CURRENT, SPEED, FedEsc, Feeder
 from signals import Table, table_of_configuration
 
@@ -320,6 +319,12 @@ class Bench:
         finally:
             gateway.kill()
 
+    def kill(self) -> None:
+        """End the gateway, however it fares."""
+        gateway, self.gateway = self.gateway, None
+        if gateway is not None:
+            gateway.kill()
+
     def wait_fresh(
         self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0
     ) -> int:
@@ -484,9 +489,7 @@ class Bench:
     def close(self) -> None:
         """End the gateway and everything else; the folder stays for a look at it as long as the machine lives."""
         self.feeder.close()
-        if self.gateway is not None:
-            self.gateway.kill()
-            self.gateway = None
+        self.kill()
         self.watch.close()
         self.metronome.close()
         for port in self.ports:
@@ -526,7 +529,7 @@ class Injection:
         self.recovered_ns = self.bench.wait_fresh(
             self.escs, self.cleared_ns, limit * 3 + 2, self.cleared_ns
         )
-        self.recovery_s = self.bench.running_s(self.cleared_ns, self.recovered_ns)
+        self.healed_at(self.recovered_ns)
 
     def healed_at(self, at_ns: int) -> None:
         """Something else that had to heal too was good at that time."""
@@ -563,6 +566,10 @@ class Injection:
         if not holds:
             raise NotRecovered(f"{what}; {self.bench.last_words()}")
 
+    @property
+    def row(self) -> Row:
+        return self.bench.report.row(self.fault)
+
     def after(self, at_ns: int | None) -> str:
         """A time since the injection in words."""
         return "no time" if at_ns is None else f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
@@ -580,4 +587,39 @@ class Injection:
         self.leave_out_until(self.recovered_ns or time.monotonic_ns())
         if not self.in_time:
             note = f"recovered only after {self.recovery_s:.2f} s"
-            self.bench.report.row(self.fault).notes.append(note)
+            self.row.notes.append(note)
+
+
+Injects = Callable[[Any, Injection, Any], None]
+"""One injection on a bench; the last argument is what ``rounds`` gave for it."""
+
+
+def half(times: int) -> range:
+    return range(max(1, times // 2))
+
+
+def injected(
+    area: str,
+    name: str,
+    limit_s: float | None,
+    *,
+    escs: Sequence[int] | None = None,
+    settle_s: float = SETTLE_S,
+    rounds: Callable[[int], Iterable[Any]] = range,
+    machine: str = "UML",
+    bench: str = "two",
+) -> Callable[[Injects], Injects]:
+    """Register a function as a fault: called once for each round, and its recovery is waited for when its cause is ``cleared``."""
+
+    def register(inject: Injects) -> Injects:
+        def run(bench: Bench, fault: Fault, times: int) -> None:
+            for each in rounds(times):
+                with bench.injection(fault, escs, settle_s) as injection:
+                    inject(bench, injection, each)
+                    if injection.cleared_ns is not None and injection.recovered_ns is None:
+                        injection.wait_recovery()
+
+        fault(area, name, limit_s, machine=machine, bench=bench)(run)
+        return inject
+
+    return register
