@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import IO, Any, Protocol, Self
 
 from bus_watch import MS, SECOND, BusWatch, Fresh
 from encoding import GEAR, POLE_PAIRS, Identity
@@ -51,46 +51,56 @@ class NotRecovered(AssertionError):
 
 
 class LoggedProcess:
-    """A program as its own process, and what it has logged so far."""
+    """A program as its own process, and the lines that it has written so far: ``lines`` to standard error, ``out`` to standard output."""
 
     def __init__(
-        self, command: Sequence[str], environment: Mapping[str, str] | None = None
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        keep_out: bool = False,
     ) -> None:
         self.process = subprocess.Popen(
             command,
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.PIPE if keep_out else subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, **(environment or {})},
         )
         self.lines: list[str] = []
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self.out: list[str] = []
+        self._readers = []
+        for stream, lines in ((self.process.stderr, self.lines), (self.process.stdout, self.out)):
+            if stream is not None:
+                reader = threading.Thread(target=self._read, args=(stream, lines), daemon=True)
+                reader.start()
+                self._readers.append(reader)
 
-    def _read(self) -> None:
-        assert self.process.stderr
-        for text in self.process.stderr:
-            self.lines.append(text.rstrip())
+    @staticmethod
+    def _read(stream: IO[str], lines: list[str]) -> None:
+        with stream:
+            for text in stream:
+                lines.append(text.rstrip())
 
     @property
     def log(self) -> str:
         return "\n".join(self.lines)
 
+    def wait(self) -> int:
+        """Wait until it has ended and all that it wrote is read; its exit code."""
+        code = self.process.wait(60)
+        for reader in self._readers:
+            reader.join(60)
+        return code
+
     def kill(self) -> None:
         """End it, however it fares."""
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait()
-        self._reader.join(60)
-        if self.process.stderr and not self.process.stderr.closed:
-            self.process.stderr.close()
+        self.wait()
 
 
 class Gateway(LoggedProcess):
-    """``kontronik-can-gw run`` with a prefix (``setpriv``) and an environment if need be.
-
-    (Like GatewayProcess of the vcan tests, without the libraries that those import: emulated, they cost seconds.)
-    """
+    """``kontronik-can-gw run`` with a prefix (``setpriv``) and an environment if need be."""
 
     def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
         program = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
