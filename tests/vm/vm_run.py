@@ -87,28 +87,15 @@ def native_prefix() -> list[str] | None:
         socket.socket(29, socket.SOCK_RAW, 1).close()
     except OSError:
         return None
-    here: list[str] = []
     with_lo = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
     namespace = ["unshare", "--user", "--map-root-user", "--net", *with_lo]
-    as_root = [
-        "sudo",
-        "-n",
-        "unshare",
-        "--net",
-        "setpriv",
-        f"--reuid={os.getuid()}",
-        f"--regid={os.getgid()}",
-    ]
-    as_root += [
-        "--init-groups",
-        "--inh-caps=+net_admin,+net_raw",
-        "--ambient-caps=+net_admin,+net_raw",
-        "env",
-    ]
+    rights = "--inh-caps=+net_admin,+net_raw --ambient-caps=+net_admin,+net_raw"
+    ids = f"--reuid={os.getuid()} --regid={os.getgid()} --init-groups"
+    as_root = f"sudo -n unshare --net setpriv {ids} {rights} env".split()
     as_root += [f"{name}={value}" for name, value in passed_on(os.environ).items()] + with_lo
     interface = f"vm{os.getpid()}"
     probe = ["sh", "-c", f"ip link add dev {interface} type vcan && ip link del {interface}"]
-    for prefix in (here, namespace, as_root):
+    for prefix in ([], namespace, as_root):
         with contextlib.suppress(OSError):
             done = subprocess.run(
                 prefix + probe, check=False, stdin=subprocess.DEVNULL, capture_output=True
@@ -122,14 +109,12 @@ def native_prefix() -> list[str] | None:
 
 
 def uml_command(job: str, out: int, err: int) -> list[str]:
-    command = f"linux.uml mem={UML_MEMORY_MIB}M root=/dev/root rootfstype=hostfs rootflags=/ ro init={job}/guest-init.sh"
-    command += (
-        f" VM_JOB={job} VM_BACKEND=uml GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512} con=null ssl=null"
-    )
-    command += (
-        f" ssl0=null,fd:{out} ssl1=null,fd:{err} uml_dir={job} umid=uml noreboot quiet loglevel=3"
-    )
-    return command.split()
+    return f"""
+        linux.uml mem={UML_MEMORY_MIB}M root=/dev/root rootfstype=hostfs rootflags=/ ro
+        init={job}/guest-init.sh VM_JOB={job} VM_BACKEND=uml GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512}
+        con=null ssl=null ssl0=null,fd:{out} ssl1=null,fd:{err}
+        uml_dir={job} umid=uml noreboot quiet loglevel=3
+    """.split()
 
 
 def uml_guest_environment() -> dict[str, str]:
@@ -140,15 +125,11 @@ def uml_guest_environment() -> dict[str, str]:
     with contextlib.suppress(OSError, importlib.metadata.PackageNotFoundError, ValueError):
         with open("/proc/cpuinfo") as cpuinfo:
             has_avx512 = "avx512f" in cpuinfo.read()
-        major, minor = importlib.metadata.version("numpy").split(".")[:2]
-        if has_avx512 and (int(major), int(minor)) >= (
-            2,
-            4,
-        ):
-            # numpy warns of a name that it does not know
-            environment["NPY_DISABLE_CPU_FEATURES"] = "X86_V4 AVX512_ICL AVX512_SPR"
-        elif has_avx512:
-            names = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+        major, minor = map(int, importlib.metadata.version("numpy").split(".")[:2])
+        names = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+        if (major, minor) >= (2, 4):  # numpy warns of a name that it does not know
+            names = "X86_V4 AVX512_ICL AVX512_SPR"
+        if has_avx512:
             environment["NPY_DISABLE_CPU_FEATURES"] = names
     return environment
 
@@ -185,66 +166,44 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
     kernel = qemu_kernel()
     if kernel is None:
         raise OSError("no kernel unpacked: run tests/vm/setup.sh qemu")
-    append = "console=ttyS0 panic=-1 quiet loglevel=3 tsc=reliable no_timer_check mitigations=off nokaslr"
-    append += f" random.trust_cpu=on VM_BACKEND=qemu GUEST_INIT={job}/guest-init.sh"
-    command = [
-        "qemu-system-x86_64",
-        "-nodefaults",
-        "-no-user-config",
-        "-display",
-        "none",
-        "-no-reboot",
-    ]
-    command += [
-        "-machine",
-        "q35",
-        "-accel",
-        "tcg,thread=multi,tb-size=512",
-        "-cpu",
-        "max",
-        "-m",
-        str(QEMU_MEMORY_MIB),
-    ]
-    command += [
-        "-kernel",
-        kernel,
-        "-initrd",
-        os.path.join(os.path.dirname(kernel), "initrd.cpio"),
-        "-append",
-        append,
-    ]
-    command += ["-serial", f"file:{job}/klog", "-device", "virtio-serial-pci"]
+    append = f"""
+        console=ttyS0 panic=-1 quiet loglevel=3 tsc=reliable no_timer_check mitigations=off nokaslr
+        random.trust_cpu=on VM_BACKEND=qemu GUEST_INIT={job}/guest-init.sh
+    """
+    initrd = os.path.join(os.path.dirname(kernel), "initrd.cpio")
+    command = f"""
+        qemu-system-x86_64 -nodefaults -no-user-config -display none -no-reboot
+        -machine q35 -accel tcg,thread=multi,tb-size=512 -cpu max -m {QEMU_MEMORY_MIB}
+        -serial file:{job}/klog -device virtio-serial-pci
+        -object can-bus,id=canbus0
+        -device kvaser_pci,canbus=canbus0 -device kvaser_pci,canbus=canbus0
+    """.split()
+    command += ["-kernel", kernel, "-initrd", initrd, "-append", " ".join(append.split())]
 
     def port(name: str, chardev: str) -> list[str]:
-        return [
-            "-chardev",
-            f"{chardev},id={name}",
-            "-device",
-            f"virtserialport,chardev={name},name={name}",
-        ]
+        device = f"virtserialport,chardev={name},name={name}"
+        return ["-chardev", f"{chardev},id={name}", "-device", device]
 
     for name, fd in (("stdout", out), ("stderr", err)):
-        command += [
-            "-add-fd",
-            f"fd={fd},set={fd}",
-            *port(name, f"file,path=/dev/fdset/{fd},append=on"),
-        ]
-    for tag, path, options in (("root", "/", ",readonly=on,multidevs=remap"), ("host", "/", ",multidevs=remap"),
-                               ("job", job, "")):  # fmt: skip
+        command += ["-add-fd", f"fd={fd},set={fd}"]
+        command += port(name, f"file,path=/dev/fdset/{fd},append=on")
+    for tag, path, options in (
+        ("root", "/", ",readonly=on,multidevs=remap"),
+        ("host", "/", ",multidevs=remap"),
+        ("job", job, ""),
+    ):
         command += ["-fsdev", f"local,id={tag},path={path},security_model=none{options}"]
         command += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
 
-    command += ["-object", "can-bus,id=canbus0"]
-    command += ["-device", "kvaser_pci,canbus=canbus0", "-device", "kvaser_pci,canbus=canbus0"]
-
     # One end is the device that the guest's driver sees, the other a virtio port that a test plays the device with.
+    usb = "usb-serial,id=usbser0,serial=ESC0002,bus=xhci.0,port=1,chardev=ftdis,always-plugged=on"
     for name, device in (
-        ("com1", ["-device", "isa-serial,chardev=com1s,index=1"]),
-        ("ftdi", ["-device", "qemu-xhci,id=xhci",
-                  "-device", "usb-serial,id=usbser0,serial=ESC0002,bus=xhci.0,port=1,chardev=ftdis,always-plugged=on"]),
-        ("qmp", ["-mon", "chardev=qmps,mode=control"]),
-    ):  # fmt: skip
-        command += ["-chardev", f"socket,id={name}s,path={job}/{name},server=on,wait=off", *device]
+        ("com1", "-device isa-serial,chardev=com1s,index=1"),
+        ("ftdi", f"-device qemu-xhci,id=xhci -device {usb}"),
+        ("qmp", "-mon chardev=qmps,mode=control"),
+    ):
+        far_end = f"socket,id={name}s,path={job}/{name},server=on,wait=off"
+        command += ["-chardev", far_end, *device.split()]
         command += port(name, f"socket,path={job}/{name}")
     return command
 
