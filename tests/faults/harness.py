@@ -397,40 +397,33 @@ class Bench:
         for esc in escs:
             self._excluded[esc].append((begin_ns, end_ns))
 
-    def account(self, until_ns: int | None = None) -> tuple[int, int]:
-        """How many values that were sent since the last account, outside of all faults, never came; how many were excused."""
+    def account(self, row: Row, until_ns: int | None = None) -> int:
+        """Note in a row how many values that were sent since the last account, outside of all faults, never came; how many they are."""
         if until_ns is None:
             until_ns = time.monotonic_ns() - 150 * MS
         self.watch.catch_up()
         time.sleep(0.05)  # until the metronome has told of the last standstill
         self.watch.settle(self.metronome.stood_still)
-        lost = excused = 0
+        lost_before = row.lost
         for index, fed in enumerate(self.fed):
             last = fed.newest(until_ns)
             for n in range(self._accounted[index], last + 1):
+                at = fed.sent[n]
                 if not fed.whole[n] or fed.seen[n] == SPEED | CURRENT:
                     continue
-                at = fed.sent[n]
                 if any(begin <= at <= end for begin, end in self._excluded[index]):
                     continue
                 following = fed.sent[n + 1] if n + 1 < len(fed.sent) else at + SECOND // 20
                 if self.metronome.stood_still(at - 5 * MS, following + 5 * MS) >= STANDSTILL_NS:
-                    excused += 1
-                else:
-                    lost += 1
-                    seen = (
-                        "only EscSpeed"
-                        if fed.seen[n] == SPEED
-                        else "only EscCurrent"
-                        if fed.seen[n]
-                        else "nothing"
-                    )
-                    self.losses.append(
-                        (at, f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came")
-                    )
+                    row.excused += 1
+                    continue
+                row.lost += 1
+                seen = {0: "nothing", SPEED: "only EscSpeed"}.get(fed.seen[n], "only EscCurrent")
+                what = f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came"
+                self.losses.append((at, what))
             self._accounted[index] = max(self._accounted[index], last + 1)
             self._excluded[index] = [x for x in self._excluded[index] if x[1] > until_ns]
-        return lost, excused
+        return row.lost - lost_before
 
     @contextlib.contextmanager
     def injection(
@@ -439,16 +432,13 @@ class Bench:
         """One injection of a fault; ``escs``: those that it disturbs, all unless given. A failed one is noted and raised again."""
         row = self.report.row(fault)
         self.check_alive()
-        lost, excused = self.account()  # of before; nobody's fault is the programme's too
-        row.lost += lost
-        row.excused += excused
-        wrong, old = self.watch.wrong_count, self.watch.old_count
+        self.account(row)  # of before; nobody's fault is the programme's too
         injection = Injection(self, fault, range(len(self.ports)) if escs is None else escs)
         row.injected += 1
         failed = True
         try:
             yield injection
-            injection.end()
+            injection.leave_out_until(injection.recovered_ns or time.monotonic_ns())
             time.sleep(settle_s)
             self.check_alive()
             failed = False
@@ -458,41 +448,17 @@ class Bench:
         finally:
             if failed:
                 injection.leave_out_until(time.monotonic_ns())
-            lost, excused = self.account()
-            row.lost += lost
-            row.excused += excused
-            if injection.in_the_controller:
-                most, end_ns = injection.in_the_controller
-                row.peak(
-                    "values in the controller already",
-                    self.watch.forgive(most, injection.begin_ns, end_ns),
-                )
-            fresh_wrong = self.watch.wrong_count - wrong
-            row.wrong += fresh_wrong
-            row.old += self.watch.old_count - old
-            if fresh_wrong:
-                for each in self.watch.wrong[-min(fresh_wrong, 3) :]:
-                    late = (each.at_ns - injection.begin_ns) / SECOND
-                    what = f"{each.message} {each.data}: {each.why}"
-                    row.notes.append(f"wrong value {late:.3f} s after the injection: {what}")
-            if lost:
-                when = [
-                    f"{(at - injection.begin_ns) / SECOND:.3f} s {what}"
-                    for at, what in self.losses[-lost:]
-                ]
-                row.notes.append(
-                    f"{lost} values lost, cleared at {injection.after(injection.cleared_ns)}, recovered at "
-                    f"{injection.after(injection.recovered_ns)}: {'; '.join(when[:4])}"
-                )
+            injection.note_lost(self.account(row))
+            injection.note_wrong()
             received, self._received = self._received, sum(port.received() for port in self.ports)
-            if self._received > received:
-                row.transmitted += self._received - received
+            row.transmitted += max(0, self._received - received)
             echoed, self._echoed = self._echoed, sum(port.echoed for port in self.ports)
             if self._echoed > echoed:
-                row.count(
-                    "bytes echoed by the kernel before the port was set", self._echoed - echoed
-                )
-            if not failed and injection.in_time:
+                what = "bytes echoed by the kernel before the port was set"
+                row.count(what, self._echoed - echoed)
+            if not injection.in_time:
+                row.notes.append(f"recovered only after {injection.recovery_s:.2f} s")
+            elif not failed:
                 row.recovered += 1
             row.worst_s = max(row.worst_s, injection.recovery_s)
 
@@ -527,6 +493,7 @@ class Injection:
         """So many values may come late until then: the controller had them, and nobody can take them back from it."""
         self.boot_ups = len(bench.watch.boot_ups)
         self.emergencies = len(bench.watch.emergencies)
+        self._wrong, self._old = bench.watch.wrong_count, bench.watch.old_count
 
     def cleared(self) -> None:
         """The cause is gone; what is sent from now on has to arrive soon."""
@@ -589,15 +556,30 @@ class Injection:
         return self.fault.limit_s is None or self.recovery_s <= self.fault.limit_s
 
     def leave_out_until(self, end_ns: int) -> None:
-        if self.escs:
-            self.bench.leave_out(self.escs, self.begin_ns - IN_FLIGHT_NS, end_ns)
+        """What was sent until then may be lost."""
+        self.bench.leave_out(self.escs, self.begin_ns - IN_FLIGHT_NS, end_ns)
 
-    def end(self) -> None:
-        """What was sent until the recovery may be lost."""
-        self.leave_out_until(self.recovered_ns or time.monotonic_ns())
-        if not self.in_time:
-            note = f"recovered only after {self.recovery_s:.2f} s"
-            self.row.notes.append(note)
+    def note_wrong(self) -> None:
+        """Put the wrong values since the injection down to it."""
+        watch, row = self.bench.watch, self.row
+        if self.in_the_controller:
+            most, end_ns = self.in_the_controller
+            forgiven = watch.forgive(most, self.begin_ns, end_ns)
+            row.peak("values in the controller already", forgiven)
+        wrong = watch.wrong_count - self._wrong
+        row.wrong += wrong
+        row.old += watch.old_count - self._old
+        for each in watch.wrong[-min(wrong, 3) :] if wrong else ():
+            what = f"{each.message} {each.data}: {each.why}"
+            row.notes.append(f"wrong value {self.after(each.at_ns)} after the injection: {what}")
+
+    def note_lost(self, lost: int) -> None:
+        if lost:
+            when = [f"{self.after(at)} {what}" for at, what in self.bench.losses[-lost:]]
+            self.row.notes.append(
+                f"{lost} values lost, cleared at {self.after(self.cleared_ns)}, recovered at "
+                f"{self.after(self.recovered_ns)}: {'; '.join(when[:4])}"
+            )
 
 
 Injects = Callable[[Any, Injection, Any], None]
