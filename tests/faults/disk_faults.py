@@ -38,7 +38,7 @@ on_disk = partial(injected, "Disk", bench="disk")
 def disk_bench(report: Report) -> Iterator[Bench]:
     """Two ESCs; the parameters on a small file system of their own; a slow one at will."""
     folder = Path(tempfile.mkdtemp(prefix="disk."))
-    store, site = folder / "store", folder / "store" / "site"
+    store, site = folder / "store", folder / "site"
     store.mkdir()
     benches.run("mount", "-t", "tmpfs", "-o", "size=64k,mode=0700", "tmpfs", str(store))
     site.mkdir()
