@@ -1,6 +1,7 @@
 """ESCs on pseudo terminals -> gateway process -> vcan: each value on the bus is one that was sent, in order, decoded by the DBC alone."""
 
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import cantools.database
 import pytest
 from encoding import POLE_PAIRS, Identity
 from harness import PtyPort
-from vcan_tools import Chain, chain, configuration, gateway_process, wait_for
+from vcan_tools import Chain, GatewayProcess, chain, configuration, wait_for
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
@@ -103,17 +104,18 @@ CAR = Path(__file__).resolve().parents[1] / "golden" / "inputs" / "my_car.dbc"
 HALF_A_STEP = {"BatteryVoltage": 0.0251, "MotorSpeed": 0.01, "PeakCurrent": 0.51}
 
 
-def test_a_users_dbc_is_followed(vcan: str, tmp_path: Path) -> None:
+def test_a_users_dbc_is_followed(
+    vcan: str, tmp_path: Path, start_gateway: Callable[..., GatewayProcess]
+) -> None:
     """Frames with 29-bit ids, CAN FD, pages and floats leave as the DBC says; that every value is right, the golden set judges."""
     database = cantools.database.load_file(CAR)
     assert isinstance(database, cantools.database.Database)
     dbc = f'fd = true\n[dbc]\nfile = "{CAR}"\nnode = "Gateway"\nunbound = "start_value"\n[dbc.e2e_data_ids]\nSafe = 0x123\n'
     port = PtyPort(tmp_path / "esc1", Identity(1))
-    toml = configuration(vcan, [port.path], dbc)
-    with (
-        can.Bus(interface="socketcan", channel=vcan, fd=True) as bus,
-        gateway_process(tmp_path / "c.toml", toml),
-    ):
+    with can.Bus(interface="socketcan", channel=vcan, fd=True) as bus:
+        gateway = start_gateway(configuration(vcan, [port.path], dbc))
+        gateway.wait_for_line("CAN socketcan")
+        gateway.wait_for_line("esc1: /")
         for n in range(30):
             while len(port.fed.sent) == n:
                 port.fed.send_one()

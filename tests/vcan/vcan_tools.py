@@ -174,19 +174,6 @@ def configuration(
     return "\n".join(parts)
 
 
-@contextmanager
-def gateway_process(file: Path, toml: str, *options: str) -> Iterator[GatewayProcess]:
-    """A gateway that has opened everything, with this configuration text, killed at the end if it still runs."""
-    file.write_text(toml)
-    process = GatewayProcess(file, *options)
-    try:
-        process.wait_for_line(f"esc{toml.count('[[esc]]')}: /")
-        process.wait_for_line("CAN socketcan")
-        yield process
-    finally:
-        process.kill()
-
-
 # --- ESCs whose frames are sent one by one
 
 
@@ -222,8 +209,8 @@ class Chain:
         for fed in self.escs:
             fed.info_every = 10
         self.config = folder / "gateway.toml"
-        self.toml = configuration(interface, [port.path for port in self.ports], toml, esc)
-        self.config.write_text(self.toml)
+        ports = [port.path for port in self.ports]
+        self.config.write_text(configuration(interface, ports, toml, esc))
         table = table_of_configuration(self.config, "[canopen]" in toml, len(identities))
         self.watch = Witness(interface, table, self.escs, slack_ns=NO_LIMIT_NS, ignore_local=False)
         self.watch.recorded = []
@@ -232,8 +219,14 @@ class Chain:
 
     @contextmanager
     def running(self, *options: str) -> Iterator[GatewayProcess]:
-        with gateway_process(self.config, self.toml, *options) as self.gateway:
+        """A gateway that has opened everything, killed at the end if it still runs."""
+        self.gateway = GatewayProcess(self.config, *options)
+        try:
+            self.gateway.wait_for_line(f"esc{len(self.ports)}: /")
+            self.gateway.wait_for_line("CAN socketcan")
             yield self.gateway
+        finally:
+            self.gateway.kill()
 
     @property
     def held_up(self) -> int:

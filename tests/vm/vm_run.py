@@ -46,6 +46,7 @@ from typing import BinaryIO, NoReturn
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 PROJECT = os.path.dirname(os.path.dirname(HERE))
+BACKENDS = ("native", "uml", "qemu")
 TIMED_OUT = 124
 VM_FAILED = 125
 
@@ -300,6 +301,54 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
     sys.exit(128 + number)
 
 
+def start_vm(
+    backend: str, job: str, out: int, err: int, log: BinaryIO
+) -> "subprocess.Popen[bytes]":
+    if backend == "uml":
+        command, environment = uml_command(job, out, err), uml_host_environment(job)
+    else:
+        command, environment = qemu_command(job, out, err), {"TMPDIR": job}
+    environment |= {"PATH": with_sbin(os.environ.get("PATH", ""))}
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=log,
+        pass_fds=(out, err),
+        start_new_session=True,
+        env={**os.environ, **environment},
+    )
+
+
+def wait_for_end(
+    process: "subprocess.Popen[bytes]", backend: str, job: str, timeout_s: float
+) -> str:
+    """Why it is not waited for any longer; nothing if it has ended."""
+    start, started = time.monotonic(), False
+    while True:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(max(0.0, start + timeout_s - time.monotonic()) if started else 0.1)
+            return ""
+        started = started or is_started(job)
+        elapsed_s = time.monotonic() - start
+        if elapsed_s >= timeout_s:
+            return f"no end within {timeout_s:g} s"
+        if not started and elapsed_s >= START_TIMEOUT_S[backend]:
+            return f"no start within {elapsed_s:.0f} s"
+
+
+def is_started(job: str) -> bool:
+    return os.path.exists(os.path.join(job, "started"))
+
+
+def read(job: str, name: str) -> str:
+    try:
+        with open(os.path.join(job, name), errors="replace") as file:
+            return file.read()
+    except OSError:
+        return ""
+
+
 def run_in_vm(
     backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
 ) -> tuple[int, bool]:
@@ -307,75 +356,37 @@ def run_in_vm(
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
     try:
         write_job(job, backend, command, writable)
-        (out_read, out_write), (err_read, err_write) = os.pipe(), os.pipe()
-        pumps = [
-            threading.Thread(target=pump, args=(out_read, sys.stdout.buffer), daemon=True),
-            threading.Thread(target=pump, args=(err_read, sys.stderr.buffer), daemon=True),
-        ]
-        start = time.monotonic()
-        late = ""
-        with contextlib.ExitStack() as ends:
-            for fd in (out_write, err_write):
-                ends.callback(os.close, fd)
-            vm_command = (uml_command if backend == "uml" else qemu_command)(
-                job, out_write, err_write
-            )
-            log = ends.enter_context(open(os.path.join(job, "log"), "wb"))
-            process = subprocess.Popen(
-                vm_command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                pass_fds=(out_write, err_write),
-                start_new_session=True,
-                env={
-                    **os.environ,
-                    **(uml_host_environment(job) if backend == "uml" else {"TMPDIR": job}),
-                    "PATH": with_sbin(os.environ.get("PATH", "")),
-                },
-            )
+        pipes = [os.pipe() for _ in range(2)]
+        try:
+            with open(os.path.join(job, "log"), "wb") as log:
+                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log)
+        finally:
+            for _, end in pipes:
+                os.close(end)
         guard_fd = guard(process.pid, job)
+        pumps = [
+            threading.Thread(target=pump, args=(end, to.buffer), daemon=True)
+            for (end, _), to in zip(pipes, (sys.stdout, sys.stderr), strict=True)
+        ]
         try:
             for thread in pumps:
                 thread.start()
-            started = False
-            while True:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(max(0.0, start + timeout_s - time.monotonic()) if started else 0.1)
-                    break
-                started = started or os.path.exists(os.path.join(job, "started"))
-                elapsed_s = time.monotonic() - start
-                if elapsed_s >= timeout_s:
-                    late = f"no end within {timeout_s:g} s"
-                elif not started and elapsed_s >= START_TIMEOUT_S[backend]:
-                    late = f"no start within {elapsed_s:.0f} s"
-                if late:
-                    break
+            late = wait_for_end(process, backend, job, timeout_s)
         finally:
             stop(process)
             os.write(guard_fd, b".")
             os.close(guard_fd)
         for thread in pumps:
             thread.join(60)
-        started = os.path.exists(os.path.join(job, "started"))
-        if late:
-            print(f"vm/run: {backend}: {late}", file=sys.stderr)
-            return (TIMED_OUT if started else VM_FAILED), started
-        try:
-            with open(os.path.join(job, "rc")) as file:
-                return int(file.read()), True
-        except (OSError, ValueError):
-            print(
-                f"vm/run: {backend}: the VM ended without a result; its last words:",
-                file=sys.stderr,
-            )
-            for name in ("log", "klog"):
-                with (
-                    contextlib.suppress(OSError),
-                    open(os.path.join(job, name), errors="replace") as file,
-                ):
-                    sys.stderr.write(file.read()[-4000:])
-            return VM_FAILED, started
+        code, started = read(job, "rc").strip(), is_started(job)
+        if code and not late:
+            return int(code), True
+        print(f"vm/run: {backend}: {late or 'the VM ended without a result'}", file=sys.stderr)
+        if late and started:
+            return TIMED_OUT, True
+        if not late:
+            print(*(read(job, name)[-4000:] for name in ("log", "klog")), file=sys.stderr)
+        return VM_FAILED, started
     except OSError as error:
         print(f"vm/run: {backend}: {error}", file=sys.stderr)
         return VM_FAILED, False
@@ -399,10 +410,8 @@ def installed() -> list[str]:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(usage=__doc__, add_help=True)
-    kinds = ("auto", "native", "uml", "qemu")
-    parser.add_argument(
-        "--backend", choices=kinds, default=os.environ.get("KCG_VM_BACKEND") or "auto"
-    )
+    kinds, default = ("auto", *BACKENDS), os.environ.get("KCG_VM_BACKEND") or "auto"
+    parser.add_argument("--backend", choices=kinds, default=default)
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")
