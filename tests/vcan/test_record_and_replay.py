@@ -172,34 +172,6 @@ def test_what_a_killed_gateway_had_recorded_was_on_the_disk(
         assert [line for line in found.damage if "was not closed" in line]
 
 
-def test_a_full_disk_stops_recording_and_nothing_else(
-    vcan: str, start_gateway: Start, tmp_path: Path
-) -> None:
-    folder = tmp_path / "small"
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(folder)], check=True)
-    try:
-        with bench(EscOptions()) as run, Candump(vcan) as live:
-            record = "[record]\nmin_free_mb = 0"
-            gateway = recorded_run(run, start_gateway, folder, 2, vcan, record)
-            gateway.wait_for_line("captures: ")
-            assert "No space left on device. Trying again." in gateway.log
-            before = len(live.frames)
-            wait_for(lambda: len(live.frames) > before + 100, "the bus goes on")
-            subprocess.run(["mount", "-o", "remount,size=20m", str(folder)], check=True)
-            gateway.wait_for_line("is written")
-            before = len(live.frames)
-            wait_for(lambda: len(live.frames) > before + 100, "the bus goes on")
-            assert gateway.end() == 0
-        with open_input(folder) as found:
-            assert isinstance(found, CaptureInput)
-            kinds = [entry.kind for entry in found.entries()]
-        assert Kind.LOST in kinds
-        assert kinds[-1] == Kind.STOP
-    finally:
-        subprocess.run(["umount", str(folder)], check=False)
-
-
 def bytes_of(folder: Path) -> list[int]:
     """When the bytes of a capture came."""
     with open_input(folder) as found:
