@@ -12,7 +12,7 @@ from typing import Any
 from encoding import Identity
 from fault_report import Report
 from harness import Bench, PtyPort
-from signals import Table, table_of_shipped
+from signals import Table, table_sent
 from slcan_adapters import Bus
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
@@ -55,7 +55,8 @@ def pair() -> Iterator[tuple[str, str]]:
 
 @functools.cache
 def table(escs: int, canopen: bool) -> Table:
-    return table_of_shipped(escs, canopen)
+    """Of the shipped layouts expanded to so many ESCs, nodes from 1 on."""
+    return table_sent(["--esc", str(escs)], canopen, escs)
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ from bus_watch import MS, SECOND, BusWatch, Fresh
 from encoding import GEAR, POLE_PAIRS, Identity
 from fault_report import Fault, Report, Row, fault
 from feeder import CURRENT, SPEED, FedEsc, Feeder
-from signals import Table, table_of_configuration
+from signals import Table
 
 from kontronik_can_gw.desk.pty import PtyEsc
 
@@ -259,10 +259,10 @@ class Bench:
         ports: Sequence[Port],
         report: Report,
         *,
+        table: Table,
         slack_ns: int = 60 * MS,
         canopen: str | None = "self_start = true",
         options: str = "",
-        table: Table | None = None,
         store: Path | None = None,
         prefix: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
@@ -281,8 +281,6 @@ class Bench:
         self.start_limit_s = start_limit_s
         self._canopen = canopen
         self.config.write_text(self.configuration(options))
-        if table is None:
-            table = table_of_configuration(self.config, canopen is not None, len(ports))
         self.watch = BusWatch(
             watched, table, self.fed, slack_ns=slack_ns, ignore_local=watched != interface
         ).start()

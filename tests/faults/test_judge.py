@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from itertools import pairwise
 
+import benches
 import pytest
 from bus_watch import MS, SECOND, Judge
 from encoding import Identity, live, live_values, mix
 from feeder import CURRENT, SPEED, FedEsc
-from signals import Message, Table, table_of_shipped
+from signals import Message, Table
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.fields import LiveData, rows
@@ -19,7 +20,7 @@ SPEED_ID, CURRENT_ID, LINK_ID = 0x688, 0x690, 0x6B0
 
 @pytest.fixture(scope="module")
 def table() -> Table:
-    return table_of_shipped(2)
+    return benches.table(2, True)
 
 
 @pytest.fixture

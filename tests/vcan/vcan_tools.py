@@ -22,7 +22,7 @@ from encoding import Identity
 from feeder import CURRENT, SPEED
 from harness import LoggedProcess, PtyPort
 from raw_bus import RawBus
-from signals import table_of_configuration
+from signals import table_sent
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk import pty
@@ -211,7 +211,7 @@ class Chain:
         self.config = folder / "gateway.toml"
         ports = [port.path for port in self.ports]
         self.config.write_text(configuration(interface, ports, toml, esc))
-        table = table_of_configuration(self.config, "[canopen]" in toml, len(identities))
+        table = table_sent(["-c", str(self.config)], "[canopen]" in toml, len(identities))
         self.watch = Witness(interface, table, self.escs, slack_ns=NO_LIMIT_NS, ignore_local=False)
         self.watch.recorded = []
         self.watch.start()
