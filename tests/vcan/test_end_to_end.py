@@ -112,7 +112,7 @@ def test_a_users_dbc_is_followed(
                 "ElectricalSpeed": data.electrical_speed,
                 "BatteryVoltage": data.battery_voltage / 100,
                 "MotorSpeed": data.electrical_speed / POLE_PAIRS,
-                "PowerStageTemperature": data.power_stage_temperature,
+                "MotorCurrent": data.motor_current * 100,
                 "PeakCurrent": data.peak_current / 10,
             }
             shown: dict[str, Any] = {}
