@@ -21,7 +21,12 @@ from typing import Any
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+import delay  # noqa: F401  registers its benchmarks, as the others do
+import instructions  # noqa: F401
+import live  # noqa: F401
+import offline  # noqa: F401
 import registry
+import start_and_memory  # noqa: F401
 from registry import Benchmark, Context, Figure, LeftOut, NotEqual
 
 
@@ -33,37 +38,20 @@ def seconds(text: str) -> float:
 
 
 def parser() -> argparse.ArgumentParser:
-    made = argparse.ArgumentParser(
-        prog="bench", description="Measure the gateway beside C and beside the obvious program."
-    )
-    made.add_argument(
-        "--only", nargs="+", default=["*"], metavar="NAME", help="these alone; as 'cpu*' too"
-    )
-    made.add_argument("--list", action="store_true", help="list the benchmarks and end")
-    made.add_argument(
-        "--seconds",
-        type=seconds,
-        default=5.0,
-        metavar="N",
-        help="length of one measurement (default: 5)",
-    )
-    made.add_argument(
-        "--long", action="store_true", help="files of up to 100 MB too, which takes minutes"
-    )
-    made.add_argument(
-        "--quick",
-        action="store_true",
-        help="as short as it can be: tries the benchmarks themselves",
-    )
-    made.add_argument(
-        "--vcan", default="", metavar="NAME", help="a vcan interface in place of the local socket"
-    )
+    made = argparse.ArgumentParser(prog="bench", description=__doc__.splitlines()[0])
+    option = made.add_argument
+    option("--only", nargs="+", default=["*"], metavar="NAME", help="these alone; as 'cpu*' too")
+    option("--list", action="store_true", help="list the benchmarks and end")
+    option("--seconds", type=seconds, default=5.0, metavar="N", help="of one measurement (5)")
+    option("--long", action="store_true", help="files of up to 100 MB too, which takes minutes")
+    option("--quick", action="store_true", help="as short as it can be: tries the benchmarks")
+    option("--vcan", default="", metavar="NAME", help="an interface in place of the local socket")
     return made
 
 
 def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
-    known = registry.benchmarks()
+    known = registry.BENCHMARKS
     if args.list:
         for each in known:
             print(f"{each.name:15} {each.help}")
@@ -86,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("bench: ended by hand; what is done is written", file=sys.stderr)
     file = registry.ROOT / "build" / "bench.json"
     file.write_text(json.dumps(document(common, results), indent=1, allow_nan=False) + "\n")
-    print(table(results))
+    print("\n".join(table(results)))
     print(f"JSON: {file}", file=sys.stderr)
     if interrupted:
         return 130
@@ -103,13 +91,13 @@ def run_one(benchmark: Benchmark, context: Context) -> dict[str, Any]:
         figures = benchmark.function(context)
     except LeftOut as reason:
         left_out = str(reason)
-        context.say(f"left out: {left_out}")
     except NotEqual as reason:
         error = f"not equal: {reason}"
-        context.say(error)
     except Exception as reason:  # one that fails must not end the others
         error = f"failed: {type(reason).__name__}: {reason}"
         traceback.print_exc()
+    if left_out or error:
+        context.say(error or f"left out: {left_out}")
     return {
         "name": benchmark.name,
         "figures": [asdict(figure) for figure in figures],
@@ -136,14 +124,11 @@ def document(context: Context, results: list[dict[str, Any]]) -> dict[str, Any]:
 
 def number(value: float) -> str:
     """As people read it: 4 figures, no exponent below a thousand million."""
-    if value == int(value) and abs(value) < 1e15:
-        return f"{int(value):,}".replace(",", " ")
-    if abs(value) >= 1000:
-        return f"{value:,.0f}".replace(",", " ")
-    return f"{value:.4g}"
+    whole = abs(value) >= 1000 or value == int(value)
+    return f"{value:,.0f}".replace(",", " ") if whole else f"{value:.4g}"
 
 
-def table(results: list[dict[str, Any]]) -> str:
+def table(results: list[dict[str, Any]]) -> list[str]:
     """Figure, value, target, reached or not."""
     figures = [figure for result in results for figure in result["figures"]]
     width = max((len(figure["name"]) for figure in figures), default=0)
@@ -156,18 +141,12 @@ def table(results: list[dict[str, Any]]) -> str:
         for word in ("left_out", "error"):
             if result[word]:
                 lines.append(f"  {word.replace('_', ' ')}: {result[word]}")
-    counts = {
-        reached: sum(figure["reached"] is reached for figure in figures)
-        for reached in (True, False)
-    }
+    reached = [figure["reached"] for figure in figures]
     left_out, failed = (
         sum(bool(result[word]) for result in results) for word in ("left_out", "error")
     )
-    lines.append("")
-    lines.append(
-        f"targets: {counts[True]} reached, {counts[False]} missed; {left_out} left out, {failed} failed"
-    )
-    return "\n".join(lines)
+    counts = f"{reached.count(True)} reached, {reached.count(False)} missed"
+    return [*lines, "", f"targets: {counts}; {left_out} left out, {failed} failed"]
 
 
 def verdict(figure: dict[str, Any]) -> str:
@@ -175,10 +154,9 @@ def verdict(figure: dict[str, Any]) -> str:
     if figure["reached"] is not False:
         return "reached" if figure["reached"] else ""
     sign, _, limit = figure["target"].partition(" ")
-    try:
-        over = figure["value"] / float(limit) - 1
-    except (ValueError, ZeroDivisionError):
+    if not limit:
         return "MISSED"
+    over = figure["value"] / float(limit) - 1
     short = over if sign == "<=" else -over
     return f"MISSED by {short:.0%}" if short > 0 else "MISSED"
 

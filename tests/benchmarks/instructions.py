@@ -7,7 +7,6 @@ bytes to the frames, of the Python programs without ports and sockets; not the k
 """
 
 import os
-import pty
 import random
 import re
 import shutil
@@ -15,14 +14,12 @@ import subprocess
 import sys
 import tempfile
 import threading
-import tty
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
-from bench_programs import FIVE, config_text, die_with_us, running
-from registry import HERE, ROOT, VALGRIND_LINE, Benchmark, Context, Figure, LeftOut, judged
+from programs import FIVE, config_text, die_with_us, running
+from registry import HERE, ROOT, VALGRIND_LINE, Context, Figure, LeftOut, benchmark, judged
 
 _SUMMARY = re.compile(r"^(?:summary|totals): (\d+)", re.MULTILINE)
 DISTINCT = 200
@@ -86,14 +83,12 @@ def obvious(all_frames: list[bytes]) -> int:
     import cantools
     from obvious import Esc
 
-    _, slave = pty.openpty()
-    tty.setraw(slave)
-    bus: Any = Sink()
-    esc = Esc(0, os.ttyname(slave), cantools.database.load_file(FIVE), bus, threading.Lock())
+    bus = Sink()
+    esc = Esc(0, None, cantools.database.load_file(FIVE), bus, threading.Lock())
     for frame in all_frames:
         esc.buffer += frame
         esc.find_frames()
-    return int(bus.count)
+    return bus.count
 
 
 # --- what runs valgrind
@@ -122,13 +117,7 @@ def of_python(program: str, count: int) -> int:
         command = [*counted_by(out), sys.executable, __file__, program, str(count)]
         same = os.environ | {"PYTHONHASHSEED": "0"}
         done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=600,
-            env=same,
-            preexec_fn=die_with_us,
-            check=False,
+            command, capture_output=True, text=True, timeout=600, env=same, preexec_fn=die_with_us
         )
         if done.returncode:
             raise RuntimeError(f"{program}: {done.stderr.strip()[-1500:]}")
@@ -140,11 +129,14 @@ def of_c(context: Context, count: int) -> int:
     with tempfile.TemporaryDirectory(prefix="kontronik-bench-") as folder:
         out = Path(folder) / "callgrind"
         words = ("--warmup", "0", "--period", "5000")
-        counted = lambda command: [*counted_by(out), *command]  # noqa: E731
-        with running(context, "c", 1, *words, seconds=count * 0.005, wrap=counted) as (
-            feeder,
-            gateway,
-        ):
+        with running(
+            context,
+            "c",
+            1,
+            *words,
+            seconds=count * 0.005,
+            wrap=lambda command: [*counted_by(out), *command],
+        ) as (feeder, gateway):
             sent = feeder.measure(gateway).sent
         return round(total(out) * count / sent)
 
@@ -156,6 +148,7 @@ def for_each(count: Callable[[int], int], number: int) -> float:
     return (long - short) / (2 * number)
 
 
+@benchmark("instructions", "instructions for each live frame, by valgrind (a minute)")
 def instructions(context: Context) -> list[Figure]:
     """The three programs."""
     number = 20 if context.quick else 200
@@ -171,12 +164,6 @@ def instructions(context: Context) -> list[Figure]:
         Figure("obvious / ours", found["obvious"] / found["ours"], "x"),
     ]
 
-
-BENCHMARKS = [
-    Benchmark(
-        "instructions", "instructions for each live frame, by valgrind (a minute)", instructions
-    )
-]
 
 if __name__ == "__main__":
     sys.path[:0] = [str(ROOT), str(HERE / "peers")]

@@ -1,7 +1,6 @@
-"""What a benchmark is, and what it gives: each of ``MODULES`` has a list ``BENCHMARKS``.
+"""What a benchmark is, and what it gives.
 
-    BENCHMARKS = [Benchmark("cpu", "CPU time a live frame, beside C", cpu)]
-
+    @benchmark("cpu", "CPU time a live frame, beside C")
     def cpu(context: Context) -> list[Figure]:
         program = context.compiled("gateway.c")   # raises LeftOut where there is no gcc
         if ours != theirs:
@@ -12,7 +11,6 @@ A missed target is no error. What is not equal, and what fails, is an exception.
 """
 
 import hashlib
-import importlib
 import shutil
 import subprocess
 import sys
@@ -23,15 +21,6 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-MODULES = (
-    "live_equal",
-    "live_cpu",
-    "live_delay",
-    "instructions",
-    "start_and_memory",
-    "offline_speed",
-)
-"""What must be equal comes first."""
 GCC_LINE = "sudo apt-get install gcc libc6-dev"
 VALGRIND_LINE = "sudo apt-get install valgrind libc6-dbg"
 
@@ -117,6 +106,17 @@ class Benchmark:
     function: Callable[[Context], list[Figure]]
 
 
-def benchmarks() -> list[Benchmark]:
-    """All of them."""
-    return [each for name in MODULES for each in importlib.import_module(name).BENCHMARKS]
+BENCHMARKS: list[Benchmark] = []
+"""Filled by importing the modules that have them, in that order: what must be equal comes first."""
+
+
+def benchmark(
+    name: str, text: str
+) -> Callable[[Callable[[Context], list[Figure]]], Callable[[Context], list[Figure]]]:
+    """Register a function as a benchmark."""
+
+    def register(function: Callable[[Context], list[Figure]]) -> Callable[[Context], list[Figure]]:
+        BENCHMARKS.append(Benchmark(name, text, function))
+        return function
+
+    return register

@@ -1,5 +1,6 @@
 """How long the gateway takes from its start to the first CAN frame, and the memory it takes: the whole command, as its own process."""
 
+import contextlib
 import os
 import re
 import socket
@@ -10,8 +11,8 @@ import time
 import uuid
 from pathlib import Path
 
-from bench_programs import STANDIN, config_text, end, median, running, start
-from registry import ROOT, Benchmark, Context, Figure, judged
+from programs import STANDIN, config_text, end, median, running, start
+from registry import ROOT, Context, Figure, benchmark, judged
 
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.lean import without_asammdf
@@ -30,41 +31,36 @@ _EXTENDED = 0x80000000
 def first_frame_ms(escs: int, config: str) -> float:
     """Start the gateway on a bus of its own, wait for its first frame, end it."""
     name = f"kontronik-bench-{uuid.uuid4().hex[:12]}"
-    ports = [PtyEsc() for _ in range(escs)]
     with (
         tempfile.TemporaryDirectory(prefix="kontronik-bench-") as made,
         socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener,
+        contextlib.ExitStack() as opened,
     ):
+        ports = [opened.enter_context(PtyEsc()).path for _ in range(escs)]
         folder = Path(made)
         listener.bind("\0" + name)
         listener.listen(1)
         listener.settimeout(_PATIENCE_S)
-        file, errors = folder / "gateway.toml", folder / "errors"
-        text = config_text(
-            [port.path for port in ports], "lo", SHIPPED, folder, config.format(folder=folder)
-        )
+        file = folder / "gateway.toml"
+        text = config_text(ports, "lo", SHIPPED, folder, config.format(folder=folder))
         file.write_text(text.replace("[dbc]", "bitrate = 1000000\n[dbc]", 1))
         command = [sys.executable, str(STANDIN), f"unix:{name}", "ours", "run", "-c", str(file)]
-        environment = {
-            key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"
-        }
-        with errors.open("w") as log:
-            begun = time.perf_counter()
-            process = start(command, stdin=subprocess.DEVNULL, stderr=log, env=environment)
+        environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+        log = opened.enter_context((folder / "errors").open("w+"))
+        begun = time.perf_counter()
+        process = start(command, stdin=subprocess.DEVNULL, stderr=log, env=environment)
+        opened.callback(end, process)
         try:
-            bus, _ = listener.accept()
-            with bus:
-                bus.settimeout(_PATIENCE_S)
-                bus.recv(128)
-                return (time.perf_counter() - begun) * 1e3
+            bus = opened.enter_context(listener.accept()[0])
+            bus.settimeout(_PATIENCE_S)
+            bus.recv(128)
         except TimeoutError:
-            raise RuntimeError(f"no frame came; the gateway said: {errors.read_text()}") from None
-        finally:
-            end(process)
-            for port in ports:
-                port.close()
+            said = (folder / "errors").read_text()
+            raise RuntimeError(f"no frame came; the gateway said: {said}") from None
+        return (time.perf_counter() - begun) * 1e3
 
 
+@benchmark("start", "from exec to the first CAN frame: 1 and 8 ESCs, CANopen")
 def start_up(context: Context) -> list[Figure]:
     """From exec to the first CAN frame, by turns."""
     cases = {
@@ -111,6 +107,7 @@ def many_escs_dbc(folder: Path) -> Path:
     return file
 
 
+@benchmark("memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder")
 def memory(context: Context) -> list[Figure]:
     """After some seconds of traffic."""
     cases = {
@@ -135,26 +132,15 @@ def memory(context: Context) -> list[Figure]:
             context.say(f"{case}: RSS {found[case]['RSS']:.1f} MB")
     context.data["memory_mb"] = found
     rss = {case: memory["RSS"] for case, memory in found.items()}
-    notes = {
-        case: f"PSS {memory['PSS']:.1f}, USS {memory['USS']:.1f}" for case, memory in found.items()
-    }
-    figures = [judged("RSS, 1 ESC", rss.pop("1 ESC"), "MB", "<= 40", notes["1 ESC"])]
-    figures += [
-        Figure(f"RSS, {case}", value, "MB", note=notes[case]) for case, value in rss.items()
+    further = (rss["64 ESCs"] - rss["1 ESC"]) / 63
+    further_nodes = (rss["8 ESCs, CANopen"] - rss["1 ESC, CANopen"]) / 7
+    figures = []
+    for case, kinds in found.items():
+        note = f"PSS {kinds['PSS']:.1f}, USS {kinds['USS']:.1f}"
+        limited = (judged, "<= 40") if case == "1 ESC" else (Figure, "")
+        figures.append(limited[0](f"RSS, {case}", kinds["RSS"], "MB", limited[1], note=note))
+    return [
+        *figures,
+        judged("RSS, each further ESC", further, "MB", "<= 0.3"),
+        Figure("RSS, each further ESC, CANopen", further_nodes, "MB"),
     ]
-    one, nodes = found["1 ESC"]["RSS"], found["1 ESC, CANopen"]["RSS"]
-    figures.append(judged("RSS, each further ESC", (rss["64 ESCs"] - one) / 63, "MB", "<= 0.3"))
-    figures.append(
-        Figure("RSS, each further ESC, CANopen", (rss["8 ESCs, CANopen"] - nodes) / 7, "MB")
-    )
-    return figures
-
-
-BENCHMARKS = [
-    Benchmark(
-        "start",
-        "from the start of the command to its first CAN frame: 1 and 8 ESCs, CANopen",
-        start_up,
-    ),
-    Benchmark("memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder", memory),
-]

@@ -87,7 +87,7 @@ def test_only_what_is_not_equal_or_fails_is_an_error(
             raise outcome
         return outcome
 
-    monkeypatch.setattr(registry, "benchmarks", lambda: [Benchmark("one", "a try", function)])
+    monkeypatch.setattr(registry, "BENCHMARKS", [Benchmark("one", "a try", function)])
     assert bench.main([]) == code
     assert said in capsys.readouterr().out
     assert json.loads((build / "bench.json").read_text())["benchmarks"][0]["name"] == "one"

@@ -1,16 +1,18 @@
 """The benches that the faults of the programme share, by name."""
 
 import contextlib
+import functools
 import itertools
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from encoding import Identity
 from fault_report import Report
 from harness import Bench, PtyPort
-from signals import Table, table_of_shipped
+from signals import Table, table_sent
 from slcan_adapters import Bus
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
@@ -24,7 +26,6 @@ BUSES: dict[str, Bus] = {}
 """The emulated adapters' buses by the gateway's interface."""
 
 _numbers = itertools.count()
-_tables: dict[tuple[int, bool], Table] = {}
 
 
 def run(*words: str) -> None:
@@ -52,10 +53,10 @@ def pair() -> Iterator[tuple[str, str]]:
         subprocess.run(["ip", "link", "del", ends[0]], check=False, capture_output=True)
 
 
+@functools.cache
 def table(escs: int, canopen: bool) -> Table:
-    if (escs, canopen) not in _tables:
-        _tables[escs, canopen] = table_of_shipped(escs, canopen)
-    return _tables[escs, canopen]
+    """Of the shipped layouts expanded to so many ESCs, nodes from 1 on."""
+    return table_sent(["--esc", str(escs)], canopen, escs)
 
 
 @contextlib.contextmanager
@@ -63,43 +64,40 @@ def bench_of(
     report: Report,
     identities: Sequence[Identity] = IDENTITIES,
     rate_hz: float = 50,
-    canopen: str | None = "self_start = true",
-    started: bool = True,
-    prefix: Sequence[str] = (),
+    cable: contextlib.AbstractContextManager[tuple[str, str]] | None = None,
+    **options: Any,
 ) -> Iterator[Bench]:
     """A running gateway with these ESCs on a CAN cable; what nobody injected is accounted before it is handed out."""
     folder = Path(tempfile.mkdtemp(prefix="ports."))
-    with pair() as (near, far):
+    with cable or pair() as (near, far):
         ports = [
             PtyPort(folder / f"esc{i + 1}", identity, rate_hz)
             for i, identity in enumerate(identities)
         ]
-        known = table(len(ports), canopen is not None)
-        with Bench(near, far, ports, report, canopen=canopen, table=known, prefix=prefix) as bench:
-            if started:
-                bench.start()
+        known = table(len(ports), options.get("canopen", "") is not None)
+        with Bench(near, far, ports, report, table=known, **options) as bench:
+            bench.start()
             yield bench
 
 
-@contextlib.contextmanager
-def two(report: Report) -> Iterator[Bench]:
-    with bench_of(report, prefix=WITHOUT_OVERRIDE) as bench:
-        yield bench
+def two(report: Report) -> contextlib.AbstractContextManager[Bench]:
+    return bench_of(report, prefix=WITHOUT_OVERRIDE)
 
 
-@contextlib.contextmanager
-def eight(report: Report) -> Iterator[Bench]:
+def eight(report: Report) -> contextlib.AbstractContextManager[Bench]:
+    """Slow ones: feeder and judge have the processor, too."""
     layouts = (Layout.V4, Layout.LEGACY)
     identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
-    with bench_of(report, identities, rate_hz=25, canopen=None) as bench:
-        # feeder and judge have the processor, too
-        yield bench
+    return bench_of(report, identities, rate_hz=25, canopen=None)
+
+
+def adapters(report: Report) -> contextlib.AbstractContextManager[Bench]:
+    """One ESC, a gateway on an emulated adapter, the judge on another; the adapters are slow."""
+    return bench_of(report, [Identity(1)], rate_hz=25, cable=adapter_pair())
 
 
 @contextlib.contextmanager
-def adapters(report: Report) -> Iterator[Bench]:
-    """One ESC, a gateway on an emulated adapter, the judge on another."""
-    folder = Path(tempfile.mkdtemp(prefix="ports."))
+def adapter_pair() -> Iterator[tuple[str, str]]:
     number = next(_numbers)
     near, far = f"sl{number}", f"slfar{number}"
     bus = BUSES[near] = Bus(near, far)
@@ -107,10 +105,7 @@ def adapters(report: Report) -> Iterator[Bench]:
         for adapter in bus.adapters:
             run("ip", "link", "set", adapter.name, "txqueuelen", "100")
             adapter.up(ADAPTER_RATE)
-        ports = [PtyPort(folder / "esc1", Identity(1), rate_hz=25)]  # the adapters are slow
-        with Bench(near, far, ports, report, table=table(1, True)) as bench:
-            bench.start()
-            yield bench
+        yield near, far
     finally:
         bus.close()
 

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Self
 
 from encoding import info_values, live_values
 from feeder import CURRENT, SPEED, FedEsc
+from raw_bus import EXTENDED, FRAME, SO_RCVBUFFORCE
 from signals import Message, Table
 
 MS = 1_000_000
@@ -27,10 +28,7 @@ LOOKED_BACK = 3000
 KEPT = 100
 
 _SO_TIMESTAMPNS = 35
-_SO_RCVBUFFORCE = 33
-_FRAME = struct.Struct("=IB3x8s")
 _STAMP = struct.Struct("=qq")
-_EXTENDED = 0x80000000
 _FOLLOWS = {"Speed": SPEED, "Current": CURRENT}
 
 
@@ -379,7 +377,7 @@ class BusWatch(Judge):
         self.failure: BaseException | None = None
         self._ignore_local = ignore_local
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        for option in (_SO_RCVBUFFORCE, socket.SO_RCVBUF):
+        for option in (SO_RCVBUFFORCE, socket.SO_RCVBUF):
             with contextlib.suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, option, 48 << 20)
                 break
@@ -412,7 +410,7 @@ class BusWatch(Judge):
             raise
 
     def _received(self, data: bytes, ancillary: list[Any], flags: int, address: Any) -> None:
-        if address[0] != self.interface or len(data) != _FRAME.size:
+        if address[0] != self.interface or len(data) != FRAME.size:
             return
         now, wall = _both_clocks()
         self._note_offset(wall - now)
@@ -422,10 +420,10 @@ class BusWatch(Judge):
                 seconds, rest = _STAMP.unpack(content[: _STAMP.size])
                 at_ns = self._monotonic(seconds * SECOND + rest, now)
         self._latest_ns = at_ns
-        can_id, size, content = _FRAME.unpack(data)
+        can_id, size, content = FRAME.unpack(data)
         if self._ignore_local and flags & socket.MSG_DONTROUTE:
             self.foreign += 1
-        elif not can_id & _EXTENDED:
+        elif not can_id & EXTENDED:
             self.take(can_id & 0x7FF, content[:size], at_ns)
 
     def catch_up(self, seconds: float = 90) -> None:

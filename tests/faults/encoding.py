@@ -4,7 +4,14 @@ So whoever sees a value knows which frames may have carried it, and a value that
 recognised. All values are inside the sheet's ranges and differ from the DBC's codes for "not available" and "error".
 """
 
-from typing import NamedTuple
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
+from esc import sheet
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
@@ -89,64 +96,37 @@ def info(identity: Identity, m: int) -> InfoData:
     )
 
 
+def physical(data: Any, fields: Sequence[sheet.Field]) -> dict[str, float]:
+    return {field.name: getattr(data, field.name) / field.steps for field in fields}
+
+
+def bits(word: int, count: int) -> dict[str, float]:
+    return {f"bit{n}": word >> n & 1 for n in range(count)}
+
+
 def live_values(data: LiveData, cells: int) -> dict[str, float]:
     """Physical values by the names that the DBC's signals have in snake case; derived ones computed anew here."""
-    speed, voltage, current = (
-        data.electrical_speed,
-        data.battery_voltage / 100,
-        data.battery_current / 10,
-    )
-    values: dict[str, float] = {
-        "electrical_speed": speed,
-        "battery_voltage": voltage,
-        "battery_current": current,
-        "motor_current": data.motor_current / 10,
-        "peak_current": data.peak_current / 10,
-        "consumed_charge": data.consumed_charge,
-        "bec_current": data.bec_current / 1000,
-        "bec_voltage": data.bec_voltage / 1000,
-        "pwm_input": data.pwm_input,
-        "throttle": data.throttle,
-        "output_opening": data.output_opening,
-        "power_stage_temperature": data.power_stage_temperature,
-        "bec_temperature": data.bec_temperature,
-        "operating_state": data.operating_state,
+    values = physical(data, sheet.LIVE_FIELDS)
+    speed, voltage = values["electrical_speed"], values["battery_voltage"]
+    return {
+        **values,
+        **bits(data.operating_errors, 24),
         "operating_state_raw": data.operating_state,
-        "timing": data.timing,
         "motor_speed": speed / POLE_PAIRS,
         "output_speed": speed / POLE_PAIRS / GEAR,
         "mean_cell_voltage": voltage / cells,
-        "battery_power": voltage * current,
+        "battery_power": voltage * values["battery_current"],
     }
-    for bit in range(24):
-        values[f"bit{bit}"] = data.operating_errors >> bit & 1
-    return values
 
 
 def info_values(data: InfoData) -> dict[str, float]:
     """The same of an info frame."""
-    values: dict[str, float] = {
-        "variant": data.variant,
+    return {
+        **physical(data, sheet.INFO_FIELDS),
+        **bits(data.selftest_errors, 19),
+        "variant": data.device_and_variant & 1023,
         "firmware_main": data.firmware_word >> 8,
         "firmware_sub": data.firmware_word & 255,
-        "device": data.device,
-        "device_raw": data.device,
-        "max_electrical_speed": data.max_electrical_speed,
-        "min_battery_voltage": data.min_battery_voltage / 100,
-        "max_battery_voltage": data.max_battery_voltage / 100,
-        "cell_count": data.cell_count,
-        "max_battery_current": data.max_battery_current / 10,
-        "max_motor_current": data.max_motor_current / 10,
-        "max_peak_current": data.max_peak_current / 10,
-        "max_bec_current": data.max_bec_current / 1000,
-        "min_bec_voltage": data.min_bec_voltage / 1000,
-        "max_throttle": data.max_throttle,
-        "max_output_opening": data.max_output_opening,
-        "min_power_stage_temperature": data.min_power_stage_temperature,
-        "max_power_stage_temperature": data.max_power_stage_temperature,
-        "min_bec_temperature": data.min_bec_temperature,
-        "max_bec_temperature": data.max_bec_temperature,
+        "device": data.device_and_variant >> 10,
+        "device_raw": data.device_and_variant >> 10,
     }
-    for bit in range(19):
-        values[f"bit{bit}"] = data.selftest_errors >> bit & 1
-    return values

@@ -1,12 +1,11 @@
 """The bench of the fault programme: fed ESCs, a gateway process, a judge of the bus, and the account of each injected fault.
 
-    bench = Bench(interfaces, [PtyPort(...)], report)           # or any port with ``fed``, ``close`` and ``received``
-    with bench.injection(fault, escs=(0,)) as injection:        # who is disturbed by it; () : nobody may be
+    @injected("Serial", "port gone and back", 2.0, escs=[0])    # who is disturbed by it; []: nobody may be; all unless given
+    def gone(bench, injection, n):                              # the n-th of as many as a run asks for
         ...the fault is on...
-        injection.cleared()                                     # its cause is gone: from now on the recovery counts
-        injection.wait_recovery()                               # the first right value that was sent since then
+        injection.cleared()                                     # its cause is gone: until the first right value sent since then
 
-At the end of the ``with`` the bus is watched a while longer, then wrong and lost values are put down to the fault. Times are
+Then the bus is watched a while longer, then wrong and lost values are put down to the fault. Times are
 monotonic nanoseconds, of frames the kernel's.
 """
 
@@ -17,15 +16,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, Self
+from typing import IO, Any, Protocol, Self
 
 from bus_watch import MS, SECOND, BusWatch, Fresh
 from encoding import GEAR, POLE_PAIRS, Identity
-from fault_report import Fault, Report, Row
+from fault_report import Fault, Report, Row, fault
 from feeder import CURRENT, SPEED, FedEsc, Feeder
-from signals import Table, table_of_configuration
+from signals import Table
 
 from kontronik_can_gw.desk.pty import PtyEsc
 
@@ -52,46 +51,56 @@ class NotRecovered(AssertionError):
 
 
 class LoggedProcess:
-    """A program as its own process, and what it has logged so far."""
+    """A program as its own process, and the lines that it has written so far: ``lines`` to standard error, ``out`` to standard output."""
 
     def __init__(
-        self, command: Sequence[str], environment: Mapping[str, str] | None = None
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        keep_out: bool = False,
     ) -> None:
         self.process = subprocess.Popen(
             command,
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.PIPE if keep_out else subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, **(environment or {})},
         )
         self.lines: list[str] = []
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self.out: list[str] = []
+        self._readers = []
+        for stream, lines in ((self.process.stderr, self.lines), (self.process.stdout, self.out)):
+            if stream is not None:
+                reader = threading.Thread(target=self._read, args=(stream, lines), daemon=True)
+                reader.start()
+                self._readers.append(reader)
 
-    def _read(self) -> None:
-        assert self.process.stderr
-        for text in self.process.stderr:
-            self.lines.append(text.rstrip())
+    @staticmethod
+    def _read(stream: IO[str], lines: list[str]) -> None:
+        with stream:
+            for text in stream:
+                lines.append(text.rstrip())
 
     @property
     def log(self) -> str:
         return "\n".join(self.lines)
 
+    def wait(self) -> int:
+        """Wait until it has ended and all that it wrote is read; its exit code."""
+        code = self.process.wait(60)
+        for reader in self._readers:
+            reader.join(60)
+        return code
+
     def kill(self) -> None:
         """End it, however it fares."""
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait()
-        self._reader.join(60)
-        if self.process.stderr and not self.process.stderr.closed:
-            self.process.stderr.close()
+        self.wait()
 
 
 class Gateway(LoggedProcess):
-    """``kontronik-can-gw run`` with a prefix (``setpriv``) and an environment if need be.
-
-    (Like GatewayProcess of the vcan tests, without the libraries that those import: emulated, they cost seconds.)
-    """
+    """``kontronik-can-gw run`` with a prefix (``setpriv``) and an environment if need be."""
 
     def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
         program = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
@@ -250,10 +259,10 @@ class Bench:
         ports: Sequence[Port],
         report: Report,
         *,
+        table: Table,
         slack_ns: int = 60 * MS,
         canopen: str | None = "self_start = true",
         options: str = "",
-        table: Table | None = None,
         store: Path | None = None,
         prefix: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
@@ -272,8 +281,6 @@ class Bench:
         self.start_limit_s = start_limit_s
         self._canopen = canopen
         self.config.write_text(self.configuration(options))
-        if table is None:
-            table = table_of_configuration(self.config, canopen is not None, len(ports))
         self.watch = BusWatch(
             watched, table, self.fed, slack_ns=slack_ns, ignore_local=watched != interface
         ).start()
@@ -318,6 +325,12 @@ class Bench:
         except subprocess.TimeoutExpired:
             raise NotRecovered("it did not end within 10 s of SIGTERM") from None
         finally:
+            gateway.kill()
+
+    def kill(self) -> None:
+        """End the gateway, however it fares."""
+        gateway, self.gateway = self.gateway, None
+        if gateway is not None:
             gateway.kill()
 
     def wait_fresh(
@@ -382,40 +395,33 @@ class Bench:
         for esc in escs:
             self._excluded[esc].append((begin_ns, end_ns))
 
-    def account(self, until_ns: int | None = None) -> tuple[int, int]:
-        """How many values that were sent since the last account, outside of all faults, never came; how many were excused."""
+    def account(self, row: Row, until_ns: int | None = None) -> int:
+        """Note in a row how many values that were sent since the last account, outside of all faults, never came; how many they are."""
         if until_ns is None:
             until_ns = time.monotonic_ns() - 150 * MS
         self.watch.catch_up()
         time.sleep(0.05)  # until the metronome has told of the last standstill
         self.watch.settle(self.metronome.stood_still)
-        lost = excused = 0
+        lost_before = row.lost
         for index, fed in enumerate(self.fed):
             last = fed.newest(until_ns)
             for n in range(self._accounted[index], last + 1):
+                at = fed.sent[n]
                 if not fed.whole[n] or fed.seen[n] == SPEED | CURRENT:
                     continue
-                at = fed.sent[n]
                 if any(begin <= at <= end for begin, end in self._excluded[index]):
                     continue
                 following = fed.sent[n + 1] if n + 1 < len(fed.sent) else at + SECOND // 20
                 if self.metronome.stood_still(at - 5 * MS, following + 5 * MS) >= STANDSTILL_NS:
-                    excused += 1
-                else:
-                    lost += 1
-                    seen = (
-                        "only EscSpeed"
-                        if fed.seen[n] == SPEED
-                        else "only EscCurrent"
-                        if fed.seen[n]
-                        else "nothing"
-                    )
-                    self.losses.append(
-                        (at, f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came")
-                    )
+                    row.excused += 1
+                    continue
+                row.lost += 1
+                seen = {0: "nothing", SPEED: "only EscSpeed"}.get(fed.seen[n], "only EscCurrent")
+                what = f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came"
+                self.losses.append((at, what))
             self._accounted[index] = max(self._accounted[index], last + 1)
             self._excluded[index] = [x for x in self._excluded[index] if x[1] > until_ns]
-        return lost, excused
+        return row.lost - lost_before
 
     @contextlib.contextmanager
     def injection(
@@ -424,16 +430,13 @@ class Bench:
         """One injection of a fault; ``escs``: those that it disturbs, all unless given. A failed one is noted and raised again."""
         row = self.report.row(fault)
         self.check_alive()
-        lost, excused = self.account()  # of before; nobody's fault is the programme's too
-        row.lost += lost
-        row.excused += excused
-        wrong, old = self.watch.wrong_count, self.watch.old_count
+        self.account(row)  # of before; nobody's fault is the programme's too
         injection = Injection(self, fault, range(len(self.ports)) if escs is None else escs)
         row.injected += 1
         failed = True
         try:
             yield injection
-            injection.end()
+            injection.leave_out_until(injection.recovered_ns or time.monotonic_ns())
             time.sleep(settle_s)
             self.check_alive()
             failed = False
@@ -443,50 +446,24 @@ class Bench:
         finally:
             if failed:
                 injection.leave_out_until(time.monotonic_ns())
-            lost, excused = self.account()
-            row.lost += lost
-            row.excused += excused
-            if injection.in_the_controller:
-                most, end_ns = injection.in_the_controller
-                row.peak(
-                    "values in the controller already",
-                    self.watch.forgive(most, injection.begin_ns, end_ns),
-                )
-            fresh_wrong = self.watch.wrong_count - wrong
-            row.wrong += fresh_wrong
-            row.old += self.watch.old_count - old
-            if fresh_wrong:
-                for each in self.watch.wrong[-min(fresh_wrong, 3) :]:
-                    late = (each.at_ns - injection.begin_ns) / SECOND
-                    what = f"{each.message} {each.data}: {each.why}"
-                    row.notes.append(f"wrong value {late:.3f} s after the injection: {what}")
-            if lost:
-                when = [
-                    f"{(at - injection.begin_ns) / SECOND:.3f} s {what}"
-                    for at, what in self.losses[-lost:]
-                ]
-                row.notes.append(
-                    f"{lost} values lost, cleared at {injection.after(injection.cleared_ns)}, recovered at "
-                    f"{injection.after(injection.recovered_ns)}: {'; '.join(when[:4])}"
-                )
+            injection.note_lost(self.account(row))
+            injection.note_wrong()
             received, self._received = self._received, sum(port.received() for port in self.ports)
-            if self._received > received:
-                row.transmitted += self._received - received
+            row.transmitted += max(0, self._received - received)
             echoed, self._echoed = self._echoed, sum(port.echoed for port in self.ports)
             if self._echoed > echoed:
-                row.count(
-                    "bytes echoed by the kernel before the port was set", self._echoed - echoed
-                )
-            if not failed and injection.in_time:
+                what = "bytes echoed by the kernel before the port was set"
+                row.count(what, self._echoed - echoed)
+            if not injection.in_time:
+                row.notes.append(f"recovered only after {injection.recovery_s:.2f} s")
+            elif not failed:
                 row.recovered += 1
             row.worst_s = max(row.worst_s, injection.recovery_s)
 
     def close(self) -> None:
         """End the gateway and everything else; the folder stays for a look at it as long as the machine lives."""
         self.feeder.close()
-        if self.gateway is not None:
-            self.gateway.kill()
-            self.gateway = None
+        self.kill()
         self.watch.close()
         self.metronome.close()
         for port in self.ports:
@@ -514,6 +491,7 @@ class Injection:
         """So many values may come late until then: the controller had them, and nobody can take them back from it."""
         self.boot_ups = len(bench.watch.boot_ups)
         self.emergencies = len(bench.watch.emergencies)
+        self._wrong, self._old = bench.watch.wrong_count, bench.watch.old_count
 
     def cleared(self) -> None:
         """The cause is gone; what is sent from now on has to arrive soon."""
@@ -526,7 +504,7 @@ class Injection:
         self.recovered_ns = self.bench.wait_fresh(
             self.escs, self.cleared_ns, limit * 3 + 2, self.cleared_ns
         )
-        self.recovery_s = self.bench.running_s(self.cleared_ns, self.recovered_ns)
+        self.healed_at(self.recovered_ns)
 
     def healed_at(self, at_ns: int) -> None:
         """Something else that had to heal too was good at that time."""
@@ -563,6 +541,10 @@ class Injection:
         if not holds:
             raise NotRecovered(f"{what}; {self.bench.last_words()}")
 
+    @property
+    def row(self) -> Row:
+        return self.bench.report.row(self.fault)
+
     def after(self, at_ns: int | None) -> str:
         """A time since the injection in words."""
         return "no time" if at_ns is None else f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
@@ -572,12 +554,62 @@ class Injection:
         return self.fault.limit_s is None or self.recovery_s <= self.fault.limit_s
 
     def leave_out_until(self, end_ns: int) -> None:
-        if self.escs:
-            self.bench.leave_out(self.escs, self.begin_ns - IN_FLIGHT_NS, end_ns)
+        """What was sent until then may be lost."""
+        self.bench.leave_out(self.escs, self.begin_ns - IN_FLIGHT_NS, end_ns)
 
-    def end(self) -> None:
-        """What was sent until the recovery may be lost."""
-        self.leave_out_until(self.recovered_ns or time.monotonic_ns())
-        if not self.in_time:
-            note = f"recovered only after {self.recovery_s:.2f} s"
-            self.bench.report.row(self.fault).notes.append(note)
+    def note_wrong(self) -> None:
+        """Put the wrong values since the injection down to it."""
+        watch, row = self.bench.watch, self.row
+        if self.in_the_controller:
+            most, end_ns = self.in_the_controller
+            forgiven = watch.forgive(most, self.begin_ns, end_ns)
+            row.peak("values in the controller already", forgiven)
+        wrong = watch.wrong_count - self._wrong
+        row.wrong += wrong
+        row.old += watch.old_count - self._old
+        for each in watch.wrong[-min(wrong, 3) :] if wrong else ():
+            what = f"{each.message} {each.data}: {each.why}"
+            row.notes.append(f"wrong value {self.after(each.at_ns)} after the injection: {what}")
+
+    def note_lost(self, lost: int) -> None:
+        if lost:
+            when = [f"{self.after(at)} {what}" for at, what in self.bench.losses[-lost:]]
+            self.row.notes.append(
+                f"{lost} values lost, cleared at {self.after(self.cleared_ns)}, recovered at "
+                f"{self.after(self.recovered_ns)}: {'; '.join(when[:4])}"
+            )
+
+
+Injects = Callable[[Any, Injection, Any], None]
+"""One injection on a bench; the last argument is what ``rounds`` gave for it."""
+
+
+def half(times: int) -> range:
+    return range(max(1, times // 2))
+
+
+def injected(
+    area: str,
+    name: str,
+    limit_s: float | None,
+    *,
+    escs: Sequence[int] | None = None,
+    settle_s: float = SETTLE_S,
+    rounds: Callable[[int], Iterable[Any]] = range,
+    machine: str = "UML",
+    bench: str = "two",
+) -> Callable[[Injects], Injects]:
+    """Register a function as a fault: called once for each round, and its recovery is waited for when its cause is ``cleared``."""
+
+    def register(inject: Injects) -> Injects:
+        def run(bench: Bench, fault: Fault, times: int) -> None:
+            for each in rounds(times):
+                with bench.injection(fault, escs, settle_s) as injection:
+                    inject(bench, injection, each)
+                    if injection.cleared_ns is not None and injection.recovered_ns is None:
+                        injection.wait_recovery()
+
+        fault(area, name, limit_s, machine=machine, bench=bench)(run)
+        return inject
+
+    return register

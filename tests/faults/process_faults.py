@@ -8,19 +8,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 from fault_report import WITH_PYTHON, Fault, fault
-from harness import AHEAD, Bench, Injection, PtyPort
+from harness import AHEAD, Bench, Injection, PtyPort, half, injected
 from raw_bus import RawBus
 
-LIMIT_S = 1.0
 RESTART_LIMIT_S = 3.0
 """A new process needs its layout compiled too, for which User Mode Linux, on one shared processor, takes some times as long as the machine
 itself; that a gateway is back within a second there is held by tests/runtime/test_life_of_the_process.py."""
 STOPPING = 2
 TIMEOUT_OBJECT = 0x2100, 4
 """Telemetry time-out in ms, which a master may set and store."""
+process = partial(injected, "Process")
 
 
 def python_start_s(bench: Bench) -> float:
@@ -41,9 +42,8 @@ def start_and_wait(injection: Injection) -> None:
     injection.recovered_ns = bench.wait_fresh(injection.escs, injection.cleared_ns, 30)
     whole = bench.running_s(injection.cleared_ns, injection.recovered_ns)
     injection.recovery_s = max(0.0, whole - python_s)
-    row = bench.report.row(injection.fault)
-    row.peak(WITH_PYTHON, round(whole, 2))
-    row.peak("s of it for Python and its libraries", round(python_s, 2))
+    injection.row.peak(WITH_PYTHON, round(whole, 2))
+    injection.row.peak("s of it for Python and its libraries", round(python_s, 2))
 
 
 @fault("Process", "kill -9 at any instant, and restart", RESTART_LIMIT_S)
@@ -66,9 +66,7 @@ def killed(bench: Bench, fault: Fault, times: int) -> None:
                 else:
                     master.send(0x601, bytes([0x23, 0x10, 0x10, 1]) + b"save")
                     time.sleep(generator.random() * 0.02)
-                assert bench.gateway is not None
-                bench.gateway.kill()
-                bench.gateway = None
+                bench.kill()
                 time.sleep(generator.random() * 0.3)
                 start_and_wait(injection)
                 found = master.read(1, *TIMEOUT_OBJECT)
@@ -81,59 +79,55 @@ def killed(bench: Bench, fault: Fault, times: int) -> None:
         master.store(1)
 
 
-@fault("Process", "SIGTERM, and restart", RESTART_LIMIT_S)
-def ended(bench: Bench, fault: Fault, times: int) -> None:
+@process("SIGTERM, and restart", RESTART_LIMIT_S)
+def ended(bench: Bench, injection: Injection, _n: int) -> None:
     """Ends within 0.5 s, and its last status says so."""
-    for _ in range(times):
-        with bench.injection(fault) as injection:
-            begin = time.monotonic()
-            code = bench.stop()
-            took = time.monotonic() - begin
-            time.sleep(0.1)
-            injection.expect(code == 0, f"it ended with {code}")
-            state = bench.watch.value("GatewayStatus", "gateway_state")
-            injection.expect(state == STOPPING, f"its last state is {state}, not Stopping")
-            bench.report.row(fault).peak("s to its end", round(took, 2))
-            injection.expect(
-                took < 0.8, f"it took {took:.2f} s to end; 0.5 s, and 0.3 s for a Python's end here"
-            )
-            start_and_wait(injection)
+    begin = time.monotonic()
+    code = bench.stop()
+    took = time.monotonic() - begin
+    time.sleep(0.1)
+    injection.expect(code == 0, f"it ended with {code}")
+    state = bench.watch.value("GatewayStatus", "gateway_state")
+    injection.expect(state == STOPPING, f"its last state is {state}, not Stopping")
+    injection.row.peak("s to its end", round(took, 2))
+    injection.expect(
+        took < 0.8, f"it took {took:.2f} s to end; 0.5 s, and 0.3 s for a Python's end here"
+    )
+    start_and_wait(injection)
 
 
-@fault("Process", "a second instance", None)
-def second(bench: Bench, fault: Fault, times: int) -> None:
+SAME_PORT, SAME_NODES = "is in use by another program", "another gateway on this machine"
+
+
+@process(
+    "a second instance",
+    None,
+    escs=[],
+    rounds=lambda times: [SAME_PORT, SAME_NODES] * max(1, times // 2),
+)
+def second(bench: Bench, injection: Injection, reason: str) -> None:
     """On the same port, and with the same nodes on the same interface: refused with one line, the first goes on undisturbed."""
-    other = bench.folder / "second.toml"
-    own = bench.configuration()
-    extra = PtyPort(bench.folder / "second", bench.fed[0].identity)
-    parts = own.split("[[esc]]")
-    others = {
-        "is in use by another program": own.replace("enabled = true", "enabled = false"),
-        "another gateway on this machine": parts[0].replace('/store"', '/store2"')
-        + "[[esc]]"
-        + parts[1].replace(bench.ports[0].path, extra.path),
-    }
-    """What is said of the same port, and of the same nodes."""
+    other, extra = bench.folder / "second.toml", bench.folder / "second"
+    text = bench.configuration()
+    if reason == SAME_PORT:
+        text = text.replace("enabled = true", "enabled = false")
+    else:
+        common, first, *_ = text.replace('/store"', '/store2"').split("[[esc]]")
+        text = f"{common}[[esc]]{first.replace(bench.ports[0].path, str(extra))}"
+    other.write_text(text)
+    port = PtyPort(extra, bench.fed[0].identity)
     try:
-        for reason, text in [*others.items()] * max(1, times // 2):
-            with bench.injection(fault, []) as injection:
-                other.write_text(text)
-                command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(other)]
-                done = subprocess.run(
-                    command, capture_output=True, text=True, timeout=30, check=False
-                )
-                said = done.stderr.strip()
-                injection.expect(
-                    done.returncode == 1,
-                    f"it ended with {done.returncode}, not by {reason!r}: {said}",
-                )
-                injection.expect(
-                    len(said.splitlines()) == 1 and reason in said,
-                    f"not {reason!r} was said: {said}",
-                )
-                injection.cleared()
+        command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(other)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     finally:
-        extra.close()
+        port.close()
+    said = done.stderr.strip()
+    injection.expect(
+        done.returncode == 1, f"it ended with {done.returncode}, not by {reason!r}: {said}"
+    )
+    injection.expect(
+        len(said.splitlines()) == 1 and reason in said, f"not {reason!r} was said: {said}"
+    )
 
 
 class Supervisor:
@@ -176,37 +170,28 @@ class Supervisor:
         os.unlink(self.path)
 
 
-@fault("Process", "a frozen loop, restarted by the watchdog", RESTART_LIMIT_S)
-def frozen(bench: Bench, fault: Fault, times: int) -> None:
+@process("a frozen loop, restarted by the watchdog", RESTART_LIMIT_S, rounds=half)
+def frozen(bench: Bench, injection: Injection, _n: int) -> None:
     """By systemd's rule: no WATCHDOG=1 for its time, then SIGABRT and a new start. Recovery counts from there."""
     supervisor = Supervisor(2)
     before = bench.environment
     bench.environment = before | supervisor.environment()
     try:
-        for i in range(max(1, times // 2)):
-            with bench.injection(fault) as injection:
-                if i == 0:
-                    bench.stop()
-                    gateway = bench.start(wait=False)
-                    bench.wait_fresh(injection.escs, gateway.started_ns, 20)
-                assert bench.gateway is not None
-                injection.expect(
-                    not supervisor.is_hungry_within(3),
-                    "the watchdog of a healthy gateway was not fed",
-                )
-                injection.expect(supervisor.ready, "it never said READY=1")
-                bench.gateway.process.send_signal(signal.SIGSTOP)
-                injection.expect(
-                    supervisor.is_hungry_within(4), "the watchdog of a frozen gateway was fed on"
-                )
-                bench.gateway.process.send_signal(signal.SIGABRT)
-                bench.gateway.process.send_signal(signal.SIGCONT)
-                bench.gateway.kill()
-                bench.gateway = None
-                supervisor.fed_at = time.monotonic() + 60
-                start_and_wait(injection)
-                supervisor.listen()
-                supervisor.fed_at = time.monotonic()
+        bench.stop()
+        gateway = bench.start(wait=False)
+        bench.wait_fresh(injection.escs, gateway.started_ns, 20)
+        injection.expect(
+            not supervisor.is_hungry_within(3), "the watchdog of a healthy gateway was not fed"
+        )
+        injection.expect(supervisor.ready, "it never said READY=1")
+        gateway.process.send_signal(signal.SIGSTOP)
+        injection.expect(
+            supervisor.is_hungry_within(4), "the watchdog of a frozen gateway was fed on"
+        )
+        gateway.process.send_signal(signal.SIGABRT)
+        gateway.process.send_signal(signal.SIGCONT)
+        bench.kill()
+        start_and_wait(injection)
     finally:
         bench.environment = before
         supervisor.close()

@@ -4,15 +4,14 @@ As in qemu_serial_faults.py. The gateway is on can0, the judge on can1; of the p
 """
 
 import os
-import socket
 import subprocess
-import sys
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 from can_faults import ACTIVE, BUS_OFF_LEFT, PASSIVE, wait_can_state
 from fault_report import Fault, fault
-from harness import Injection
+from harness import Injection, injected
 from qemu_adapters import STATUS_BIT
 from qemu_machine import (
     BITRATE,
@@ -25,6 +24,7 @@ from qemu_machine import (
     pci_slot,
     receive_overruns,
 )
+from raw_bus import RawBus
 
 if TYPE_CHECKING:
     from qemu_programme import AdapterBench, MachineBench
@@ -32,9 +32,11 @@ if TYPE_CHECKING:
 RECEIVE_OVERRUN = 0x8110
 CAN_LIMIT_S = 1.0 + 0.5
 """By the issue 1 s after an interface's return; half a second more, as this machine is fifteen times slower than a usual one."""
+on_controller = partial(injected, "CAN", machine="QEMU", bench="machine")
+on_adapter = partial(injected, "CAN", machine="QEMU", bench="adapter")
 
 
-def wait_back(injection: Injection, *, bus_off: bool = False) -> None:
+def back(injection: Injection, *, bus_off: bool = False) -> None:
     """The cause is gone: wait until the node is on the bus again."""
     injection.cleared()
     injection.wait_recovery()
@@ -46,76 +48,68 @@ def wait_back(injection: Injection, *, bus_off: bool = False) -> None:
 # --- the controllers
 
 
-@fault("CAN", "controller's link down and up", CAN_LIMIT_S, machine="QEMU", bench="machine")
-def link_down(bench: "MachineBench", fault: Fault, times: int) -> None:
-    for pause in [0.05, 0.5, 1.5] * times + [8.0]:
-        with bench.injection(fault) as injection:
-            ip("link", "set", "can0", "down")
-            time.sleep(pause)
-            ip("link", "set", "can0", "up")
-            wait_back(injection)
+@on_controller(
+    "controller's link down and up",
+    CAN_LIMIT_S,
+    rounds=lambda times: [0.05, 0.5, 1.5] * times + [8.0],
+)
+def link_down(bench: "MachineBench", injection: Injection, pause: float) -> None:
+    ip("link", "set", "can0", "down")
+    time.sleep(pause)
+    ip("link", "set", "can0", "up")
+    back(injection)
 
 
-@fault(
-    "CAN",
+@on_controller(
     "controller taken from its driver and given back",
     CAN_LIMIT_S,
-    machine="QEMU",
-    bench="machine",
+    rounds=lambda times: [0.1, 1.0, 3.0] * times,
 )
-def rebound(bench: "MachineBench", fault: Fault, times: int) -> None:
+def rebound(bench: "MachineBench", injection: Injection, pause: float) -> None:
     """The interface is gone, and another one with the same name comes."""
     slot = pci_slot("can0")
-    for pause in [0.1, 1.0, 3.0] * times:
-        with bench.injection(fault) as injection:
-            pci_bind(slot, False)
-            # else can1 keeps what came last until its next interrupt
-            subprocess.run(["cansend", "can1", "7FF#"], check=True)
-            time.sleep(pause)
-            driver_back(slot)
-            wait_back(injection)
+    pci_bind(slot, False)
+    # else can1 keeps what came last until its next interrupt
+    subprocess.run(["cansend", "can1", "7FF#"], check=True)
+    time.sleep(pause)
+    driver_back(slot)
+    back(injection)
 
 
-@fault("CAN", "controller's receive FIFO overrun", None, machine="QEMU", bench="machine")
-def fifo_overrun(bench: "MachineBench", fault: Fault, times: int) -> None:
+@on_controller(
+    "controller's receive FIFO overrun", None, escs=[], rounds=lambda times: range(2 * times)
+)
+def fifo_overrun(bench: "MachineBench", injection: Injection, _n: int) -> None:
     """Its interrupts are masked while the bus sends more than 64 bytes: the driver counts it, the node says EMCY 8110h."""
+    time.sleep(1.2)  # the node says it once a second at most
     registers = controller_registers(pci_slot("can0"))
     interrupt_enable = 4
-    for _ in range(2 * times):
-        time.sleep(1.2)  # the node says it once a second at most
-        with bench.injection(fault, escs=()) as injection:
-            before = receive_overruns("can0")
-            enabled = os.pread(registers, 1, interrupt_enable)
-            frame = (0x7FF).to_bytes(4, sys.byteorder) + bytes((8, 0, 0, 0)) + bytes(8)
-            with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as sender:
-                sender.bind(("can1",))
-                os.pwrite(registers, b"\0", interrupt_enable)
-                for _ in range(10):
-                    sender.send(frame)
-                os.pwrite(registers, enabled, interrupt_enable)
-                sender.send(frame)
-            injection.wait_emergency(1, RECEIVE_OVERRUN)
-            injection.expect(receive_overruns("can0") > before, "the driver has counted no overrun")
+    before = receive_overruns("can0")
+    enabled = os.pread(registers, 1, interrupt_enable)
+    with RawBus("can1") as sender:
+        os.pwrite(registers, b"\0", interrupt_enable)
+        for _ in range(10):
+            sender.send(0x7FF, bytes(8))
+        os.pwrite(registers, enabled, interrupt_enable)
+        sender.send(0x7FF, bytes(8))
     os.close(registers)
+    injection.wait_emergency(1, RECEIVE_OVERRUN)
+    injection.expect(receive_overruns("can0") > before, "the driver has counted no overrun")
 
 
-@fault("CAN", "1500 foreign frames in a row", None, machine="QEMU", bench="machine")
-def foreign_flood(bench: "MachineBench", fault: Fault, times: int) -> None:
+@on_controller("1500 foreign frames in a row", None, escs=[])
+def foreign_flood(bench: "MachineBench", injection: Injection, _n: int) -> None:
     words = "cangen can1 -g 1 -n 1500 -I 5A5 -L 8 -D i -p 10"
-    for _ in range(times):
-        with bench.injection(fault, escs=()):
-            subprocess.run(words.split(), check=True)
+    subprocess.run(words.split(), check=True)
 
 
 # --- a CAN adapter whose bus has errors
 
 
-@fault("CAN", "bus-off, restart-ms 100", CAN_LIMIT_S, machine="QEMU", bench="adapter")
-def bus_off(bench: "AdapterBench", fault: Fault, times: int) -> None:
-    for _ in range(3 * times):
-        with bench.injection(fault) as injection:
-            bench.adapter.go_bus_off()
-            wait_back(injection, bus_off=True)
+@on_adapter("bus-off, restart-ms 100", CAN_LIMIT_S, rounds=lambda times: range(3 * times))
+def bus_off(bench: "AdapterBench", injection: Injection, _n: int) -> None:
+    bench.adapter.go_bus_off()
+    back(injection, bus_off=True)
 
 
 @fault(
@@ -140,58 +134,49 @@ def bus_off_for_good(bench: "AdapterBench", fault: Fault, times: int) -> None:
                 ip("link", "set", "can2", "type", "can", "restart")
             else:
                 can_up("can2")
-            wait_back(injection, bus_off=restarted)
+            back(injection, bus_off=restarted)
 
 
-@fault("CAN", "error passive and active again", None, machine="QEMU", bench="adapter")
-def error_passive(bench: "AdapterBench", fault: Fault, times: int) -> None:
+@on_adapter("error passive and active again", None, escs=[], rounds=lambda times: range(2 * times))
+def error_passive(bench: "AdapterBench", injection: Injection, _n: int) -> None:
     adapter = bench.adapter
-    for _ in range(2 * times):
-        with bench.injection(fault, escs=()):
-            # a good frame takes one off
-            adapter.disturb(STATUS_BIT, transmit=250 - adapter.tx_errors)
-            bench.wait_until(
-                lambda: controller_state("can2") == "ERROR-PASSIVE",
-                2,
-                "the driver says error passive",
-            )
-            wait_can_state(bench, PASSIVE)
-            adapter.heal()
-            wait_can_state(bench, ACTIVE)
+    # a good frame takes one off
+    adapter.disturb(STATUS_BIT, transmit=250 - adapter.tx_errors)
+    bench.wait_until(
+        lambda: controller_state("can2") == "ERROR-PASSIVE", 2, "the driver says error passive"
+    )
+    wait_can_state(bench, PASSIVE)
+    adapter.heal()
+    wait_can_state(bench, ACTIVE)
 
 
-@fault("CAN", "no other node acknowledges", CAN_LIMIT_S, machine="QEMU", bench="adapter")
-def no_acknowledge(bench: "AdapterBench", fault: Fault, times: int) -> None:
-    for pause in [1.0, 4.0] * times:
-        with bench.injection(fault) as injection:
-            ip("link", "set", "can3", "down")
-            time.sleep(pause)
-            ip("link", "set", "can3", "up")
-            injection.cleared()
-            injection.wait_recovery()
+@on_adapter("no other node acknowledges", CAN_LIMIT_S, rounds=lambda times: [1.0, 4.0] * times)
+def no_acknowledge(bench: "AdapterBench", injection: Injection, pause: float) -> None:
+    ip("link", "set", "can3", "down")
+    time.sleep(pause)
+    ip("link", "set", "can3", "up")
+    injection.cleared()
 
 
-@fault("CAN", "gateway's bit rate wrong", CAN_LIMIT_S, machine="QEMU", bench="adapter")
-def wrong_bitrate(bench: "AdapterBench", fault: Fault, times: int) -> None:
-    for _ in range(times):
-        with bench.injection(fault) as injection:
-            can_up("can2", BITRATE // 2)
-            time.sleep(2)
-            can_up("can2")
-            wait_back(injection)
+@on_adapter("gateway's bit rate wrong", CAN_LIMIT_S)
+def wrong_bitrate(bench: "AdapterBench", injection: Injection, _n: int) -> None:
+    can_up("can2", BITRATE // 2)
+    time.sleep(2)
+    can_up("can2")
+    back(injection)
 
 
-@fault(
-    "CAN", "adapter hangs with a full queue, is reset", CAN_LIMIT_S, machine="QEMU", bench="adapter"
+@on_adapter(
+    "adapter hangs with a full queue, is reset",
+    CAN_LIMIT_S,
+    rounds=lambda times: [2.0, 5.0] * times,
 )
-def stalled(bench: "AdapterBench", fault: Fault, times: int) -> None:
+def stalled(bench: "AdapterBench", injection: Injection, pause: float) -> None:
     """Set down while it hangs: else the frames that the kernel holds for it, five or so, come out late, which nobody can prevent."""
-    for pause in [2.0, 5.0] * times:
-        with bench.injection(fault) as injection:
-            bench.adapter.stall(True)
-            time.sleep(pause)
-            # the driver says that it gets no answer
-            subprocess.run(["ip", "link", "set", "can2", "down"], check=False)
-            bench.adapter.stall(False)
-            can_up("can2")
-            wait_back(injection)
+    bench.adapter.stall(True)
+    time.sleep(pause)
+    # the driver says that it gets no answer
+    subprocess.run(["ip", "link", "set", "can2", "down"], check=False)
+    bench.adapter.stall(False)
+    can_up("can2")
+    back(injection)

@@ -19,15 +19,13 @@ from typing import Any, NamedTuple
 
 VIRTIO_PORTS = Path("/dev/virtio-ports")
 KVASER = Path("/sys/bus/pci/drivers/kvaser_pci")
-USB_SERIAL = {
+USB_SERIAL: dict[str, Any] = {
     "driver": "usb-serial",
     "id": "usbser0",
     "serial": "ESC0002",
     "bus": "xhci.0",
-    "port": "1",
-    "chardev": "ftdis",
-    "always-plugged": True,
 }
+USB_SERIAL |= {"port": "1", "chardev": "ftdis", "always-plugged": True}
 BITRATE = 1_000_000
 _TIOCGICOUNT = 0x545D
 
@@ -181,18 +179,8 @@ def ip(*words: str) -> None:
 def can_up(name: str, bitrate: int = BITRATE, restart_ms: int = 100) -> None:
     ip("link", "set", name, "down")
     ip("link", "set", name, "txqueuelen", "100")
-    ip(
-        "link",
-        "set",
-        name,
-        "up",
-        "type",
-        "can",
-        "bitrate",
-        str(bitrate),
-        "restart-ms",
-        str(restart_ms),
-    )
+    settings = f"type can bitrate {bitrate} restart-ms {restart_ms}"
+    ip("link", "set", name, "up", *settings.split())
 
 
 def _can_details(name: str) -> Any:

@@ -21,7 +21,7 @@ import qemu_can_faults  # noqa: F401  registers its faults
 import qemu_serial_faults  # noqa: F401
 from bus_watch import MS
 from encoding import Identity
-from fault_report import Report, in_order
+from fault_report import Report, Row, in_order
 from feeder import CURRENT, SPEED
 from harness import Bench, Gateway, Port
 from qemu_adapters import CanAdapter, CanBus, SerialAdapter
@@ -62,7 +62,7 @@ class EmulatedBench(Bench):
             start_limit_s=120,
         )
 
-    def account(self, until_ns: int | None = None) -> tuple[int, int]:
+    def account(self, row: Row, until_ns: int | None = None) -> int:
         if until_ns is None:
             until_ns = time.monotonic_ns() - 150 * MS
         for index, fed in enumerate(self.fed):
@@ -77,7 +77,7 @@ class EmulatedBench(Bench):
                     and newer - fed.sent[n] <= SLACK_NS
                 ):
                     fed.seen[n] = SPEED | CURRENT
-        return super().account(until_ns)
+        return super().account(row, until_ns)
 
 
 class MachineBench(EmulatedBench):

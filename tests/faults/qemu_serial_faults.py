@@ -1,6 +1,6 @@
 """The faults of the emulated machine's start and serial ports: real drivers for the UART and the USB adapters.
 
-Each function injects its fault a few times, ``times`` as often in a long run. Imported for the names of the faults anywhere; run by
+Imported for the names of the faults anywhere; run by
 qemu_programme.py in the machine only. ESC 1 is on the 16550A, ESC 2 on QEMU's USB adapter, ESC 3 on the played one.
 """
 
@@ -10,9 +10,11 @@ import os
 import signal
 import termios
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 from fault_report import Fault, fault
+from harness import Injection, injected
 from qemu_adapters import ESC_LINE, Line
 from qemu_machine import driver_back, hold, line_counts, line_setting, pci_bind, pci_slot
 from qemu_ports import AS_SET
@@ -23,6 +25,11 @@ if TYPE_CHECKING:
 UART, USB, WIRE = 0, 1, 2
 PORT_LIMIT_S = 2.0
 """By the issue: after a port's return."""
+serial = partial(injected, "Serial", machine="QEMU", bench="machine")
+
+
+def twice(times: int) -> range:
+    return range(2 * times)
 
 
 @fault(
@@ -52,103 +59,81 @@ def hampered_start(bench: "MachineBench", fault: Fault, times: int) -> None:
 # --- serial ports
 
 
-@fault("Serial", "USB adapter pulled and put back", PORT_LIMIT_S, machine="QEMU", bench="machine")
-def replug(bench: "MachineBench", fault: Fault, times: int) -> None:
-    for pause in [0.0, 0.3, 1.0] * times + [6.0]:
-        with bench.injection(fault, escs=(USB,)) as injection:
-            bench.usb.unplug()
-            time.sleep(pause)
-            bench.usb.plug()
-            injection.cleared()
-            injection.wait_recovery()
-
-
-@fault(
-    "Serial",
-    "USB adapter back under another ttyUSB number",
+@serial(
+    "USB adapter pulled and put back",
     PORT_LIMIT_S,
-    machine="QEMU",
-    bench="machine",
+    escs=[USB],
+    rounds=lambda times: [0.0, 0.3, 1.0] * times + [6.0],
 )
-def renumbered(bench: "MachineBench", fault: Fault, times: int) -> None:
+def replug(bench: "MachineBench", injection: Injection, pause: float) -> None:
+    bench.usb.unplug()
+    time.sleep(pause)
+    bench.usb.plug()
+    injection.cleared()
+
+
+@serial("USB adapter back under another ttyUSB number", PORT_LIMIT_S, escs=[USB], rounds=twice)
+def renumbered(bench: "MachineBench", injection: Injection, _n: int) -> None:
     """And back under its first one: while another program has not let go of the old one, its number stays taken."""
-    for _ in range(2 * times):
-        with bench.injection(fault, escs=(USB,)) as injection:
-            before = bench.usb.device
-            held = hold(before)
-            try:
-                bench.usb.unplug()
-                bench.usb.plug()
-                injection.cleared()
-                injection.expect(bench.usb.device != before, f"the adapter is {before} again")
-                injection.wait_recovery()
-            finally:
-                os.close(held)
+    before = bench.usb.device
+    held = hold(before)
+    try:
+        bench.usb.unplug()
+        bench.usb.plug()
+        injection.cleared()
+        injection.expect(bench.usb.device != before, f"the adapter is {before} again")
+        injection.wait_recovery()
+    finally:
+        os.close(held)
 
 
-@fault(
-    "Serial",
-    "USB adapter in use by another program at its return",
-    PORT_LIMIT_S,
-    machine="QEMU",
-    bench="machine",
+@serial(
+    "USB adapter in use by another program at its return", PORT_LIMIT_S, escs=[WIRE], rounds=twice
 )
-def busy_at_return(bench: "MachineBench", fault: Fault, times: int) -> None:
+def busy_at_return(bench: "MachineBench", injection: Injection, _n: int) -> None:
     wire = bench.wire
-    for _ in range(2 * times):
-        with bench.injection(fault, escs=(WIRE,)) as injection:
-            wire.unplug()
-            # until echo is off: what that program would echo is not the gateway's doing
-            wire.send = wire.silent
-            wire.plug()
-            held = hold(wire.device)
-            try:
-                fcntl.ioctl(held, termios.TIOCEXCL)
-                wire.send = wire.clean
-                time.sleep(1.5)
-            finally:
-                os.close(held)
-            injection.cleared()
-            injection.wait_recovery()
+    wire.unplug()
+    # until echo is off: what that program would echo is not the gateway's doing
+    wire.send = wire.silent
+    wire.plug()
+    held = hold(wire.device)
+    try:
+        fcntl.ioctl(held, termios.TIOCEXCL)
+        wire.send = wire.clean
+        time.sleep(1.5)
+    finally:
+        os.close(held)
+    injection.cleared()
+    injection.wait_recovery()
     bench.wait_log(f"{wire.path}: is in use")
 
 
-@fault("Serial", "8N1 stream on the 8E1 line", PORT_LIMIT_S, machine="QEMU", bench="machine")
-def wrong_parity(bench: "MachineBench", fault: Fault, times: int) -> None:
-    misread(bench, fault, times, Line(parity="N"), ("framing", "parity"))
-
-
-@fault("Serial", "9600 baud stream", PORT_LIMIT_S, machine="QEMU", bench="machine")
-def slow_stream(bench: "MachineBench", fault: Fault, times: int) -> None:
-    misread(bench, fault, times, Line(9600, "N"), ("framing", "breaks"))
-
-
 def misread(
-    bench: "MachineBench", fault: Fault, times: int, line: Line, counters: tuple[str, ...]
+    bench: "MachineBench", injection: Injection, _n: int, line: Line, counters: tuple[str, ...]
 ) -> None:
     """An ESC that sends by other settings for a while; the driver has to count it."""
     wire = bench.wire
-    for _ in range(2 * times):
-        before = line_counts(wire.device)
-        with bench.injection(fault, escs=(WIRE,)) as injection:
-            wire.send = wire.at(line)
-            time.sleep(1.5)
-            wire.send = wire.clean
-            injection.cleared()
-            injection.wait_recovery()
-            after = line_counts(wire.device)
-            counted = any(getattr(after, name) > getattr(before, name) for name in counters)
-            injection.expect(counted, f"no {counters} counted: {after}")
+    before = line_counts(wire.device)
+    wire.send = wire.at(line)
+    time.sleep(1.5)
+    wire.send = wire.clean
+    injection.cleared()
+    injection.wait_recovery()
+    after = line_counts(wire.device)
+    counted = any(getattr(after, name) > getattr(before, name) for name in counters)
+    injection.expect(counted, f"no {counters} counted: {after}")
 
 
-@fault(
-    "Serial",
-    "bit errors on the line, each tenth frame",
-    PORT_LIMIT_S,
-    machine="QEMU",
-    bench="machine",
-)
-def bit_errors(bench: "MachineBench", fault: Fault, times: int) -> None:
+for name, line, counters in (
+    ("8N1 stream on the 8E1 line", Line(parity="N"), ("framing", "parity")),
+    ("9600 baud stream", Line(9600, "N"), ("framing", "breaks")),
+):
+    played = partial(misread, line=line, counters=counters)
+    serial(name, PORT_LIMIT_S, escs=[WIRE], rounds=twice)(played)
+
+
+@serial("bit errors on the line, each tenth frame", PORT_LIMIT_S, escs=[])
+def bit_errors(bench: "MachineBench", injection: Injection, _n: int) -> None:
     """Only the frames that were hit may be missing."""
     wire = bench.wire
     sent = itertools.count(1)
@@ -156,17 +141,15 @@ def bit_errors(bench: "MachineBench", fault: Fault, times: int) -> None:
     def sometimes(data: bytes) -> bool:
         return wire.clean(data) if next(sent) % 10 else wire.flipped(data)
 
-    for _ in range(times):
-        before = line_counts(wire.device)
-        with bench.injection(fault, escs=()) as injection:
-            wire.send = sometimes
-            time.sleep(6)
-            wire.send = wire.clean
-            time.sleep(0.3)
-            after = line_counts(wire.device)
-            errors = after.parity + after.framing - before.parity - before.framing
-            injection.expect(errors >= 3, f"no errors counted: {before} {after}")
-            bench.report.row(fault).count("line errors counted", errors)
+    before = line_counts(wire.device)
+    wire.send = sometimes
+    time.sleep(6)
+    wire.send = wire.clean
+    time.sleep(0.3)
+    after = line_counts(wire.device)
+    errors = after.parity + after.framing - before.parity - before.framing
+    injection.expect(errors >= 3, f"no errors counted: {before} {after}")
+    injection.row.count("line errors counted", errors)
 
 
 @fault("Serial", "break, 0.3 s", PORT_LIMIT_S, machine="QEMU", bench="machine")
@@ -194,69 +177,49 @@ def line_break(bench: "MachineBench", fault: Fault, times: int) -> None:
             )
 
 
-@fault("Serial", "all ports are set to 8E1, without echo", None, machine="QEMU", bench="machine")
-def port_setting(bench: "MachineBench", fault: Fault, times: int) -> None:
+@serial("all ports are set to 8E1, without echo", None, escs=[], rounds=lambda _: [0])
+def port_setting(bench: "MachineBench", injection: Injection, _n: int) -> None:
     adapter = bench.wire.adapter
-    with bench.injection(fault, escs=()) as injection:
-        for device in (bench.uart.device, bench.usb.device, bench.wire.device):
-            setting = line_setting(device)
-            injection.expect(setting == AS_SET, f"{device}: {setting}")
-        injection.expect(adapter.line == ESC_LINE, f"the chip: {adapter.line}")
-        injection.expect(
-            adapter.latency_ms == 1, f"the chip's latency timer: {adapter.latency_ms} ms"
-        )
+    for device in (bench.uart.device, bench.usb.device, bench.wire.device):
+        setting = line_setting(device)
+        injection.expect(setting == AS_SET, f"{device}: {setting}")
+    injection.expect(adapter.line == ESC_LINE, f"the chip: {adapter.line}")
+    injection.expect(adapter.latency_ms == 1, f"the chip's latency timer: {adapter.latency_ms} ms")
 
 
-@fault(
-    "Serial",
-    "16550A flooded with garbage at the full line rate",
-    PORT_LIMIT_S,
-    machine="QEMU",
-    bench="machine",
-)
-def flood(bench: "MachineBench", fault: Fault, times: int) -> None:
+@serial("16550A flooded with garbage at the full line rate", PORT_LIMIT_S, escs=[UART])
+def flood(bench: "MachineBench", injection: Injection, _n: int) -> None:
     """Three seconds without a gap; the other ESCs must not notice."""
     chunk = bytes((i * 37 + i // 251) & 0xFF for i in range(115_200 // 11 // 20))
-    for _ in range(times):
-        with bench.injection(fault, escs=(UART,)) as injection:
-            bench.uart.fed.on = False
-            for _ in range(60):
-                bench.uart.far.put(chunk)
-                time.sleep(0.05)
-            bench.uart.fed.on = True
-            injection.cleared()
-            injection.wait_recovery()
+    bench.uart.fed.on = False
+    for _ in range(60):
+        bench.uart.far.put(chunk)
+        time.sleep(0.05)
+    bench.uart.fed.on = True
+    injection.cleared()
 
 
-@fault(
-    "Serial",
-    "receive overrun while the process is stopped",
-    PORT_LIMIT_S,
-    machine="QEMU",
-    bench="machine",
-)
-def overrun(bench: "MachineBench", fault: Fault, times: int) -> None:
+@serial("receive overrun while the process is stopped", PORT_LIMIT_S)
+def overrun(bench: "MachineBench", injection: Injection, _n: int) -> None:
     """More than the kernel and the chip hold; what is read first afterwards is old and must not be sent."""
     assert bench.gateway is not None
     wire = bench.wire
     filler = bytes(range(256)) * 8
-    for _ in range(times):
-        before = line_counts(wire.device).overrun
-        with bench.injection(fault) as injection:
-            bench.gateway.process.send_signal(signal.SIGSTOP)
-            try:
-                for _ in range(60):
-                    wire.adapter.put(filler)
-                    if wire.adapter.waiting(1) > 300:
-                        break
-                    time.sleep(0.02)
-                wire.adapter.put(filler)
-                time.sleep(0.5)
-            finally:
-                bench.gateway.process.send_signal(signal.SIGCONT)
-            injection.cleared()
-            injection.wait_recovery()
-            injection.expect(line_counts(wire.device).overrun > before, "no overrun counted")
+    before = line_counts(wire.device).overrun
+    bench.gateway.process.send_signal(signal.SIGSTOP)
+    try:
+        for _ in range(60):
+            wire.adapter.put(filler)
+            if wire.adapter.waiting(1) > 300:
+                break
+            time.sleep(0.02)
+        wire.adapter.put(filler)
+        time.sleep(0.5)
+    finally:
+        bench.gateway.process.send_signal(signal.SIGCONT)
+    injection.cleared()
+    injection.wait_recovery()
+    injection.expect(line_counts(wire.device).overrun > before, "no overrun counted")
 
 
 @fault("Serial", "another program sets the port to 9600 8N1", 5.0, machine="QEMU", bench="machine")

@@ -1,59 +1,68 @@
 """A plain CAN socket of the bench's own, and the few CANopen services it needs: what a master, a foreign node or a vandal sends."""
 
 import contextlib
+import select
 import socket
 import struct
 import time
 from typing import Self
 
-_FRAME = struct.Struct("=IB3x8s")
-ERROR_FLAG = 0x20000000
+FRAME = struct.Struct("=IB3x8s")
+ERROR_FLAG, EXTENDED, REMOTE = 0x20000000, 0x80000000, 0x40000000
+INVERTED = 0x20000000
+"""In a filter: all but this id."""
+SO_RCVBUFFORCE = 33
 
 
 class RawBus:
-    """A socket on one interface, as context manager."""
+    """A socket on one interface, with room for bursts, as context manager; it hears what a filter (id, mask) lets pass."""
 
-    def __init__(self, interface: str) -> None:
+    def __init__(self, interface: str, *filters: tuple[int, int]) -> None:
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 4_000_000)
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        self._filter(*filters)
         self._socket.bind((interface,))
         self._socket.settimeout(0.05)
-        self._filter(None)
 
-    def _filter(self, can_id: int | None) -> None:
-        packed = b"" if can_id is None else struct.pack("=II", can_id, 0xDFFFFFFF)
+    def _filter(self, *filters: tuple[int, int]) -> None:
+        packed = b"".join(struct.pack("=II", *each) for each in filters)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed)
 
     def send(self, can_id: int, data: bytes = b"", wait: bool = True) -> bool:
         """Send a frame; False if the queue is full and we are not to wait."""
+        return self._send(FRAME.pack(can_id, len(data), data), wait)
+
+    def send_fd(self, can_id: int, data: bytes) -> None:
+        self._send(struct.pack("=IBB2x64s", can_id, len(data), 1, data))
+
+    def _send(self, frame: bytes, wait: bool = True) -> bool:
         while True:
             try:
-                self._socket.send(_FRAME.pack(can_id, len(data), data.ljust(8, b"\0")))
+                self._socket.send(frame)
                 return True
             except (BlockingIOError, TimeoutError, OSError) as error:
                 if not wait or getattr(error, "errno", None) not in (11, 105, None):
                     return False
                 time.sleep(0.001)
 
-    def _answer(self, seconds: float) -> bytes | None:
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            with contextlib.suppress(TimeoutError):
-                _, size, content = _FRAME.unpack(self._socket.recv(16))
-                return bytes(content[:size])
-        return None
+    def receive(self, seconds: float) -> tuple[int, bytes] | None:
+        """The next frame's id and data, at most eight bytes of it; None when none comes."""
+        if not select.select([self._socket], [], [], seconds)[0]:
+            return None
+        can_id, size, data = FRAME.unpack(self._socket.recv(72)[: FRAME.size])
+        return can_id, data[:size]
 
     def _ask(self, node: int, request: bytes, seconds: float) -> bytes | None:
         """The answer to an SDO request, None if none came."""
-        self._filter(0x580 + node)
-        with contextlib.suppress(TimeoutError):
-            while self._socket.recv(16):  # what came late for an earlier one
-                pass
-        self._socket.settimeout(0.005)
+        self._filter((0x580 + node, 0xDFFFFFFF))
+        while self.receive(0.05):  # what came late for an earlier one
+            pass
         self.send(0x600 + node, request)
-        self._socket.settimeout(0.05)
-        answer = self._answer(seconds)
-        self._filter(None)
-        return answer
+        answer = self.receive(seconds)
+        self._filter()
+        return answer and answer[1]
 
     def write(
         self, node: int, index: int, sub: int, value: int, size: int, seconds: float = 2

@@ -12,13 +12,15 @@ from functools import partial
 from bus_watch import SECOND
 from encoding import Identity
 from fault_report import Fault, fault
-from harness import Bench, PtyPort, growth
+from harness import Bench, Injection, PtyPort, growth, half, injected
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.states import Device
 
 LIMIT_S = 2.0
 LOST, PORT_ERROR = 4, 5
+on_first = partial(injected, "Serial", escs=[0])
+"""A fault of the first ESC."""
 
 
 def port_of(bench: Bench) -> PtyPort:
@@ -37,16 +39,6 @@ def lost(bench: Bench) -> None:
 
 
 @contextlib.contextmanager
-def mangled(bench: Bench, how: Callable[[bytes], tuple[bytes, bool]]) -> Iterator[None]:
-    fed = bench.fed[0]
-    fed.mangle = how
-    try:
-        yield
-    finally:
-        fed.mangle = None
-
-
-@contextlib.contextmanager
 def replugged(port: PtyPort) -> Iterator[None]:
     """Unplug and plug in again; the gateway sees the port when the block ends."""
     port.unplug()
@@ -58,68 +50,59 @@ def replugged(port: PtyPort) -> Iterator[None]:
     port.link = link
 
 
-@fault("Serial", "port busy at its return", LIMIT_S)
-def busy(bench: Bench, fault: Fault, times: int) -> None:
+@on_first("port busy at its return", LIMIT_S)
+def busy(bench: Bench, injection: Injection, _n: int) -> None:
     port = port_of(bench)
-    for _ in range(times):
-        with bench.injection(fault, [0]) as injection:
-            with replugged(port):
-                fd = os.open(port.device, os.O_RDWR | os.O_NOCTTY)
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            time.sleep(1.2)
-            os.close(fd)
-            injection.cleared()
-            injection.wait_recovery()
-            bench.wait_log("in use")
+    with replugged(port):
+        fd = os.open(port.device, os.O_RDWR | os.O_NOCTTY)
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    time.sleep(1.2)
+    os.close(fd)
+    injection.cleared()
+    bench.wait_log("in use")
 
 
-@fault("Serial", "permission missing at its return", LIMIT_S)
-def permission(bench: Bench, fault: Fault, times: int) -> None:
+@on_first("permission missing at its return", LIMIT_S)
+def permission(bench: Bench, injection: Injection, _n: int) -> None:
     port = port_of(bench)
-    for _ in range(times):
-        with bench.injection(fault, [0]) as injection:
-            with replugged(port):
-                os.chmod(port.device, 0)
-            time.sleep(1.2)
-            bench.wait_log("permission denied")
-            injection.cleared()
-            os.chmod(port.device, 0o620)
-            injection.wait_recovery()
+    with replugged(port):
+        os.chmod(port.device, 0)
+    time.sleep(1.2)
+    bench.wait_log("permission denied")
+    injection.cleared()
+    os.chmod(port.device, 0o620)
 
 
-@fault("Serial", "port gone and back", LIMIT_S)
-def gone(bench: Bench, fault: Fault, times: int) -> None:
+@on_first(
+    "port gone and back",
+    LIMIT_S,
+    rounds=lambda times: [0.05, 0.3, 0.7] * times + [24 if times > 10 else 4],
+)
+def gone(bench: Bench, injection: Injection, pause: float) -> None:
     port = port_of(bench)
-    for pause in [0.05, 0.3, 0.7] * times + [24 if times > 10 else 4]:
-        with bench.injection(fault, [0]) as injection:
-            port.unplug()
-            if pause > 1:
-                lost(bench)
-            time.sleep(pause)
-            injection.cleared()
-            port.plug()
-            injection.wait_recovery()
+    port.unplug()
+    if pause > 1:
+        lost(bench)
+    time.sleep(pause)
+    injection.cleared()
+    port.plug()
 
 
-@fault("Serial", "port back under another name", LIMIT_S)
-def other_name(bench: Bench, fault: Fault, times: int) -> None:
+@on_first("port back under another name", LIMIT_S)
+def other_name(bench: Bench, injection: Injection, _n: int) -> None:
     port = port_of(bench)
-    for _ in range(times):
-        before = port.device
-        with bench.injection(fault, [0]) as injection:
-            # keeps the old number taken, as a program does that reads on
-            held = os.open(before, os.O_RDWR | os.O_NOCTTY)
-            try:
-                port.unplug()
-                time.sleep(0.3)
-                injection.cleared()
-                port.plug(other=True)
-                injection.expect(
-                    port.device != before, "the bench gave the port its old name again"
-                )
-                injection.wait_recovery()
-            finally:
-                os.close(held)
+    before = port.device
+    # keeps the old number taken, as a program does that reads on
+    held = os.open(before, os.O_RDWR | os.O_NOCTTY)
+    try:
+        port.unplug()
+        time.sleep(0.3)
+        injection.cleared()
+        port.plug(other=True)
+        injection.expect(port.device != before, "the bench gave the port its old name again")
+        injection.wait_recovery()
+    finally:
+        os.close(held)
 
 
 # --- what the line makes of the bytes: each takes a frame, and returns what comes and whether the frame is whole in it
@@ -165,134 +148,121 @@ def parity(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
 
 def slow_stream(generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
     """Read twelve times too fast, each bit is a run of equal bits."""
-    return bytes(
-        generator.choice((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0)) for _ in range(12)
-    ), False
+    return bytes(generator.choices((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0), k=12)), False
 
 
-def undisturbed(bench: Bench, fault: Fault, times: int, how: Mangle) -> None:
-    for _ in range(times):
-        with bench.injection(fault, []) as injection, mangled(bench, how):
-            time.sleep(1.5)
-            injection.cleared()
+def mangled(bench: Bench, injection: Injection, n: int, how: Mangle, readable: bool) -> None:
+    """Nothing may be disturbed, or nothing is right any more: that a wrong setting is likely is said after a while."""
+    bench.fed[0].mangle = how
+    try:
+        time.sleep(1.5 if readable else 0.8)
+        if readable:
+            return
+        lost(bench)
+        if n == 0 and "parity" in injection.fault.name:
+            bench.wait_log("parity")
+    finally:
+        bench.fed[0].mangle = None
+    injection.cleared()
 
 
-def unreadable(bench: Bench, fault: Fault, times: int, how: Mangle) -> None:
-    """Nothing is right any more; that a wrong setting is likely is said after a while."""
-    for i in range(times):
-        with bench.injection(fault, [0]) as injection:
-            with mangled(bench, how):
-                time.sleep(0.8)
-                lost(bench)
-                if i == 0 and "parity" in fault.name:
-                    bench.wait_log("parity")
-            injection.cleared()
-            injection.wait_recovery()
-
-
-for name, run, how, limit_s in (
-    ("garbage between frames", undisturbed, garbage, None),
-    ("bit errors and lost bytes", undisturbed, bit_errors, None),
-    ("break: only zero bytes", unreadable, line_break, LIMIT_S),
-    ("every byte hit, as by a wrong parity", unreadable, parity, LIMIT_S),
-    ("a 9600 baud stream", unreadable, slow_stream, LIMIT_S),
+for name, how, readable in (
+    ("garbage between frames", garbage, True),
+    ("bit errors and lost bytes", bit_errors, True),
+    ("break: only zero bytes", line_break, False),
+    ("every byte hit, as by a wrong parity", parity, False),
+    ("a 9600 baud stream", slow_stream, False),
 ):
-    fault("Serial", name, limit_s)(partial(run, how=partial(how, random.Random(name))))
+    escs, limit_s = ([], None) if readable else ([0], LIMIT_S)
+    line = partial(how, random.Random(name))
+    injected("Serial", name, limit_s, escs=escs)(partial(mangled, how=line, readable=readable))
 
 
-@fault("Serial", "ESC off and on", LIMIT_S)
-def off(bench: Bench, fault: Fault, times: int) -> None:
-    for i in range(times):
-        with bench.injection(fault, [0]) as injection:
-            bench.fed[0].on = False
-            time.sleep((0.5, 1.5, 3)[i % 3])
-            lost(bench)
-            injection.cleared()
-            bench.fed[0].on = True
-            injection.wait_recovery()
+@on_first("ESC off and on", LIMIT_S)
+def off(bench: Bench, injection: Injection, n: int) -> None:
+    bench.fed[0].on = False
+    time.sleep((0.5, 1.5, 3)[n % 3])
+    lost(bench)
+    injection.cleared()
+    bench.fed[0].on = True
 
 
-@fault("Serial", "ESC swapped for another model and layout", LIMIT_S)
-def swapped(bench: Bench, fault: Fault, times: int) -> None:
+MODELS = [
+    Identity(11, Layout.LEGACY, Device.JIVEPRO, 12),
+    Identity(12, Layout.V4, Device.KOLIBRI, 3),
+    Identity(13, Layout.V4, Device.KOSMIK, 14),
+    Identity(1),
+]
+
+
+@on_first(
+    "ESC swapped for another model and layout",
+    LIMIT_S,
+    settle_s=1,
+    rounds=lambda times: [*(MODELS * times)[:times], Identity(1)],
+)
+def swapped(bench: Bench, injection: Injection, model: Identity) -> None:
     fed = bench.fed[0]
-    models = [
-        Identity(11, Layout.LEGACY, Device.JIVEPRO, 12),
-        Identity(12, Layout.V4, Device.KOLIBRI, 3),
-        Identity(13, Layout.V4, Device.KOSMIK, 14),
-        Identity(1),
-    ]
-    for i in range(times + 1):
-        with bench.injection(fault, [0], settle_s=1) as injection:
-            fed.on = False
-            time.sleep(0.6)
-            fed.become(models[i % 4] if i < times else Identity(1))
-            injection.cleared()
-            fed.on = True
-            injection.wait_recovery()
-            bench.wait_until(
-                lambda: bench.watch.info_device(0) == fed.identity.device.value,
-                5,
-                "the new ESC's device on the bus",
-            )
+    fed.on = False
+    time.sleep(0.6)
+    fed.become(model)
+    injection.cleared()
+    fed.on = True
+    injection.wait_recovery()
+    bench.wait_until(
+        lambda: bench.watch.info_device(0) == model.device.value,
+        5,
+        "the new ESC's device on the bus",
+    )
 
 
-@fault("Serial", "a stream that stutters, bytes seconds apart", LIMIT_S)
-def stutter(bench: Bench, fault: Fault, times: int) -> None:
+@on_first("a stream that stutters, bytes seconds apart", LIMIT_S, rounds=half)
+def stutter(bench: Bench, injection: Injection, _n: int) -> None:
     """A frame of which the end comes seconds after its beginning is old."""
-    port, fed = port_of(bench), bench.fed[0]
-    for _ in range(max(1, times // 2)):
-        with bench.injection(fault, [0]) as injection:
-            fed.on = False
-            time.sleep(0.05)
-            wire = encode(fed.live(len(fed.sent) - 1), fed.identity.layout)
-            for at in range(0, len(wire), 14):
-                port.write(wire[at : at + 14])
-                time.sleep(1.2)
-            lost(bench)
-            injection.cleared()
-            fed.on = True
-            injection.wait_recovery()
+    fed = bench.fed[0]
+    fed.on = False
+    time.sleep(0.05)
+    wire = encode(fed.live(len(fed.sent) - 1), fed.identity.layout)
+    for at in range(0, len(wire), 14):
+        fed.write(wire[at : at + 14])
+        time.sleep(1.2)
+    lost(bench)
+    injection.cleared()
+    fed.on = True
 
 
-@fault("Serial", "a line that is never silent", LIMIT_S)
-def never_silent(bench: Bench, fault: Fault, times: int) -> None:
+@on_first("a line that is never silent", LIMIT_S, settle_s=1)
+def never_silent(bench: Bench, injection: Injection, _n: int) -> None:
     """Frame behind frame, as many as 115200 baud carry: of one ESC newer values take the place of older ones, of the other none is lost."""
     fed = bench.fed[0]
-    for _ in range(times):
-        with bench.injection(fault, [0], settle_s=1) as injection:
-            before, fed.rate_hz = fed.rate_hz, 260
-            time.sleep(1.5)
-            fed.rate_hz = before
-            injection.cleared()
-            injection.wait_recovery()
+    before, fed.rate_hz = fed.rate_hz, 260
+    time.sleep(1.5)
+    fed.rate_hz = before
+    injection.cleared()
 
 
-@fault("Serial", "a port that floods", LIMIT_S)
-def flood(bench: Bench, fault: Fault, times: int) -> None:
+@injected("Serial", "a port that floods", LIMIT_S, settle_s=1)
+def flood(bench: Bench, injection: Injection, _n: int) -> None:
     """Rubbish and frames as fast as a pseudo terminal takes them, many times a UART's pace: the other ESC goes on, perhaps thinned out."""
-    port = port_of(bench)
     rubbish = random.Random(5).randbytes(4096).replace(b"K", b"k")
-    for _ in range(times):
-        with bench.injection(fault, settle_s=1) as injection:
-            bench.watch.reset_silence()
-            stop = threading.Event()
+    bench.watch.reset_silence()
+    stop = threading.Event()
 
-            def pour(stop: threading.Event = stop) -> None:
-                while not stop.is_set():
-                    if not port.write(rubbish):
-                        time.sleep(0.001)
+    def pour() -> None:
+        while not stop.is_set():
+            if not bench.fed[0].write(rubbish):
+                time.sleep(0.001)
 
-            thread = threading.Thread(target=pour, daemon=True)
-            thread.start()
-            time.sleep(1.5)
-            stop.set()
-            thread.join()
-            bench.watch.catch_up()
-            silence = bench.watch.silence_ns(1) / SECOND
-            bench.report.row(fault).peak("ms the other ESC was silent", int(1000 * silence))
-            injection.expect(silence < 0.25, f"the other ESC was silent for {silence:.2f} s")
-            injection.cleared()
-            injection.wait_recovery()
+    thread = threading.Thread(target=pour, daemon=True)
+    thread.start()
+    time.sleep(1.5)
+    stop.set()
+    thread.join()
+    bench.watch.catch_up()
+    silence = bench.watch.silence_ns(1) / SECOND
+    injection.row.peak("ms the other ESC was silent", int(1000 * silence))
+    injection.expect(silence < 0.25, f"the other ESC was silent for {silence:.2f} s")
+    injection.cleared()
 
 
 @fault("Serial", "ports gone and back again and again", LIMIT_S, bench="cycles")

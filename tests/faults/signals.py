@@ -4,7 +4,6 @@ import contextlib
 import io
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from encoding import Identity, info, info_values, live, live_values
@@ -108,18 +107,8 @@ def table_of(texts: Sequence[str], escs: int) -> Table:
     return found
 
 
-def table_of_configuration(config: Path, canopen: bool, escs: int) -> Table:
-    """The table of what ``kontronik-can-gw dbc`` says that a configuration sends."""
-    return table_of(texts_of(["-c", str(config)], canopen), escs)
-
-
-def table_of_shipped(escs: int, canopen: bool = True) -> Table:
-    """The table of the shipped layouts expanded to so many ESCs, nodes from 1 on."""
-    return table_of(texts_of(["--esc", str(escs)], canopen), escs)
-
-
-def texts_of(words: Sequence[str], canopen: bool) -> list[str]:
-    """What ``kontronik-can-gw dbc`` prints, of the nodes too if there are any; in this process, as a start takes long in a VM."""
+def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:
+    """Of what ``kontronik-can-gw dbc`` prints, of the nodes too if there are any; in this process, as a start takes long in a VM."""
     from kontronik_can_gw.cli import main
 
     texts = []
@@ -128,4 +117,4 @@ def texts_of(words: Sequence[str], canopen: bool) -> list[str]:
         with contextlib.redirect_stdout(printed):
             assert main(["dbc", *words, *options]) == 0
         texts.append(printed.getvalue())
-    return texts
+    return table_of(texts, escs)

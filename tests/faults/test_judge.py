@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from itertools import pairwise
 
+import benches
 import pytest
 from bus_watch import MS, SECOND, Judge
 from encoding import Identity, live, live_values, mix
 from feeder import CURRENT, SPEED, FedEsc
-from signals import Message, Table, table_of_shipped
+from signals import Message, Table
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.fields import LiveData, rows
@@ -19,7 +20,7 @@ SPEED_ID, CURRENT_ID, LINK_ID = 0x688, 0x690, 0x6B0
 
 @pytest.fixture(scope="module")
 def table() -> Table:
-    return table_of_shipped(2)
+    return benches.table(2, True)
 
 
 @pytest.fixture
@@ -82,12 +83,6 @@ def test_values_marked_as_not_available_are_never_wrong(judge: Judge) -> None:
     assert judge.marked == 1
 
 
-def test_an_old_value_is_wrong_and_its_age_is_said(judge: Judge) -> None:
-    judge.take(SPEED_ID, of_live(judge, SPEED_ID, 10), START + 10 * PERIOD + 400 * MS)
-    assert settled(judge) == ["old: frame 10, sent 0.400 s before"]
-    assert (judge.wrong_count, judge.old_count) == (1, 1)
-
-
 def test_an_old_value_is_excused_by_a_standstill_of_the_whole_machine_only(judge: Judge) -> None:
     judge.take(SPEED_ID, of_live(judge, SPEED_ID, 10), START + 10 * PERIOD + 400 * MS)
     judge.settle(lambda begin, end: 200 * MS if begin < START + 20 * PERIOD < end else 0)
@@ -103,21 +98,30 @@ def test_a_value_that_was_never_sent_is_wrong_whatever_stood_still(judge: Judge)
     assert "never sent" in judge.wrong[0].why
 
 
-def test_a_frame_put_together_from_two_is_wrong(judge: Judge) -> None:
-    one, other = of_live(judge, SPEED_ID, 10), of_live(judge, SPEED_ID, 11)
-    judge.take(SPEED_ID, one[:3] + other[3:], START + 11 * PERIOD + MS)
-    assert "never sent" in settled(judge)[0]
-
-
-def test_values_of_another_esc_are_wrong(judge: Judge) -> None:
-    judge.take(SPEED_ID, of_live(judge, SPEED_ID + 1, 10, esc=1), START + 10 * PERIOD + MS)
-    assert settled(judge) == ["of another ESC: frame 10 of esc2"]
-
-
-def test_a_value_from_before_a_newer_one_is_wrong(judge: Judge) -> None:
-    judge.take(SPEED_ID, of_live(judge, SPEED_ID, 11), START + 11 * PERIOD + MS)
-    judge.take(SPEED_ID, of_live(judge, SPEED_ID, 10), START + 11 * PERIOD + 2 * MS)
-    assert settled(judge) == ["values of frame 10 after those of frame 11"]
+@pytest.mark.parametrize(
+    ("given", "late", "why"),
+    [
+        ([10], 400 * MS, "old: frame 10, sent 0.400 s before"),
+        ([11, 10], MS, "values of frame 10 after those of frame 11"),
+        ([(10, 11)], MS, "never sent"),
+        ([-10], MS, "of another ESC: frame 10 of esc2"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    judge: Judge, given: list[int | tuple[int, int]], late: int, why: str
+) -> None:
+    """Frames of the first ESC; negative: of the second one; a pair: put together from two."""
+    for each in given:
+        if isinstance(each, tuple):
+            one, other = (of_live(judge, SPEED_ID, n) for n in each)
+            n, data = each[1], one[:3] + other[3:]
+        else:
+            n, esc = abs(each), int(each < 0)
+            data = of_live(judge, SPEED_ID + esc, n, esc)
+        judge.take(SPEED_ID, data, START + max(n, 11 if len(given) > 1 else 0) * PERIOD + late)
+    (said,) = settled(judge)
+    assert why in said
+    assert (judge.wrong_count, judge.old_count) == (1, int(why.startswith("old")))
 
 
 def test_an_age_that_is_told_too_young_is_wrong(judge: Judge) -> None:

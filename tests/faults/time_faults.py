@@ -5,25 +5,19 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from fault_report import Fault, fault
-from harness import Bench
-
-LIMIT_S = 1.0
+from harness import Bench, Injection, injected
 
 
-def clock_set(bench: Bench, fault: Fault, times: int, to: Callable[[], float]) -> None:
-    for _ in range(times):
-        with bench.injection(fault, []) as injection:
-            right = time.time() - time.monotonic()
-            bench.watch.note_clocks()
-            time.clock_settime(time.CLOCK_REALTIME, to())
-            bench.watch.note_clocks()
-            try:
-                time.sleep(1.2)
-            finally:
-                time.clock_settime(time.CLOCK_REALTIME, right + time.monotonic())
-                bench.watch.note_clocks()
-            injection.cleared()
+def clock_set(bench: Bench, _injection: Injection, _n: int, to: Callable[[], float]) -> None:
+    right = time.time() - time.monotonic()
+    bench.watch.note_clocks()
+    time.clock_settime(time.CLOCK_REALTIME, to())
+    bench.watch.note_clocks()
+    try:
+        time.sleep(1.2)
+    finally:
+        time.clock_settime(time.CLOCK_REALTIME, right + time.monotonic())
+        bench.watch.note_clocks()
 
 
 for name, to in (
@@ -32,17 +26,14 @@ for name, to in (
     # no kernel takes less: it would have been started before 1970
     ("wall clock set to 1970, and right again", lambda: time.monotonic() + 5),
 ):
-    fault("Time", name, None)(partial(clock_set, to=to))
+    injected("Time", name, None, escs=[])(partial(clock_set, to=to))
 
 
-@fault("Time", "process suspended (SIGSTOP, SIGCONT)", LIMIT_S)
-def suspended(bench: Bench, fault: Fault, times: int) -> None:
+@injected("Time", "process suspended (SIGSTOP, SIGCONT)", 1.0)
+def suspended(bench: Bench, injection: Injection, n: int) -> None:
     """For 10 s and for less; nothing old is sent as new."""
     assert bench.gateway is not None
-    for i in range(times):
-        with bench.injection(fault) as injection:
-            bench.gateway.process.send_signal(signal.SIGSTOP)
-            time.sleep((10, 0.4, 2)[i % 3])
-            injection.cleared()
-            bench.gateway.process.send_signal(signal.SIGCONT)
-            injection.wait_recovery()
+    bench.gateway.process.send_signal(signal.SIGSTOP)
+    time.sleep((10, 0.4, 2)[n % 3])
+    injection.cleared()
+    bench.gateway.process.send_signal(signal.SIGCONT)

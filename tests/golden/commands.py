@@ -18,6 +18,10 @@ import scenario
 HERE = Path(__file__).parent
 LINES = 25
 """Lines on standard error that are shown."""
+SURROUNDINGS = (
+    *("LISTEN_FDS", "NOTIFY_SOCKET", "JOURNAL_STREAM"),
+    *("STATE_DIRECTORY", "RUNTIME_DIRECTORY", "NO_COLOR"),
+)
 _RESULT = re.compile(r"(\||!|=>) ?")
 _WORD = re.compile(r"'([^']*)'|(\S+)")
 
@@ -158,24 +162,10 @@ def _place() -> Iterator[Path]:
     argv, stdin, handlers = sys.argv, sys.stdin, logging.root.handlers
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
-        for key in (
-            "LISTEN_FDS",
-            "NOTIFY_SOCKET",
-            "JOURNAL_STREAM",
-            "STATE_DIRECTORY",
-            "RUNTIME_DIRECTORY",
-            "NO_COLOR",
-        ):
+        for key in SURROUNDINGS:
             os.environ.pop(key, None)
-        os.environ.update(
-            {
-                "HOME": name,
-                "XDG_STATE_HOME": f"{name}/state",
-                "COLUMNS": "100",
-                "TZ": "UTC0",
-                "LC_ALL": "C",
-            }
-        )
+        os.environ |= {"HOME": name, "XDG_STATE_HOME": f"{name}/state", "COLUMNS": "100"}
+        os.environ |= {"TZ": "UTC0", "LC_ALL": "C"}
         time.tzset()
         os.chdir(folder)
         sys.argv = ["kontronik-can-gw"]

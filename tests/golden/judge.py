@@ -18,6 +18,7 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,6 +45,24 @@ CONVERSIONS: dict[tuple[str, str], int | Fraction] = {
 }
 LIVE = {f.name: f for f in sheet.LIVE_FIELDS}
 INFO = {f.name: f for f in sheet.INFO_FIELDS}
+OF_SETTINGS = {"MotorSpeed", "OutputSpeed", "MeanCellVoltage"}
+OF_LIVE = OF_SETTINGS | {"OperatingState", "OperatingStateRaw", "BatteryPower"}
+OF_INFO = {
+    "Device": ("device_and_variant", 10, 63),
+    "DeviceRaw": ("device_and_variant", 10, 63),
+    "Variant": ("device_and_variant", 0, 1023),
+    "FirmwareMain": ("firmware_word", 8, 255),
+    "FirmwareSub": ("firmware_word", 0, 255),
+}
+"""A word of an info frame, shift, mask."""
+DEVICE_OBJECT = (
+    ("device_and_variant", 10, 63, "B"),
+    ("device_and_variant", 0, 1023, "H"),
+    ("firmware_word", 0, 0xFFFF, "H"),
+    ("selftest_errors", 0, 0xFFFFFFFF, "I"),
+    ("cell_count", 0, 255, "B"),
+)
+"""2010h: the same, and how it is packed."""
 Values = Mapping[str, int]
 Bytes = tuple[int, bytes | None]
 """(time, bytes that are read; None where the port is lost)."""
@@ -80,11 +99,7 @@ class Esc:
     def expire(self, now: int) -> bool:
         """Forget what is too old."""
         before = self.state
-        if (
-            before.live is not None
-            and before.live_ns is not None
-            and now - before.live_ns > self.timeout
-        ):
+        if before.live is not None and now - (before.live_ns or 0) > self.timeout:
             self.lose()
         if self.state.info is not None and now - self.state.info_ns > INFO_NS:
             self.state = self.state._replace(info=None)
@@ -101,9 +116,8 @@ class Esc:
         if kind == "info":
             self.state = self.state._replace(info=values, info_ns=when, last_info=values)
         else:
-            self.state = self.state._replace(
-                live=values, live_ns=max(when, self.state.live_ns or 0)
-            )
+            when = max(when, self.state.live_ns or 0)
+            self.state = self.state._replace(live=values, live_ns=when)
 
 
 def found_frames(inputs: list[Bytes], timeout: int) -> list[Arrivals | None]:
@@ -119,17 +133,12 @@ def found_frames(inputs: list[Bytes], timeout: int) -> list[Arrivals | None]:
         if end > begin:
             _search(inputs, begin, end, timeout, found)
         begin = end if end > begin else end + 1
-    return [
-        None if data is None else arrivals
-        for (_, data), arrivals in zip(inputs, found, strict=True)
-    ]
+    return [None if inputs[n][1] is None else arrivals for n, arrivals in enumerate(found)]
 
 
 def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list[Arrivals]) -> None:
-    stream = b"".join(data or b"" for _, data in inputs[begin:end])
-    ends: list[int] = []
-    for _, data in inputs[begin:end]:
-        ends.append((ends[-1] if ends else 0) + len(data or b""))
+    parts = [data or b"" for _, data in inputs[begin:end]]
+    stream, ends = b"".join(parts), list(accumulate(map(len, parts)))
     moment = gap = 0
     for frame in reference.frames_of(stream):
         moment = max(moment, frame.end)
@@ -142,14 +151,17 @@ def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list
         now = inputs[begin + index][0]
         when = now - (ends[index] - frame.end) * NS_PER_BYTE
         if now - when <= timeout:
-            found[begin + index].append(
-                (frame.kind, frame.layout, fields_of(frame.kind, frame.raw), when)
-            )
+            values = fields_of(frame.kind, frame.raw)
+            found[begin + index].append((frame.kind, frame.layout, values, when))
 
 
 def fields_of(kind: str, raw: bytes) -> Values:
     listed = sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
     return {f.name: struct.unpack_from(f"<{f.code}", raw, f.offset)[0] for f in listed}
+
+
+def snake(name: str) -> str:
+    return re.sub("(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
 
 
 def bec_current_supplied(state: State) -> bool:
@@ -162,7 +174,7 @@ def bec_current_supplied(state: State) -> bool:
 
 def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | None:
     """The value that a signal is to have, in the sheet's unit; None: not available. KeyError for what is not judged."""
-    plain = re.sub("(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
+    plain = snake(name)
     live, info = state.live, state.info
     for known, listed in ((live, LIVE), (info, INFO)):
         if plain in listed and plain != "operating_state":
@@ -171,31 +183,14 @@ def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | No
             if plain == "max_bec_current" and known["device_and_variant"] >> 10 == JIVEPRO:
                 return None
             return Fraction(known[plain], listed[plain].steps)
-    if name in ("MotorSpeed", "OutputSpeed", "MeanCellVoltage") and not esc.sure:
-        raise KeyError(name)
-    if name in (
-        "OperatingState",
-        "OperatingStateRaw",
-        "MotorSpeed",
-        "OutputSpeed",
-        "BatteryPower",
-        "MeanCellVoltage",
-    ):
-        return (
-            None
-            if live is None
-            else _of_live(name, esc, live, esc.cells or (info or {}).get("cell_count", 0))
-        )
-    if name in ("Device", "DeviceRaw", "Variant", "FirmwareMain", "FirmwareSub"):
-        if info is None:
-            return None
-        pair, firmware = info["device_and_variant"], info["firmware_word"]
-        parts = {
-            "Variant": pair & 1023,
-            "FirmwareMain": firmware >> 8,
-            "FirmwareSub": firmware & 255,
-        }
-        return parts.get(name, pair >> 10)
+    if name in OF_LIVE:
+        if name in OF_SETTINGS and not esc.sure:
+            raise KeyError(name)
+        cells = esc.cells or (info or {}).get("cell_count", 0)
+        return None if live is None else _of_live(name, esc, live, cells)
+    if name in OF_INFO:
+        word, shift, mask = OF_INFO[name]
+        return None if info is None else info[word] >> shift & mask
     if name == "Layout":
         return state.layout
     if name == "DataAge":
@@ -269,6 +264,9 @@ class Judge:
         if not arrivals:
             esc.passed.append(esc.state)
 
+    def _note(self, now: int, what: str) -> None:
+        self.wrong.append(f"{scenario.seconds(now)} {what}")
+
     def _at(self, now: int, esc: Esc) -> Esc:
         if now != self._now:
             self._now = now
@@ -312,39 +310,25 @@ class Judge:
             self._answer(now, frame)
         node = frame.can_id & 0x7F
         if not frame.extended and 0x180 < frame.can_id < 0x400 and node in self.node_ids:
-            self._message(
-                now,
-                frame,
-                self._pdos,
-                frame.can_id - node + 1,
-                self.escs[self.node_ids.index(node)],
-            )
+            owner = self.escs[self.node_ids.index(node)]
+            self._message(now, frame, self._pdos, frame.can_id - node + 1, owner)
         elif self.database is not None:
             self._message(now, frame, self.database, frame.can_id, None)
 
     def _message(
         self, now: int, frame: drive.Frame, database: Database, can_id: int, owner: Esc | None
     ) -> None:
-        message = next(
-            (
-                m
-                for m in database.messages
-                if (m.frame_id, m.is_extended_frame) == (can_id, frame.extended)
-            ),
-            None,
-        )
+        message = _by_id(database).get((can_id, frame.extended))
         if message is None:
             return
         if message.length != len(frame.data):
-            self.wrong.append(f"{scenario.seconds(now)} {message.name}: {len(frame.data)} bytes")
+            self._note(now, f"{message.name}: {len(frame.data)} bytes")
             return
         raw: Any = message.decode(frame.data, decode_choices=False, scaling=False)
         for signal in message.signals:
             if signal.name in raw:
-                esc = owner or next(
-                    (e for e in self.escs if e.prefix and signal.name.startswith(e.prefix)),
-                    self.escs[0],
-                )
+                named = (e for e in self.escs if e.prefix and signal.name.startswith(e.prefix))
+                esc = owner or next(named, self.escs[0])
                 self._signal(now, message.name, signal, raw[signal.name], esc, owner is not None)
         if owner is None:
             self._rhythm(now, message, raw)
@@ -362,29 +346,22 @@ class Judge:
             live = [{s.live is not None for s in e.passed or [e.state]} for e in self.escs]
             good = sum(map(min, live)) <= raw <= sum(map(max, live))
         else:
-            plain = re.sub("(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
+            plain = snake(name)
             row = (LIVE | INFO).get(plain, LIVE["battery_voltage"])
             unit = row.unit.replace("µ", "u")
             try:
-                good = any(
-                    fits(signal, raw, expected(name, esc, state, now), unit) for state in states
-                )
-                # CiA 301 has no code for what is not available: as it stands on the wire
-                good = good or (
-                    pdo and any(s.live is not None and raw == s.live.get(plain) for s in states)
-                )
+                good = any(fits(signal, raw, expected(name, esc, s, now), unit) for s in states)
             except KeyError:
                 return
+            # CiA 301 has no code for what is not available: as it stands on the wire
+            good = good or (pdo and any(s.live and raw == s.live.get(plain) for s in states))
         self.count["values"] += 1
         if not good:
-            self.wrong.append(
-                f"{scenario.seconds(now)} {message}.{signal.name} = {raw} with {states}"
-            )
+            self._note(now, f"{message}.{signal.name} = {raw} with {states}")
 
     def _rhythm(self, now: int, message: Any, raw: Mapping[str, Any]) -> None:
-        alive = next(
-            (s for s in message.signals if s.name.endswith(("Alive", "AliveCounter"))), None
-        )
+        counters = (s for s in message.signals if s.name.endswith(("Alive", "AliveCounter")))
+        alive = next(counters, None)
         counter = -1 if alive is None else int(raw[alive.name])
         before, last = self._last.get(message.name, (-1, now))
         self._last[message.name] = counter, now
@@ -392,27 +369,17 @@ class Judge:
             return
         self.count["distances"] += 1
         if alive is not None and before >= 0 and counter != (before + 1) % 15:
-            self.wrong.append(
-                f"{scenario.seconds(now)} {message.name}: alive counter {before} -> {counter}"
-            )
+            self._note(now, f"{message.name}: alive counter {before} -> {counter}")
         attributes = message.dbc.attributes
         delay = attributes["GenMsgDelayTime"].value if "GenMsgDelayTime" in attributes else 0
-        if (
-            message.cycle_time and now - last > message.cycle_time * 10**6 + 10**6
-        ) or now - last < delay * 10**6:
-            self.wrong.append(
-                f"{scenario.seconds(now)} {message.name}: {(now - last) / 1e6} ms after the one before"
-            )
+        distance_ms = (now - last) / 1e6
+        if distance_ms > (message.cycle_time or 1e9) + 1 or distance_ms < delay:
+            self._note(now, f"{message.name}: {distance_ms} ms after the one before")
 
     def _answer(self, now: int, frame: drive.Frame) -> None:
         node, data = frame.can_id - 0x580, frame.data
-        request = self._requests.pop(node, None)
-        if (
-            request is not None
-            and data[0] == 0x60
-            and request[1:3] == b"\x00\x21"
-            and request[0] & 0xE2 == 0x22
-        ):
+        request = self._requests.pop(node, bytes(8))
+        if data[0] == 0x60 and request[1:3] == b"\x00\x21" and request[0] & 0xE2 == 0x22:
             self.setting(node, request[3], request[4 : 8 - (request[0] >> 2 & 3)])
         if data[0] & 0xE2 == 0x42:
             self.read(now, node, data[2] << 8 | data[1], data[3], data[4 : 8 - (data[0] >> 2 & 3)])
@@ -425,45 +392,35 @@ class Judge:
         state = esc.state
         live, info = state.live, state.last_info
         wanted: bytes | None = None
-        row = (
-            sheet.LIVE_FIELDS[min(sub, 16) - 1]
-            if index == 0x2000
-            else sheet.INFO_FIELDS[min(sub, 14) + 3]
-        )
         if index == 0x2000 and sub <= 16:
+            row = sheet.LIVE_FIELDS[sub - 1]
             if live is not None and (row.name != "bec_current" or bec_current_supplied(state)):
                 wanted = struct.pack(f"<{row.code}", live[row.name])
         elif index == 0x2011 and sub <= 14:
-            if info is not None and (
-                row.name != "max_bec_current" or info["device_and_variant"] >> 10 != JIVEPRO
-            ):
+            row = sheet.INFO_FIELDS[sub + 3]
+            is_jivepro = info is not None and info["device_and_variant"] >> 10 == JIVEPRO
+            if info is not None and (row.name != "max_bec_current" or not is_jivepro):
                 wanted = struct.pack(f"<{row.code}", info[row.name])
         elif index == 0x2010 and sub <= 5:
-            names = (
-                "device_and_variant",
-                "device_and_variant",
-                "firmware_word",
-                "selftest_errors",
-                "cell_count",
-            )
+            word, shift, mask, code = DEVICE_OBJECT[sub - 1]
             if info is not None:
-                value = info[names[sub - 1]]
-                wanted = struct.pack(
-                    f"<{'BHHIB'[sub - 1]}", {1: value >> 10, 2: value & 1023}.get(sub, value)
-                )
+                wanted = struct.pack(f"<{code}", info[word] >> shift & mask)
         elif index == 0x2001 and sub <= 2 and esc.sure:
             if live is not None:
                 ratio = esc.pole_pairs * (esc.gear if sub == 2 else 1)
-                wanted = struct.pack(
-                    "<i", int(live["electrical_speed"] / Fraction(ratio) + Fraction(1, 2))
-                )
+                speed = live["electrical_speed"] / Fraction(ratio)
+                wanted = struct.pack("<i", int(speed + Fraction(1, 2)))
         else:
             return
         self.count["SDO answers"] += 1
         if data != wanted:
-            self.wrong.append(
-                f"{scenario.seconds(now)} {index:04X}h:{sub:02X} = {data and data.hex()}, not {wanted and wanted.hex()}"
-            )
+            texts = [each and each.hex() for each in (data, wanted)]
+            self._note(now, f"{index:04X}h:{sub:02X} = {texts[0]}, not {texts[1]}")
+
+
+@cache
+def _by_id(database: Database) -> dict[tuple[int, bool], Any]:
+    return {(each.frame_id, each.is_extended_frame): each for each in database.messages}
 
 
 @cache
@@ -500,9 +457,8 @@ def follow(found: Judge, steps: list[tuple[int, str, Any]]) -> Judge:
     """What happened, in order: bytes (ESC, what; None: the port is lost), frames <- and ->, SDO transfers."""
     queues = []
     for index, esc in enumerate(found.escs):
-        inputs = [
-            (now, what[1]) for now, verb, what in steps if verb == "bytes" and what[0] == index
-        ]
+        mine = [(now, what) for now, verb, what in steps if verb == "bytes" and what[0] == index]
+        inputs = [(now, data) for now, (_, data) in mine]
         queues.append(iter(found_frames(inputs, esc.timeout)))
     for now, verb, what in steps:
         if verb == "bytes":
@@ -553,18 +509,8 @@ def judge_scenario(file: Path) -> Judge:
         elif verb in ("read", "write"):
             node, index, sub = int(words[0]), int(words[1][:4], 16), int(words[1][5:], 16)
             if verb == "read":
-                steps.append(
-                    (
-                        now,
-                        verb,
-                        (
-                            node,
-                            index,
-                            sub,
-                            None if "!" in words else bytes.fromhex("".join(words[3:4])),
-                        ),
-                    )
-                )
+                answer = None if "!" in words else bytes.fromhex("".join(words[3:4]))
+                steps.append((now, verb, (node, index, sub, answer)))
             elif index == 0x2100 and "!" not in words:
                 steps.append((now, verb, (node, sub, bytes.fromhex(words[2]))))
     return follow(Judge(escs, database, node_ids, steady), steps)
@@ -576,14 +522,9 @@ def blocks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     while (at := data.find(b"KCB1", at)) >= 0:
         head = data[at : at + 24]
         if len(head) == 24:
-            kind, packed, _, stored = (
-                head[4:5],
-                head[5],
-                head[6:8],
-                int.from_bytes(head[8:12], "little"),
-            )
+            kind, packed, stored, crc = struct.unpack("<4xcB2xI8xI", head)
             payload = data[at + 24 : at + 24 + stored]
-            if zlib.crc32(payload, zlib.crc32(head[:20])) == int.from_bytes(head[20:], "little"):
+            if zlib.crc32(payload, zlib.crc32(head[:20])) == crc:
                 yield kind, zlib.decompress(payload) if packed else payload
                 at += 24 + stored
                 continue
@@ -609,15 +550,8 @@ def judge_capture(file: Path) -> Judge:
     escs = []
     for esc in listed:
         prefix = esc["name"].title() if len(listed) > 1 else ""
-        escs.append(
-            Esc(
-                prefix,
-                esc["pole_pairs"],
-                Fraction(esc["gear"]),
-                esc["cell_count"],
-                esc["timeout_ns"],
-            )
-        )
+        gear, timeout = Fraction(esc["gear"]), esc["timeout_ns"]
+        escs.append(Esc(prefix, esc["pole_pairs"], gear, esc["cell_count"], timeout))
     database = meaning.database(header["dbc"]["text"].encode("latin-1"))
     if len(listed) > 1:
         database = _dbc([word for esc in listed for word in ("--name", esc["name"])])
@@ -627,6 +561,17 @@ def judge_capture(file: Path) -> Judge:
     steps.sort(key=lambda step: step[0])  # stable: bytes come before the frames of the same time
     nodes = [node["node_id"] for node in (header["canopen"] or {}).get("nodes", [])]
     return follow(Judge(escs, database, nodes, steady=False), steps)
+
+
+SHOWN_OTHERWISE = {"operating_state", "device_and_variant", "firmware_word"}
+SHOWN_OTHERWISE |= {"bec_current", "max_bec_current"}
+"""Fields that ``decode`` shows as texts, or not on every device."""
+
+
+def _decoded(frame: Any, kind: str, row: Any) -> str:
+    if frame.kind != kind:
+        return ""
+    return meaning.spelled(str(float(Fraction(fields_of(kind, frame.raw)[row.name], row.steps))))
 
 
 def judge_decoded(file: Path) -> Judge:
@@ -644,45 +589,20 @@ def judge_decoded(file: Path) -> Judge:
         }
         for kind, listed in (("live", LIVE), ("info", INFO)):
             for name, row in listed.items():
-                columns[name] = []
-                for frame in frames:
-                    value = (
-                        Fraction(fields_of(kind, frame.raw)[name], row.steps)
-                        if frame.kind == kind
-                        else None
-                    )
-                    columns[name].append(
-                        "" if value is None else meaning.spelled(str(float(value)))
-                    )
-        for name in (
-            "operating_state",
-            "device_and_variant",
-            "firmware_word",
-            "bec_current",
-            "max_bec_current",
-        ):
-            del columns[name]  # shown as texts, or not on every device
+                if name not in SHOWN_OTHERWISE:
+                    columns[name] = [_decoded(frame, kind, row) for frame in frames]
         wanted = meaning.column_lines(columns)[1:]
         shown = Counter(line.removeprefix("| ") for line in lines)
-        always = [
-            line.removeprefix("always ").partition(": ")
-            for line in shown
-            if line.startswith("always ")
-        ]
+        always = [line[7:].partition(": ") for line in shown if line.startswith("always ")]
         for line in wanted:
             found.count["columns"] += 1
             if line.startswith("always "):
-                same_value, _, names = line.removeprefix("always ").partition(": ")
+                value, _, names = line[7:].partition(": ")
                 same = {
-                    name
-                    for other, _, these in always
-                    if other == same_value
-                    for name in these.split(", ")
+                    n for other, _, these in always if other == value for n in these.split(", ")
                 }
-                found.wrong += [
-                    f"{title}: {name} is not always {same_value}"
-                    for name in {*names.split(", ")} - same
-                ]
+                missing = {*names.split(", ")} - same
+                found.wrong += [f"{title}: {name} is not always {value}" for name in missing]
             elif shown[line] != 2:  # as JSON lines and as CSV
                 found.wrong.append(f"{title}: not so: {line}")
     return found

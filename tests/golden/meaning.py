@@ -9,6 +9,7 @@ import tempfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -97,14 +98,8 @@ def _sections(data: bytes) -> configparser.ConfigParser:
     return found
 
 
-_OF_THE_DAY = {
-    "CreationDate",
-    "CreationTime",
-    "ModificationDate",
-    "ModificationTime",
-    "CreatedBy",
-    "ModifiedBy",
-}
+_OF_THE_DAY = {"CreationDate", "CreationTime", "CreatedBy"}
+_OF_THE_DAY |= {"ModificationDate", "ModificationTime", "ModifiedBy"}
 
 
 def eds(data: bytes) -> list[str]:
@@ -113,14 +108,14 @@ def eds(data: bytes) -> list[str]:
     lines = []
     for name in sorted(found.sections(), key=str.upper):
         keys = {
-            key: spelled(value)
-            for key, value in found[name].items()
-            if key not in _OF_THE_DAY and value
+            key: value for key, value in found[name].items() if key not in _OF_THE_DAY and value
         }
-        lines.append(
-            f"[{name.upper()}] " + " ".join(f"{key}={value}" for key, value in sorted(keys.items()))
-        )
+        lines.append(f"[{name.upper()}] {_keys(dict(sorted(keys.items())))}")
     return lines
+
+
+def _keys(values: Mapping[str, str]) -> str:
+    return " ".join(f"{key}={spelled(value)}" for key, value in values.items())
 
 
 def dcf(data: bytes) -> list[str]:
@@ -128,13 +123,9 @@ def dcf(data: bytes) -> list[str]:
     found = _sections(data)
     lines = [line for line in eds(data) if line.startswith(("[DEVICECOM", "[FILEINFO"))]
     for name in sorted(found.sections(), key=str.upper):
-        values = {
-            key: found[name][key] for key in ("ParameterValue", "Denotation") if key in found[name]
-        }
+        values = {k: found[name][k] for k in ("ParameterValue", "Denotation") if k in found[name]}
         if values and "Com" not in name:
-            lines.append(
-                f"[{name.upper()}] " + " ".join(f"{key}={spelled(v)}" for key, v in values.items())
-            )
+            lines.append(f"[{name.upper()}] {_keys(values)}")
     return lines
 
 
@@ -159,14 +150,11 @@ def _cell(value: object) -> str:
 
 def _runs(values: Sequence[str]) -> str:
     """Values in a row; `x*3` for the same three times, `-` for nothing."""
-    parts: list[tuple[str, int]] = []
-    for value in values:
-        value = value.replace(" ", "_") or "-"
-        if parts and parts[-1][0] == value:
-            parts[-1] = value, parts[-1][1] + 1
-        else:
-            parts.append((value, 1))
-    return " ".join(value if count == 1 else f"{value}*{count}" for value, count in parts)
+    parts = []
+    for value, same in groupby(each.replace(" ", "_") or "-" for each in values):
+        count = len(list(same))
+        parts.append(value if count == 1 else f"{value}*{count}")
+    return " ".join(parts)
 
 
 def table(data: bytes) -> list[str]:
@@ -204,14 +192,9 @@ def _log(suffix: str) -> Callable[[bytes], list[str]]:
         frames = [
             (m.arbitration_id, m.is_extended_id, m.is_fd, m.is_rx, bytes(m.data)) for m in found
         ]
-        lines = [
-            f"{len(found)} frames in {found[-1].timestamp - first:.4f} s, content {_digest(frames)}"
-        ]
-        lines.append(
-            f"times in 0.1 ms {_digest(round((m.timestamp - first) * 1e4) for m in found)}"
-        )
         return [
-            *lines,
+            f"{len(found)} frames in {found[-1].timestamp - first:.4f} s, content {_digest(frames)}",
+            f"times in 0.1 ms {_digest(round((m.timestamp - first) * 1e4) for m in found)}",
             "ids " + " ".join(f"{can_id}*{count}" for can_id, count in sorted(ids.items())),
         ]
 

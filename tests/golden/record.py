@@ -19,23 +19,16 @@ sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parents[1])]
 import commands  # noqa: E402
 import scenario  # noqa: E402
 
+KINDS = ("captures", "commands", "dialogues", "flights")
 LINES = 12
 """Lines of a difference that are shown."""
 
 
 def files(words: Sequence[str] = ()) -> list[Path]:
     """The golden files, those whose names hold one of the words."""
-    found = [
-        *HERE.glob("flights/*.txt"),
-        *HERE.glob("dialogues/*.txt"),
-        *HERE.glob("commands/*.txt"),
-    ]
-    found += [capture.with_suffix(".txt") for capture in HERE.glob("captures/*.kcap")]
-    return [
-        file
-        for file in sorted(found)
-        if not words or any(word in str(file.relative_to(HERE)) for word in words)
-    ]
+    found = [file for kind in KINDS for file in HERE.glob(f"{kind}/*.txt")]
+    named = [(file, str(file.relative_to(HERE))) for file in sorted(found)]
+    return [file for file, name in named if not words or any(word in name for word in words)]
 
 
 def made(file: Path) -> str:
@@ -58,10 +51,8 @@ def differences(file: Path, old: str, new: str) -> list[str]:
     name = str(file.relative_to(HERE))
     if file.parent.name == "commands":
         return [f"{name}: {line}" for line in _in_cases(old, new)]
-    return [
-        f"{name}: {line}"
-        for line in [*_in_frames(old, new), *_in_lines(old.splitlines(), new.splitlines())]
-    ]
+    lines = [*_in_frames(old, new), *_in_lines(old.splitlines(), new.splitlines())]
+    return [f"{name}: {line}" for line in lines]
 
 
 def _in_frames(old: str, new: str) -> Iterator[str]:

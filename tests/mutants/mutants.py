@@ -193,9 +193,14 @@ def is_killed(mutant: Mutation, known: Result) -> bool:
     # what a fixture or a cache executes is noted for the first test only: the others of these files follow
     chosen = [test for test in seconds if test.partition("::")[0] in files]
     chosen.sort(key=lambda test: (test not in seeing, seconds[test]))
-    limits = {test: max(MIN_LIMIT_S, LIMIT_FACTOR * seconds[test]) for test in chosen}
-    if not limits:
+    return fails(mutant, files, {test: seconds[test] for test in chosen})
+
+
+def fails(mutant: Mutation, files: Sequence[str], seconds: Mapping[str, float]) -> bool:
+    """Whether one of these tests, tried in this order, does; an endless one fails by its limit."""
+    if not seconds:
         return False
+    limits = {test: max(MIN_LIMIT_S, LIMIT_FACTOR * each) for test, each in seconds.items()}
     status, _ = in_child(Watch(limits), files, mutant)
     if status in NOT_DECIDED:
         print(f"  not decided, counted as surviving: {mutant.key} {mutant}", flush=True)
@@ -241,6 +246,17 @@ def compare(old: Result, new: Result) -> bool:
     return not lost
 
 
+def settle() -> None:
+    """What runs depend on is the same in each."""
+    if os.environ.get("PYTHONHASHSEED") != "0":
+        os.execve(
+            sys.executable, [sys.executable, *sys.argv], {**os.environ, "PYTHONHASHSEED": "0"}
+        )
+    os.chdir(PROJECT)
+    sys.path.insert(0, str(PROJECT))
+    warnings.simplefilter("ignore")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -259,13 +275,7 @@ def main() -> int:
     packages = options.packages or list(PACKAGES)
     if wrong := set(packages) - set(PACKAGES):
         parser.error(f"{', '.join(wrong)}: no such package; there are {', '.join(PACKAGES)}")
-    if os.environ.get("PYTHONHASHSEED") != "0":
-        os.execve(
-            sys.executable, [sys.executable, *sys.argv], {**os.environ, "PYTHONHASHSEED": "0"}
-        )
-    os.chdir(PROJECT)
-    sys.path.insert(0, str(PROJECT))
-    warnings.simplefilter("ignore")
+    settle()
     found = {package: judge(package, options.only) for package in packages}
     if options.json:
         options.json.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n")

@@ -52,6 +52,12 @@ class Mutation:
     def module(self) -> str:
         return ".".join(self.file.with_suffix("").parts).removesuffix(".__init__")
 
+    @classmethod
+    def of_text(cls, file: Path, source: str) -> "Mutation":
+        """A whole file with another text."""
+        tree = ast.parse(source)
+        return cls(file, tree, "", (tree, "body", 0, tree.body[0]), tree.body[0], 0, "")
+
     def put_in(self) -> None:
         parent, name, index, _ = self.place
         if index is None:

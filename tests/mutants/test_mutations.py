@@ -5,8 +5,9 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from mutants import PROJECT
 from mutations import Mutation, mutations, noting_lines
-from put_in_faults import PROJECT, Fault, faults
+from put_in_faults import Fault, faults
 
 FILE = Path("kontronik_can_gw/some.py")
 
@@ -99,6 +100,6 @@ def test_each_statement_that_is_executed_is_noted() -> None:
 
 @pytest.mark.parametrize("fault", faults(), ids=lambda fault: fault.what)
 def test_a_fault_of_the_list_can_be_put_in(fault: Fault) -> None:
-    file, changed = fault.put_in(PROJECT / "kontronik_can_gw")
+    file, changed = fault.put_in()
     assert changed != file.read_text()
     assert all((PROJECT / tests).exists() for tests in fault.seen_by)

@@ -1,16 +1,13 @@
 """CAN reception and queued sending on a real socket: kernel filters, full queues, interfaces that go and come back."""
 
-import select
-import socket
-import struct
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Self
 
 import pytest
+from raw_bus import EXTENDED, INVERTED, REMOTE, RawBus
 from vcan_tools import DELIVERY_MARK, LIMIT_S, ip, wait_for, wait_for_delivery
 
 from kontronik_can_gw.config.keys import CanConfig
@@ -27,46 +24,16 @@ from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
-EXTENDED, REMOTE = 0x80000000, 0x40000000
-INVERTED = 0x20000000
-"""In a filter: all but this id."""
-CLASSIC = struct.Struct("=IB3x8s")
+
+def peer_on(interface: str) -> RawBus:
+    """Another participant, that hears all."""
+    return RawBus(interface, (INVERTED | DELIVERY_MARK, 0x7FF))
 
 
-class Peer:
-    """Another participant: a raw socket of its own, with room for bursts."""
-
-    def __init__(self, interface: str) -> None:
-        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        self._socket.setsockopt(socket.SOL_SOCKET, 33, 4_000_000)  # SO_RCVBUFFORCE
-        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
-        no_mark = struct.pack("=II", INVERTED | DELIVERY_MARK, 0x7FF)
-        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, no_mark)
-        self._socket.bind((interface,))
-
-    def send(self, can_id: int, data: bytes = b"") -> None:
-        self._socket.send(CLASSIC.pack(can_id, len(data), data))
-
-    def send_fd(self, can_id: int, data: bytes) -> None:
-        self._socket.send(struct.pack("=IBB2x64s", can_id, len(data), 1, data))
-
-    def receive(self, seconds: float = LIMIT_S) -> tuple[int, bytes] | None:
-        """The next frame's id and data; None when none comes."""
-        if not select.select([self._socket], [], [], seconds)[0]:
-            return None
-        can_id, size, data = CLASSIC.unpack(self._socket.recv(72)[: CLASSIC.size])
-        return can_id, data[:size]
-
-    def ask(self, can_id: int, data: bytes) -> tuple[int, bytes] | None:
-        """Send a request; the next frame that comes."""
-        self.send(can_id, data)
-        return self.receive()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._socket.close()
+def ask(peer: RawBus, can_id: int, data: bytes) -> tuple[int, bytes] | None:
+    """Send a request; the next frame that comes."""
+    peer.send(can_id, data)
+    return peer.receive(LIMIT_S)
 
 
 @contextmanager
@@ -105,7 +72,7 @@ def test_exactly_the_wanted_frames_come_and_nothing_else_makes_the_socket_readab
     vcan: str,
 ) -> None:
     wanted = (0x000, 0x080, 0x601, 0x7E5)
-    with port_on(vcan, wanted) as port, Peer(vcan) as peer:
+    with port_on(vcan, wanted) as port, peer_on(vcan) as peer:
         for can_id in range(0x800):
             if can_id not in wanted:
                 peer.send(can_id, b"foreign")
@@ -127,7 +94,7 @@ def test_exactly_the_wanted_frames_come_and_nothing_else_makes_the_socket_readab
 
 def test_600_ids_are_merged_and_still_exactly_they_come(vcan: str) -> None:
     wanted = set(range(0x081, 0x081 + 3 * 600, 3))
-    with port_on(vcan, sorted(wanted)) as port, Peer(vcan) as peer:
+    with port_on(vcan, sorted(wanted)) as port, peer_on(vcan) as peer:
         came: list[int] = []
         for can_id in range(0x800):
             peer.send(can_id)
@@ -140,7 +107,7 @@ def test_600_ids_are_merged_and_still_exactly_they_come(vcan: str) -> None:
 
 
 def test_on_a_bus_with_can_fd_frames_are_told_apart(vcan: str) -> None:
-    with port_on(vcan, [0x601], fd=True) as port, Peer(vcan) as peer:
+    with port_on(vcan, [0x601], fd=True) as port, peer_on(vcan) as peer:
         peer.send_fd(0x601, b"12345678")
         peer.send_fd(0x601, bytes(64))
         peer.send(0x601, b"classic")
@@ -156,20 +123,20 @@ def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vca
     with (
         port_on(vcan, [0x581], own=True) as port,
         port_on(vcan, [0x581]) as second,
-        Peer(vcan) as peer,
+        peer_on(vcan) as peer,
     ):
         assert port.send(CanFrame(0x581, b"own")) is Sent.OK
         peer.send(0x581, b"other")
         assert all_of(port, vcan) == [CanFrame(0x581, b"other")]
         assert all_of(second, vcan) == [CanFrame(0x581, b"own"), CanFrame(0x581, b"other")]
         assert port.send(CanFrame(0x702, b"", remote=True)) is Sent.OK
-        assert [peer.receive() for _ in range(2)] == [(0x581, b"own"), (0x702 | REMOTE, b"")]
+        assert [peer.receive(LIMIT_S) for _ in range(2)] == [(0x581, b"own"), (0x702 | REMOTE, b"")]
 
 
 def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(
     vcan: str,
 ) -> None:
-    with port_on(vcan, [0x601]) as port, Peer(vcan) as peer:
+    with port_on(vcan, [0x601]) as port, peer_on(vcan) as peer:
         for n in range(508):  # four blocks of 127 segments, more than a socket's usual 278 frames
             peer.send(0x601, n.to_bytes(2, "little"))
         assert [int.from_bytes(frame.data, "little") for frame in all_of(port, vcan)] == list(
@@ -255,11 +222,11 @@ def test_4000_foreign_frames_do_not_reach_a_process_that_receives(
 ) -> None:
     node = Node(0x000, 0x080, 0x602)
     run_node(node)
-    with Peer(vcan) as peer:
+    with peer_on(vcan) as peer:
         for options in (["-I", "123"], ["-I", "602", "-e"], ["-I", "602", "-R"]):
             subprocess.run(["cangen", vcan, "-g", "0", "-n", "4000", "-i", *options], check=True)
-            assert len([peer.receive() for _ in range(4000)]) == 4000
-        assert peer.ask(0x602, b"x") == (0x582, b"x")
+            assert len([peer.receive(LIMIT_S) for _ in range(4000)]) == 4000
+        assert ask(peer, 0x602, b"x") == (0x582, b"x")
         assert node.status.received_frames == 1
 
 
@@ -267,28 +234,14 @@ def test_a_block_of_127_and_pdos_share_a_bus_that_is_full(
     vcan: str, run_node: Callable[[Node], Loop]
 ) -> None:
     """Some 200 frames/s, with room for ten: the kernel says ENOBUFS again and again."""
-    shaper = [
-        "tc",
-        "qdisc",
-        "add",
-        "dev",
-        vcan,
-        "root",
-        "tbf",
-        "rate",
-        "25kbit",
-        "burst",
-        "160",
-        "limit",
-        "160",
-    ]
-    subprocess.run(shaper, check=True)
+    shaper = f"tc qdisc add dev {vcan} root tbf rate 25kbit burst 160 limit 160"
+    subprocess.run(shaper.split(), check=True)
     node = Node(0x601)
     run_node(node)
-    with Peer(vcan) as peer:
+    with peer_on(vcan) as peer:
         peer.send(0x601)
         came: list[tuple[int, bytes]] = []
-        while len(came) < 167 and (frame := peer.receive()) is not None:
+        while len(came) < 167 and (frame := peer.receive(LIMIT_S)) is not None:
             came.append(frame)
         assert peer.receive(0.2) is None
     block = [data[0] for can_id, data in came if can_id == 0x581]
@@ -309,17 +262,17 @@ def test_a_node_hears_again_when_its_interface_was_down_or_removed(
     up = ("set", vcan, "up")
     down, removed = [("set", vcan, "down"), up], [("del", vcan), ("add", vcan, "type", "vcan"), up]
     for away, *back in (down, removed, down, removed):
-        with Peer(vcan) as peer:
-            assert peer.ask(0x602, b"before") == (0x582, b"before")
+        with peer_on(vcan) as peer:
+            assert ask(peer, 0x602, b"before") == (0x582, b"before")
         opened = node.opened
         ip("link", *away)
         wait_for(lambda: node.status.can_state is CanState.DOWN, "down, though nothing was sent")
         for words in back:
             ip("link", *words)
         wait_for(lambda opened=opened: node.opened > opened, "open again")  # type: ignore[misc]
-        with Peer(vcan) as peer:
+        with peer_on(vcan) as peer:
             peer.send(0x603)
-            assert peer.ask(0x602, b"again") == (0x582, b"again")
+            assert ask(peer, 0x602, b"again") == (0x582, b"again")
         wait_for(lambda: node.status.can_state is CanState.ERROR_ACTIVE, "error active")
     assert node.status.received_frames == 8
 

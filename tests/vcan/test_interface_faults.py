@@ -35,38 +35,6 @@ def test_a_missing_interface_and_one_without_can_fd_are_one_line_with_the_remedy
         assert name == vcan or len(gateway.lines) == 1
 
 
-def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(
-    vcan: str, tmp_path: Path
-) -> None:
-    with chain(vcan, tmp_path, Identity(1)) as run, run.running() as gateway:
-        run.feed(times=3)
-        for n in (1, 2):
-            ip("link", "set", vcan, "down")
-            wait_for(
-                lambda n=n: gateway.log.count("is down. Start it") >= n,  # type: ignore[misc]
-                "the log says that it is down",
-            )
-            run.escs[0].send_one()  # which nobody sees
-            ip("link", "set", vcan, "up")
-            wait_for(
-                lambda n=n: gateway.log.count("frames are sent again") >= n,  # type: ignore[misc]
-                "the log says that it is up",
-            )
-            run.feed(times=3)
-        ip("link", "del", vcan)
-        wait_for(
-            lambda: gateway.log.count(f"CAN interface {vcan}: ") >= 3,
-            "the log says that it is gone",
-        )
-        ip("link", "add", vcan, "type", "vcan")
-        ip("link", "set", vcan, "up")
-        wait_for(
-            lambda: gateway.log.count("frames are sent again") >= 3, "the log says that it is back"
-        )
-        run.feed(times=3)
-        assert gateway.end() == 0, gateway.log
-
-
 def test_commands_to_a_stopped_process_are_obeyed_when_it_goes_on(
     vcan: str, esc: PtyEsc, start_gateway: Callable[..., GatewayProcess], tmp_path: Path
 ) -> None:

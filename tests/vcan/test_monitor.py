@@ -2,16 +2,21 @@
 
 import json
 import subprocess
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import can
-from vcan_tools import LIMIT_S, Candump, GatewayProcess, bench, configuration, ip, wait_for
+from vcan_tools import (
+    LIMIT_S,
+    Candump,
+    GatewayProcess,
+    bench,
+    configuration,
+    ip,
+    program,
+    wait_for,
+)
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults
@@ -21,39 +26,10 @@ from kontronik_can_gw.runtime.bus_listener import BusListener
 
 Start = Callable[..., GatewayProcess]
 FAULTY = EscOptions(faults=Faults(errors=(ErrorWindow(OperatingError.BEC_OVERCURRENT, 0),)))
-COMMAND = [sys.executable, "-m", "kontronik_can_gw", "monitor"]
 
 
 def once(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [*COMMAND, "--once", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=2 * LIMIT_S, check=False)
-
-
-@contextmanager
-def lines_of(*words: object) -> Iterator[tuple[subprocess.Popen[str], list[str], list[str]]]:
-    """``monitor`` as its own process, and the lines of its standard output and standard error so far."""
-    pipe = subprocess.PIPE
-    with subprocess.Popen(
-        [*COMMAND, *map(str, words)], stdout=pipe, stderr=pipe, text=True
-    ) as process:
-
-        def read(stream: Any, lines: list[str]) -> None:
-            lines.extend(line.rstrip() for line in stream)
-
-        out: list[str] = []
-        err: list[str] = []
-        threads = [
-            threading.Thread(target=read, args=pair)
-            for pair in ((process.stdout, out), (process.stderr, err))
-        ]
-        for thread in threads:
-            thread.start()
-        try:
-            yield process, out, err
-        finally:
-            process.kill()
-            for thread in threads:
-                thread.join()
+    return program("monitor", "--once", *words)
 
 
 def sent_on(interface: str) -> int:
@@ -105,7 +81,9 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
         gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
         gateway.wait_for_line("esc1: /dev/pts")
         run.start()
-        with lines_of("--channel", vcan, "--interval", 0.25) as (process, out, err):
+        shown = GatewayProcess(None, "--channel", vcan, "--interval", 0.25, command="monitor")
+        out, err = shown.out, shown.lines
+        try:
 
             def is_shown() -> bool:
                 return bool(out) and "link ok" in out[-1] and "battery_voltage -" not in out[-1]
@@ -123,7 +101,7 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
                 ip("link", *act)
                 wait_for(lambda t=told, w=what: any(w in line for line in err[t:]), what)  # type: ignore[misc]
                 wait_for(lambda: "battery_voltage - V" in out[-1], "no old value")
-                assert process.poll() is None
+                assert shown.process.poll() is None
                 for words in undo:
                     ip("link", *words)
                 wait_for(is_shown, "values again")
@@ -131,10 +109,11 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
                     lambda t=told: any(line.endswith(f"{vcan}: frames come") for line in err[t:]),  # type: ignore[misc]
                     "the good news",
                 )
-            process.terminate()
-            assert process.wait(LIMIT_S) == 0
-            wait_for(lambda: err[-1].endswith(f"seen on {vcan}, none sent"), "the last line")
-            assert not any("Traceback" in line for line in err)
+            assert shown.end() == 0
+            assert err[-1].endswith(f"seen on {vcan}, none sent")
+            assert "Traceback" not in shown.log
+        finally:
+            shown.kill()
 
 
 def test_the_listener_takes_only_what_was_asked_for_and_sends_nothing(vcan: str) -> None:

@@ -2,7 +2,6 @@
 
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +12,8 @@ import cantools.database
 import pytest
 from vcan_tools import (
     LIMIT_S,
+    NEVER_STALE,
+    PROGRAM,
     Bench,
     Candump,
     GatewayProcess,
@@ -20,6 +21,7 @@ from vcan_tools import (
     canopen_table,
     configuration,
     ip,
+    program,
     wait_for,
 )
 
@@ -36,17 +38,10 @@ NOISY = EscOptions(
 )
 
 
-PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
-
-
-def program(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*PROGRAM, *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=2 * LIMIT_S,
-        check=False,
-    )
+def shipped_message(name: str) -> cantools.database.can.Message:
+    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
+    assert isinstance(database, cantools.database.can.Database)
+    return database.get_message_by_name(name)
 
 
 def frames_of(dump: Candump) -> list[tuple[int, bytes]]:
@@ -68,8 +63,15 @@ def is_part(some: Sequence[bytes], whole: Sequence[bytes]) -> bool:
 
 
 def recorded_run(
-    run: Bench, start: Start, toml: str, folder: Path, seconds: float
+    run: Bench,
+    start: Start,
+    folder: Path,
+    seconds: float,
+    vcan: str,
+    tables: str = "",
+    esc: str = NEVER_STALE,
 ) -> GatewayProcess:
+    toml = configuration(vcan, [port.path for port in run.ports], tables, esc)
     gateway = start(toml, "--record", str(folder))
     gateway.wait_for_line(f"esc{len(run.ports)}: /dev/pts")
     run.start()
@@ -92,9 +94,8 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
     try:
         with bench(NOISY, EscOptions()) as run:
             tables = canopen_table(tmp_path / "store", more="self_start = true")
-            toml = configuration(vcan, [port.path for port in run.ports], tables, esc="")
             with Candump(vcan) as live:
-                gateway = recorded_run(run, start_gateway, toml, folder, 5)
+                gateway = recorded_run(run, start_gateway, folder, 5, vcan, tables, esc="")
                 assert gateway.end() == 0
         on_bus = frames_of(live)
         assert len(on_bus) > 500
@@ -111,18 +112,8 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
         # on another bus, in real time times three; and the log itself likewise
         for source, marked in ((folder, False), (log, False), (folder, True)):
             with Candump(second_vcan) as replayed:
-                words = [] if marked else ["--unmarked"]
-                done = program(
-                    "replay",
-                    source,
-                    "--to",
-                    "can",
-                    "--channel",
-                    second_vcan,
-                    "--speed",
-                    "3",
-                    *words,
-                )
+                words = f"--to can --channel {second_vcan} --speed 3".split()
+                done = program("replay", source, *words, *([] if marked else ["--unmarked"]))
                 assert done.returncode == 0, done.stderr
                 assert f"{len(logged)} frames to {second_vcan}" in done.stderr
                 wait_for(lambda r=replayed: len(r.frames) >= len(logged), "all frames")  # type: ignore[misc]
@@ -131,18 +122,12 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
                 if source is log:
                     assert frames_of(replayed) == logged
                 continue
-            database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-            assert isinstance(database, cantools.database.can.Database)
-            state = database.get_message_by_name("GatewayStatus")
+            state = shipped_message("GatewayStatus")
             shown, were = by_id(frames_of(replayed)), by_id(logged)
             assert shown.keys() == were.keys()
             differing = {can_id for can_id in were if shown[can_id] != were[can_id]}
             # TPDO 4 has the link status, in which bit 6 says replay
-            assert differing == {
-                state.frame_id,
-                0x481,
-                0x482,
-            }
+            assert differing == {state.frame_id, 0x481, 0x482}
             states = [
                 str(state.decode_simple(data)["GatewayState"])
                 for can_id, data in frames_of(replayed)
@@ -157,9 +142,7 @@ def test_a_replay_keeps_away_from_a_bus_with_a_gateway(
     vcan: str, start_gateway: Start, tmp_path: Path
 ) -> None:
     with bench(EscOptions()) as run:
-        gateway = recorded_run(
-            run, start_gateway, configuration(vcan, [run.ports[0].path]), tmp_path / "c", 1.5
-        )
+        gateway = recorded_run(run, start_gateway, tmp_path / "c", 1.5, vcan)
         [file] = (tmp_path / "c").glob("*.kcap")
         done = program("replay", file, "--to", "can", "--channel", vcan)
         assert (done.returncode, done.stdout) == (1, "")
@@ -173,9 +156,7 @@ def test_what_a_killed_gateway_had_recorded_was_on_the_disk(
 ) -> None:
     folder = tmp_path / "captures"
     with bench(EscOptions()) as run:
-        gateway = recorded_run(
-            run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4
-        )
+        gateway = recorded_run(run, start_gateway, folder, 4, vcan)
         sure = time.monotonic_ns()
         wait_for(
             lambda: (found := bytes_of(folder)) and found[-1] > sure,
@@ -191,34 +172,6 @@ def test_what_a_killed_gateway_had_recorded_was_on_the_disk(
         assert [line for line in found.damage if "was not closed" in line]
 
 
-def test_a_full_disk_stops_recording_and_nothing_else(
-    vcan: str, start_gateway: Start, tmp_path: Path
-) -> None:
-    folder = tmp_path / "small"
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(folder)], check=True)
-    try:
-        with bench(EscOptions()) as run, Candump(vcan) as live:
-            toml = configuration(vcan, [run.ports[0].path], "[record]\nmin_free_mb = 0")
-            gateway = recorded_run(run, start_gateway, toml, folder, 2)
-            gateway.wait_for_line("captures: ")
-            assert "No space left on device. Trying again." in gateway.log
-            before = len(live.frames)
-            wait_for(lambda: len(live.frames) > before + 100, "the bus goes on")
-            subprocess.run(["mount", "-o", "remount,size=20m", str(folder)], check=True)
-            gateway.wait_for_line("is written")
-            before = len(live.frames)
-            wait_for(lambda: len(live.frames) > before + 100, "the bus goes on")
-            assert gateway.end() == 0
-        with open_input(folder) as found:
-            assert isinstance(found, CaptureInput)
-            kinds = [entry.kind for entry in found.entries()]
-        assert Kind.LOST in kinds
-        assert kinds[-1] == Kind.STOP
-    finally:
-        subprocess.run(["umount", str(folder)], check=False)
-
-
 def bytes_of(folder: Path) -> list[int]:
     """When the bytes of a capture came."""
     with open_input(folder) as found:
@@ -231,9 +184,7 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
 ) -> None:
     folder = tmp_path / "captures"
     with bench(EscOptions()) as run:
-        gateway = recorded_run(
-            run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4
-        )
+        gateway = recorded_run(run, start_gateway, folder, 4, vcan)
         assert gateway.end() == 0
         sent = {live.battery_voltage for live in run.live(0)}
     link = tmp_path / "played"
@@ -251,9 +202,7 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
         gateway.wait_for_line("telemetry ok")
         assert player.wait(LIMIT_S) == 0
         gateway.kill()
-    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-    assert isinstance(database, cantools.database.can.Database)
-    speed = database.get_message_by_name("EscSpeed")
+    speed = shipped_message("EscSpeed")
     values = [
         speed.decode_simple(frame.data)["BatteryVoltage"] for frame in live.of(speed.frame_id)
     ]

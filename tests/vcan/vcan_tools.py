@@ -7,8 +7,6 @@ to not happen is followed by something that has to.
 
 import itertools
 import re
-import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -23,13 +21,15 @@ from bus_watch import SECOND, BusWatch
 from encoding import Identity
 from feeder import CURRENT, SPEED
 from harness import LoggedProcess, PtyPort
-from signals import table_of_configuration
+from raw_bus import RawBus
+from signals import table_sent
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Sent, SimulatedEsc
 
+PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIMIT_S = 60.0
 NEVER_STALE = "telemetry_timeout_ms = 60000"
 """For an [[esc]]: a machine that stands still for a while makes no telemetry loss."""
@@ -54,36 +54,33 @@ def wait_for(condition: Callable[[], object], what: object) -> None:
 
 
 class GatewayProcess(LoggedProcess):
-    """``kontronik-can-gw run`` as its own process."""
+    """``kontronik-can-gw run``, or another of its commands, as its own process."""
 
-    def __init__(self, config: Path, *options: str) -> None:
-        super().__init__(
-            [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), *options]
-        )
+    def __init__(self, config: Path | None, *options: object, command: str = "run") -> None:
+        words = [*PROGRAM, command, *([] if config is None else ["-c", config]), *options]
+        super().__init__([str(word) for word in words], keep_out=command != "run")
 
     def wait_for_line(self, text: str) -> None:
         """Wait until a log line holds ``text``."""
 
         def seen() -> bool:
             if self.process.poll() is not None:
-                self._reader.join(LIMIT_S)
-                assert text in self.log, (
-                    f"the gateway ended with {self.process.returncode}:\n{self.log}"
-                )
+                code = self.wait()
+                assert text in self.log, f"the gateway ended with {code}:\n{self.log}"
             return text in self.log
 
         wait_for(seen, lambda: f"log line {text!r} in:\n{self.log}")
-
-    def wait(self) -> int:
-        """The exit code, when all that it logged has been read."""
-        code = self.process.wait(LIMIT_S)
-        self._reader.join(LIMIT_S)
-        return code
 
     def end(self, signal_number: int = 15) -> int:
         """Send a signal and wait for the exit code."""
         self.process.send_signal(signal_number)
         return self.wait()
+
+
+def program(*words: object) -> subprocess.CompletedProcess[str]:
+    """A command that ends by itself."""
+    command = [*PROGRAM, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=2 * LIMIT_S, check=False)
 
 
 class Recorded(NamedTuple):
@@ -103,23 +100,17 @@ _delivery_marks = itertools.count(1)
 
 
 def send_mark(interface: str, number: int, can_id: int = MARK) -> None:
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
-        bus.bind((interface,))
-        bus.send(struct.pack("=IB3x8s", can_id, 4, number.to_bytes(4, "little")))
+    with RawBus(interface) as bus:
+        bus.send(can_id, number.to_bytes(4, "little"))
 
 
 def wait_for_delivery(interface: str) -> None:
     """Wait until every socket on this interface has what was sent so far."""
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as witness:
-        witness.setsockopt(
-            socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", DELIVERY_MARK, 0x7FF)
-        )
-        witness.bind((interface,))
-        witness.settimeout(LIMIT_S)
+    with RawBus(interface, (DELIVERY_MARK, 0x7FF)) as witness:
         number = next(_delivery_marks)
         send_mark(interface, number, DELIVERY_MARK)
-        while int.from_bytes(witness.recv(16)[8:12], "little") != number:
-            pass
+        expected = DELIVERY_MARK, number.to_bytes(4, "little")
+        wait_for(lambda: witness.receive(1) == expected, "the mark")
 
 
 class Candump:
@@ -183,19 +174,6 @@ def configuration(
     return "\n".join(parts)
 
 
-@contextmanager
-def gateway_process(file: Path, toml: str, *options: str) -> Iterator[GatewayProcess]:
-    """A gateway that has opened everything, with this configuration text, killed at the end if it still runs."""
-    file.write_text(toml)
-    process = GatewayProcess(file, *options)
-    try:
-        process.wait_for_line(f"esc{toml.count('[[esc]]')}: /")
-        process.wait_for_line("CAN socketcan")
-        yield process
-    finally:
-        process.kill()
-
-
 # --- ESCs whose frames are sent one by one
 
 
@@ -231,9 +209,9 @@ class Chain:
         for fed in self.escs:
             fed.info_every = 10
         self.config = folder / "gateway.toml"
-        self.toml = configuration(interface, [port.path for port in self.ports], toml, esc)
-        self.config.write_text(self.toml)
-        table = table_of_configuration(self.config, "[canopen]" in toml, len(identities))
+        ports = [port.path for port in self.ports]
+        self.config.write_text(configuration(interface, ports, toml, esc))
+        table = table_sent(["-c", str(self.config)], "[canopen]" in toml, len(identities))
         self.watch = Witness(interface, table, self.escs, slack_ns=NO_LIMIT_NS, ignore_local=False)
         self.watch.recorded = []
         self.watch.start()
@@ -241,8 +219,14 @@ class Chain:
 
     @contextmanager
     def running(self, *options: str) -> Iterator[GatewayProcess]:
-        with gateway_process(self.config, self.toml, *options) as self.gateway:
+        """A gateway that has opened everything, killed at the end if it still runs."""
+        self.gateway = GatewayProcess(self.config, *options)
+        try:
+            self.gateway.wait_for_line(f"esc{len(self.ports)}: /")
+            self.gateway.wait_for_line("CAN socketcan")
             yield self.gateway
+        finally:
+            self.gateway.kill()
 
     @property
     def held_up(self) -> int:
@@ -283,9 +267,7 @@ class Chain:
         self.catch_up()
         self.watch.settle(lambda _begin, _end: 0)
         assert not self.watch.wrong, self.watch.wrong
-        assert [port.received() for port in self.ports] == [0] * len(self.ports), (
-            "something was sent to an ESC"
-        )
+        assert not any(port.received() for port in self.ports), "something was sent to an ESC"
 
     def close(self) -> None:
         self.watch.close()
@@ -310,7 +292,7 @@ def chain(
 
 
 class NotedEsc(SimulatedEsc):
-    """A simulated ESC that notes each frame before anybody can have it."""
+    """A simulated ESC that notes each frame before anybody can have it: a value that came from an ESC is in a list read after it came."""
 
     def __init__(self, options: EscOptions, seed: int, noted: list[Sent]) -> None:
         super().__init__(options, seed=seed)
@@ -323,28 +305,23 @@ class NotedEsc(SimulatedEsc):
 
 
 class Bench:
-    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent.
+    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent."""
 
-    A frame is in the record before it is written: a value that came from an ESC is in a record read after it came.
-    """
-
-    def __init__(self, escs: Sequence[EscOptions], seed: int = 1) -> None:
+    def __init__(self, escs: Sequence[EscOptions]) -> None:
         self.ports = [pty.PtyEsc() for _ in escs]
         self.sent: list[list[Sent]] = [[] for _ in escs]
         self._options = escs
-        self._seed = seed
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         self._stop.clear()
-        noted = [
-            NotedEsc(options, self._seed + i, sent)
-            for i, (options, sent) in enumerate(zip(self._options, self.sent, strict=True))
-        ]
-        pairs = list(zip(noted, self.ports, strict=True))
+        escs = [NotedEsc(each, 1 + i, self.sent[i]) for i, each in enumerate(self._options)]
         self._thread = threading.Thread(
-            target=lambda: pty.run(pairs, stop=self._stop.is_set), daemon=True
+            target=pty.run,
+            args=(list(zip(escs, self.ports, strict=True)),),
+            kwargs={"stop": self._stop.is_set},
+            daemon=True,
         )
         self._thread.start()
 
@@ -359,12 +336,6 @@ class Bench:
     def info(self, index: int) -> list[InfoData]:
         return [sent.data for sent in self.sent[index] if isinstance(sent.data, InfoData)]
 
-    def close(self) -> None:
-        self.stop()
-        for port in self.ports:
-            port.check()
-            port.close()
-
 
 @contextmanager
 def bench(*escs: EscOptions) -> Iterator[Bench]:
@@ -373,10 +344,11 @@ def bench(*escs: EscOptions) -> Iterator[Bench]:
     try:
         yield made
     finally:
-        made.close()
-    assert [port.received for port in made.ports] == [0] * len(escs), (
-        "something was transmitted to an ESC"
-    )
+        made.stop()
+        for port in made.ports:
+            port.check()
+            port.close()
+    assert not any(port.received for port in made.ports), "something was transmitted to an ESC"
 
 
 # --- CANopen

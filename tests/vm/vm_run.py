@@ -46,6 +46,7 @@ from typing import BinaryIO, NoReturn
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 PROJECT = os.path.dirname(os.path.dirname(HERE))
+BACKENDS = ("native", "uml", "qemu")
 TIMED_OUT = 124
 VM_FAILED = 125
 
@@ -87,28 +88,15 @@ def native_prefix() -> list[str] | None:
         socket.socket(29, socket.SOCK_RAW, 1).close()
     except OSError:
         return None
-    here: list[str] = []
     with_lo = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
     namespace = ["unshare", "--user", "--map-root-user", "--net", *with_lo]
-    as_root = [
-        "sudo",
-        "-n",
-        "unshare",
-        "--net",
-        "setpriv",
-        f"--reuid={os.getuid()}",
-        f"--regid={os.getgid()}",
-    ]
-    as_root += [
-        "--init-groups",
-        "--inh-caps=+net_admin,+net_raw",
-        "--ambient-caps=+net_admin,+net_raw",
-        "env",
-    ]
+    rights = "--inh-caps=+net_admin,+net_raw --ambient-caps=+net_admin,+net_raw"
+    ids = f"--reuid={os.getuid()} --regid={os.getgid()} --init-groups"
+    as_root = f"sudo -n unshare --net setpriv {ids} {rights} env".split()
     as_root += [f"{name}={value}" for name, value in passed_on(os.environ).items()] + with_lo
     interface = f"vm{os.getpid()}"
     probe = ["sh", "-c", f"ip link add dev {interface} type vcan && ip link del {interface}"]
-    for prefix in (here, namespace, as_root):
+    for prefix in ([], namespace, as_root):
         with contextlib.suppress(OSError):
             done = subprocess.run(
                 prefix + probe, check=False, stdin=subprocess.DEVNULL, capture_output=True
@@ -122,14 +110,12 @@ def native_prefix() -> list[str] | None:
 
 
 def uml_command(job: str, out: int, err: int) -> list[str]:
-    command = f"linux.uml mem={UML_MEMORY_MIB}M root=/dev/root rootfstype=hostfs rootflags=/ ro init={job}/guest-init.sh"
-    command += (
-        f" VM_JOB={job} VM_BACKEND=uml GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512} con=null ssl=null"
-    )
-    command += (
-        f" ssl0=null,fd:{out} ssl1=null,fd:{err} uml_dir={job} umid=uml noreboot quiet loglevel=3"
-    )
-    return command.split()
+    return f"""
+        linux.uml mem={UML_MEMORY_MIB}M root=/dev/root rootfstype=hostfs rootflags=/ ro
+        init={job}/guest-init.sh VM_JOB={job} VM_BACKEND=uml GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512}
+        con=null ssl=null ssl0=null,fd:{out} ssl1=null,fd:{err}
+        uml_dir={job} umid=uml noreboot quiet loglevel=3
+    """.split()
 
 
 def uml_guest_environment() -> dict[str, str]:
@@ -140,15 +126,11 @@ def uml_guest_environment() -> dict[str, str]:
     with contextlib.suppress(OSError, importlib.metadata.PackageNotFoundError, ValueError):
         with open("/proc/cpuinfo") as cpuinfo:
             has_avx512 = "avx512f" in cpuinfo.read()
-        major, minor = importlib.metadata.version("numpy").split(".")[:2]
-        if has_avx512 and (int(major), int(minor)) >= (
-            2,
-            4,
-        ):
-            # numpy warns of a name that it does not know
-            environment["NPY_DISABLE_CPU_FEATURES"] = "X86_V4 AVX512_ICL AVX512_SPR"
-        elif has_avx512:
-            names = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+        major, minor = map(int, importlib.metadata.version("numpy").split(".")[:2])
+        names = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+        if (major, minor) >= (2, 4):  # numpy warns of a name that it does not know
+            names = "X86_V4 AVX512_ICL AVX512_SPR"
+        if has_avx512:
             environment["NPY_DISABLE_CPU_FEATURES"] = names
     return environment
 
@@ -185,66 +167,44 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
     kernel = qemu_kernel()
     if kernel is None:
         raise OSError("no kernel unpacked: run tests/vm/setup.sh qemu")
-    append = "console=ttyS0 panic=-1 quiet loglevel=3 tsc=reliable no_timer_check mitigations=off nokaslr"
-    append += f" random.trust_cpu=on VM_BACKEND=qemu GUEST_INIT={job}/guest-init.sh"
-    command = [
-        "qemu-system-x86_64",
-        "-nodefaults",
-        "-no-user-config",
-        "-display",
-        "none",
-        "-no-reboot",
-    ]
-    command += [
-        "-machine",
-        "q35",
-        "-accel",
-        "tcg,thread=multi,tb-size=512",
-        "-cpu",
-        "max",
-        "-m",
-        str(QEMU_MEMORY_MIB),
-    ]
-    command += [
-        "-kernel",
-        kernel,
-        "-initrd",
-        os.path.join(os.path.dirname(kernel), "initrd.cpio"),
-        "-append",
-        append,
-    ]
-    command += ["-serial", f"file:{job}/klog", "-device", "virtio-serial-pci"]
+    append = f"""
+        console=ttyS0 panic=-1 quiet loglevel=3 tsc=reliable no_timer_check mitigations=off nokaslr
+        random.trust_cpu=on VM_BACKEND=qemu GUEST_INIT={job}/guest-init.sh
+    """
+    initrd = os.path.join(os.path.dirname(kernel), "initrd.cpio")
+    command = f"""
+        qemu-system-x86_64 -nodefaults -no-user-config -display none -no-reboot
+        -machine q35 -accel tcg,thread=multi,tb-size=512 -cpu max -m {QEMU_MEMORY_MIB}
+        -serial file:{job}/klog -device virtio-serial-pci
+        -object can-bus,id=canbus0
+        -device kvaser_pci,canbus=canbus0 -device kvaser_pci,canbus=canbus0
+    """.split()
+    command += ["-kernel", kernel, "-initrd", initrd, "-append", " ".join(append.split())]
 
     def port(name: str, chardev: str) -> list[str]:
-        return [
-            "-chardev",
-            f"{chardev},id={name}",
-            "-device",
-            f"virtserialport,chardev={name},name={name}",
-        ]
+        device = f"virtserialport,chardev={name},name={name}"
+        return ["-chardev", f"{chardev},id={name}", "-device", device]
 
     for name, fd in (("stdout", out), ("stderr", err)):
-        command += [
-            "-add-fd",
-            f"fd={fd},set={fd}",
-            *port(name, f"file,path=/dev/fdset/{fd},append=on"),
-        ]
-    for tag, path, options in (("root", "/", ",readonly=on,multidevs=remap"), ("host", "/", ",multidevs=remap"),
-                               ("job", job, "")):  # fmt: skip
+        command += ["-add-fd", f"fd={fd},set={fd}"]
+        command += port(name, f"file,path=/dev/fdset/{fd},append=on")
+    for tag, path, options in (
+        ("root", "/", ",readonly=on,multidevs=remap"),
+        ("host", "/", ",multidevs=remap"),
+        ("job", job, ""),
+    ):
         command += ["-fsdev", f"local,id={tag},path={path},security_model=none{options}"]
         command += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
 
-    command += ["-object", "can-bus,id=canbus0"]
-    command += ["-device", "kvaser_pci,canbus=canbus0", "-device", "kvaser_pci,canbus=canbus0"]
-
     # One end is the device that the guest's driver sees, the other a virtio port that a test plays the device with.
+    usb = "usb-serial,id=usbser0,serial=ESC0002,bus=xhci.0,port=1,chardev=ftdis,always-plugged=on"
     for name, device in (
-        ("com1", ["-device", "isa-serial,chardev=com1s,index=1"]),
-        ("ftdi", ["-device", "qemu-xhci,id=xhci",
-                  "-device", "usb-serial,id=usbser0,serial=ESC0002,bus=xhci.0,port=1,chardev=ftdis,always-plugged=on"]),
-        ("qmp", ["-mon", "chardev=qmps,mode=control"]),
-    ):  # fmt: skip
-        command += ["-chardev", f"socket,id={name}s,path={job}/{name},server=on,wait=off", *device]
+        ("com1", "-device isa-serial,chardev=com1s,index=1"),
+        ("ftdi", f"-device qemu-xhci,id=xhci -device {usb}"),
+        ("qmp", "-mon chardev=qmps,mode=control"),
+    ):
+        far_end = f"socket,id={name}s,path={job}/{name},server=on,wait=off"
+        command += ["-chardev", far_end, *device.split()]
         command += port(name, f"socket,path={job}/{name}")
     return command
 
@@ -341,6 +301,54 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
     sys.exit(128 + number)
 
 
+def start_vm(
+    backend: str, job: str, out: int, err: int, log: BinaryIO
+) -> "subprocess.Popen[bytes]":
+    if backend == "uml":
+        command, environment = uml_command(job, out, err), uml_host_environment(job)
+    else:
+        command, environment = qemu_command(job, out, err), {"TMPDIR": job}
+    environment |= {"PATH": with_sbin(os.environ.get("PATH", ""))}
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=log,
+        pass_fds=(out, err),
+        start_new_session=True,
+        env={**os.environ, **environment},
+    )
+
+
+def wait_for_end(
+    process: "subprocess.Popen[bytes]", backend: str, job: str, timeout_s: float
+) -> str:
+    """Why it is not waited for any longer; nothing if it has ended."""
+    start, started = time.monotonic(), False
+    while True:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(max(0.0, start + timeout_s - time.monotonic()) if started else 0.1)
+            return ""
+        started = started or is_started(job)
+        elapsed_s = time.monotonic() - start
+        if elapsed_s >= timeout_s:
+            return f"no end within {timeout_s:g} s"
+        if not started and elapsed_s >= START_TIMEOUT_S[backend]:
+            return f"no start within {elapsed_s:.0f} s"
+
+
+def is_started(job: str) -> bool:
+    return os.path.exists(os.path.join(job, "started"))
+
+
+def read(job: str, name: str) -> str:
+    try:
+        with open(os.path.join(job, name), errors="replace") as file:
+            return file.read()
+    except OSError:
+        return ""
+
+
 def run_in_vm(
     backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
 ) -> tuple[int, bool]:
@@ -348,75 +356,37 @@ def run_in_vm(
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
     try:
         write_job(job, backend, command, writable)
-        (out_read, out_write), (err_read, err_write) = os.pipe(), os.pipe()
-        pumps = [
-            threading.Thread(target=pump, args=(out_read, sys.stdout.buffer), daemon=True),
-            threading.Thread(target=pump, args=(err_read, sys.stderr.buffer), daemon=True),
-        ]
-        start = time.monotonic()
-        late = ""
-        with contextlib.ExitStack() as ends:
-            for fd in (out_write, err_write):
-                ends.callback(os.close, fd)
-            vm_command = (uml_command if backend == "uml" else qemu_command)(
-                job, out_write, err_write
-            )
-            log = ends.enter_context(open(os.path.join(job, "log"), "wb"))
-            process = subprocess.Popen(
-                vm_command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                pass_fds=(out_write, err_write),
-                start_new_session=True,
-                env={
-                    **os.environ,
-                    **(uml_host_environment(job) if backend == "uml" else {"TMPDIR": job}),
-                    "PATH": with_sbin(os.environ.get("PATH", "")),
-                },
-            )
+        pipes = [os.pipe() for _ in range(2)]
+        try:
+            with open(os.path.join(job, "log"), "wb") as log:
+                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log)
+        finally:
+            for _, end in pipes:
+                os.close(end)
         guard_fd = guard(process.pid, job)
+        pumps = [
+            threading.Thread(target=pump, args=(end, to.buffer), daemon=True)
+            for (end, _), to in zip(pipes, (sys.stdout, sys.stderr), strict=True)
+        ]
         try:
             for thread in pumps:
                 thread.start()
-            started = False
-            while True:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(max(0.0, start + timeout_s - time.monotonic()) if started else 0.1)
-                    break
-                started = started or os.path.exists(os.path.join(job, "started"))
-                elapsed_s = time.monotonic() - start
-                if elapsed_s >= timeout_s:
-                    late = f"no end within {timeout_s:g} s"
-                elif not started and elapsed_s >= START_TIMEOUT_S[backend]:
-                    late = f"no start within {elapsed_s:.0f} s"
-                if late:
-                    break
+            late = wait_for_end(process, backend, job, timeout_s)
         finally:
             stop(process)
             os.write(guard_fd, b".")
             os.close(guard_fd)
         for thread in pumps:
             thread.join(60)
-        started = os.path.exists(os.path.join(job, "started"))
-        if late:
-            print(f"vm/run: {backend}: {late}", file=sys.stderr)
-            return (TIMED_OUT if started else VM_FAILED), started
-        try:
-            with open(os.path.join(job, "rc")) as file:
-                return int(file.read()), True
-        except (OSError, ValueError):
-            print(
-                f"vm/run: {backend}: the VM ended without a result; its last words:",
-                file=sys.stderr,
-            )
-            for name in ("log", "klog"):
-                with (
-                    contextlib.suppress(OSError),
-                    open(os.path.join(job, name), errors="replace") as file,
-                ):
-                    sys.stderr.write(file.read()[-4000:])
-            return VM_FAILED, started
+        code, started = read(job, "rc").strip(), is_started(job)
+        if code and not late:
+            return int(code), True
+        print(f"vm/run: {backend}: {late or 'the VM ended without a result'}", file=sys.stderr)
+        if late and started:
+            return TIMED_OUT, True
+        if not late:
+            print(*(read(job, name)[-4000:] for name in ("log", "klog")), file=sys.stderr)
+        return VM_FAILED, started
     except OSError as error:
         print(f"vm/run: {backend}: {error}", file=sys.stderr)
         return VM_FAILED, False
@@ -440,10 +410,8 @@ def installed() -> list[str]:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(usage=__doc__, add_help=True)
-    kinds = ("auto", "native", "uml", "qemu")
-    parser.add_argument(
-        "--backend", choices=kinds, default=os.environ.get("KCG_VM_BACKEND") or "auto"
-    )
+    kinds, default = ("auto", *BACKENDS), os.environ.get("KCG_VM_BACKEND") or "auto"
+    parser.add_argument("--backend", choices=kinds, default=default)
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")

@@ -10,7 +10,6 @@ import json
 import os
 import select
 import signal
-import socket
 import statistics
 import subprocess
 import sys
@@ -18,9 +17,9 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from registry import HERE, Context
 
@@ -39,13 +38,12 @@ class Measured:
     cpu_share: float
     sent: int
     lost: int
-    result: dict[str, Any] = field(default_factory=dict)
+    result: dict[str, Any]
 
     @property
     def delay(self) -> dict[str, float]:
         """count, p50, p90, p99, p999, max in microseconds."""
-        found: dict[str, float] = self.result["delay_us"]
-        return found
+        return cast(dict[str, float], self.result["delay_us"])
 
     @property
     def lost_share(self) -> float:
@@ -94,27 +92,14 @@ class Feeder:
         self, context: Context, escs: int, *options: str, seconds: float | None = None
     ) -> None:
         self.bus = (
-            f"can:{context.vcan}"
-            if context.vcan
-            else f"unix:kontronik-bench-{uuid.uuid4().hex[:12]}"
+            f"can:{context.vcan}" if context.vcan else f"unix:kontronik-{uuid.uuid4().hex[:12]}"
         )
         program = context.compiled("feeder.c", "-pthread")
         length = context.seconds if seconds is None else seconds
         warmup = 0.5 if context.quick else 2.0
         self._limit_s = length + warmup + 30
-        words = [
-            "--bus",
-            self.bus,
-            "--escs",
-            escs,
-            "--seconds",
-            length,
-            "--warmup",
-            warmup,
-            "--priority",
-            _PRIORITY,
-        ]
-        command = [str(program), *map(str, words), *options]
+        words = f"--bus {self.bus} --escs {escs} --seconds {length} --warmup {warmup}"
+        command = [str(program), *words.split(), "--priority", str(_PRIORITY), *options]
         self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._heard = ""
         self.ports: list[str] = self._line()["ports"]
@@ -137,8 +122,7 @@ class Feeder:
             if not self._hear(gateway):
                 raise RuntimeError(f"the feeder ended: exit code {self.process.wait()}")
         line, _, self._heard = self._heard.partition("\n")
-        found: dict[str, Any] = json.loads(line)
-        return found
+        return cast(dict[str, Any], json.loads(line))
 
     def measure(self, gateway: "Gateway") -> Measured:
         """Wait for the run to be over. RuntimeError if the gateway ended meanwhile."""
@@ -179,29 +163,14 @@ class Gateway:
         channel = context.vcan or "lo"
         if program == "c":
             command = [str(context.compiled("gateway.c")), feeder.bus, *feeder.ports]
-        elif program == "obvious":
-            command = [
-                sys.executable,
-                str(STANDIN),
-                feeder.bus,
-                "obvious",
-                str(FIVE),
-                channel,
-                *feeder.ports,
-            ]
         else:
-            (folder / "gateway.toml").write_text(
-                config_text(feeder.ports, channel, dbc, folder, config)
-            )
-            command = [
-                sys.executable,
-                str(STANDIN),
-                feeder.bus,
-                "ours",
-                "run",
-                "-c",
-                str(folder / "gateway.toml"),
-            ]
+            command = [sys.executable, str(STANDIN), feeder.bus, program]
+            if program == "obvious":
+                command += [str(FIVE), channel, *feeder.ports]
+            else:
+                text = config_text(feeder.ports, channel, dbc, folder, config)
+                (folder / "gateway.toml").write_text(text)
+                command += ["run", "-c", str(folder / "gateway.toml")]
         self._errors = (folder / "errors").open("w+")
         same = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""}
         nothing = subprocess.DEVNULL
@@ -280,9 +249,3 @@ def once(context: Context, program: str, escs: int, *options: str, **further: An
 def median(values: Sequence[float]) -> float:
     """Of a few rounds."""
     return float(statistics.median(values))
-
-
-def free_port() -> int:
-    """A TCP port that nobody has at the moment."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])

@@ -6,9 +6,9 @@ import subprocess
 import sys
 from collections.abc import Iterator
 
-from bench_programs import Measured, end, median, once, start
-from live_cpu import CANOPEN, compare, losses
-from registry import Benchmark, Context, Figure, LeftOut, judged
+from live import CANOPEN, compare, losses
+from programs import Measured, end, median, once, start
+from registry import Context, Figure, LeftOut, benchmark, judged
 
 _PRIORITY = 60
 RIGHT_LINE = "sudo prlimit --rtprio=99 --pid $$"
@@ -19,6 +19,7 @@ def of_runs(runs: list[Measured], key: str) -> float:
     return median([run.delay[key] for run in runs])
 
 
+@benchmark("delay", "from the last byte to the fifth CAN frame: C, ours, the obvious program")
 def delay(context: Context) -> list[Figure]:
     """One ESC, the three programs by turns."""
     found = compare(context, 1)
@@ -42,6 +43,7 @@ file = "status.json"
 """Recorder, status file, nodes."""
 
 
+@benchmark("delay-full", "the same with 8 ESCs, recorder, statistics, CANopen and a polling master")
 def full(context: Context) -> list[Figure]:
     """8 ESCs with recorder, status file, CANopen nodes and a master that polls them."""
     runs = [once(context, "ours", 8, "--sdo", config=EVERYTHING) for _ in range(context.rounds)]
@@ -89,6 +91,7 @@ def may_have_priority(priority: int) -> bool:
     )
 
 
+@benchmark("delay-realtime", "the same with real-time priority while other programs load all cores")
 def realtime(context: Context) -> list[Figure]:
     """With and without real-time priority while other programs load all cores."""
     if not may_have_priority(_PRIORITY):
@@ -111,20 +114,3 @@ def realtime(context: Context) -> list[Figure]:
             "loaded, real-time priority, 99 %", of_runs(preferred, "p99"), "us", "<= 500", longest
         ),
     ]
-
-
-BENCHMARKS = [
-    Benchmark(
-        "delay", "from the last byte to the fifth CAN frame: C, ours, the obvious program", delay
-    ),
-    Benchmark(
-        "delay-full",
-        "the same with 8 ESCs, recorder, statistics, CANopen and a polling master",
-        full,
-    ),
-    Benchmark(
-        "delay-realtime",
-        "the same with real-time priority while other programs load all cores",
-        realtime,
-    ),
-]
