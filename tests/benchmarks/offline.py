@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -111,13 +112,7 @@ def best(context: Context, form: str, source: Path, *options: object) -> Run:
 
 def convert_here(arguments: list[str]) -> Run:
     """In this process. The libraries are loaded before the clock starts."""
-    from kontronik_can_gw.desk.recordings.convert import (
-        TABLES,
-        Conversion,
-        LogConversion,
-        Output,
-        TableConversion,
-    )
+    from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
     from kontronik_can_gw.desk.recordings.inputs import DumpInput
     from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
     from kontronik_can_gw.desk.recordings.tables.rows import Choice
@@ -135,13 +130,14 @@ def convert_here(arguments: list[str]) -> Run:
         pyarrow.array([0])  # imports pandas where it is installed
     layout = None if args.dbc is None else layout_of_dbc(args.dbc)
     with DumpInput(Path(args.source), layout) as recording:
-        conversion: Conversion = LogConversion(args.form)
+        convert_all = partial(to_log, form=args.form)
         if args.form in TABLES:
             names = LiveData._fields if args.live else ()
-            conversion = TableConversion(args.form, Choice.of(recording.fields, names))
+            choice = Choice.of(recording.fields, names)
+            convert_all = partial(to_table, form=args.form, choice=choice)
         cpu, wall = time.process_time(), time.perf_counter()
         with Output(Path(args.target), args.form) as out:
-            told = conversion(recording, out, lambda position: None)
+            told = convert_all(recording, out, lambda position: None)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     return Run(cpu, wall, int(peak[1]) / 1024 if peak else 0.0, f"{told}")
