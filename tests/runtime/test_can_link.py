@@ -83,7 +83,7 @@ class Bench:
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
         self.can = CanLink(
-            loaded.config.can, self.gateway, World(), FaultLog(), clock=lambda: self.clock
+            *(loaded.config.can, self.gateway, World().poller, FaultLog()), clock=lambda: self.clock
         )
 
     @property
@@ -291,7 +291,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> 
     side = CanLink(
         loaded.config.can,
         gateway,
-        World(),
+        World().poller,
         FaultLog(),
         lambda path: "left" if "USB1" in path else None,
     )

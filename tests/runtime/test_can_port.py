@@ -27,9 +27,8 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
-from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
-from kontronik_can_gw.runtime.driver_port import DriverPort
+from kontronik_can_gw.runtime.driver_port import QUEUE_LENGTH, DriverPort
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
@@ -417,11 +416,9 @@ def test_one_thread_brings_the_wanted_frames_in_order() -> None:
 def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> None:
     with virtual() as (port, other):
         port.set_receive_ids({1})
-        reader = port._reader
-        assert reader is not None
         for n in range(QUEUE_LENGTH + 20):
             other.send(message(1, n.to_bytes(2, "little")))
-        wait_for(lambda: reader.dropped == 20, "20 dropped frames")
+        wait_for(lambda: port._dropped == 20, "20 dropped frames")
         frames: list[CanFrame] = []
         while len(frames) < QUEUE_LENGTH:
             assert readable(port), "what is left keeps the descriptor readable"
@@ -438,11 +435,9 @@ def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> N
 def test_what_waits_can_be_thrown_away() -> None:
     with virtual() as (port, other):
         port.set_receive_ids({1})
-        reader = port._reader
-        assert reader is not None
         for _ in range(200):
             other.send(message(1, b"old"))
-        wait_for(lambda: len(reader._frames) == 200, "200 frames")
+        wait_for(lambda: len(port._frames) == 200, "200 frames")
         port.discard()
         other.send(message(1, b"new"))
         assert receive(port, 1) == [CanFrame(1, b"new")]
@@ -530,7 +525,7 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
     held = threading.Event()
     with virtual() as (port, other):
         other.send(message(1))
-        monkeypatch.setattr("kontronik_can_gw.runtime.bus_reader._MAX_END_S", 0.01)
+        monkeypatch.setattr("kontronik_can_gw.runtime.driver_port._MAX_END_S", 0.01)
         waiting = threading.Event()
 
         def holding(timeout: float | None) -> can.Message:

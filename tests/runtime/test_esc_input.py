@@ -6,10 +6,12 @@ import logging
 import os
 import termios
 from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
+from wire_world import Wire, World, loop_in, run
 
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
@@ -43,8 +45,6 @@ class Port:
         self.reads: list[bytes | Exception] = []
         self.counts: dict[str, int] = {"parity": 5}
         self.waits_to_be_read = False
-        self.looks = 0
-        self.hold = True
         self.drained = True
         self.pipe = PtyEsc()
 
@@ -64,8 +64,7 @@ class Port:
         return dict(self.counts)
 
     def settings_hold(self) -> bool:
-        self.looks += 1
-        return self.hold
+        return True
 
     def discard(self) -> None:
         pass
@@ -325,21 +324,26 @@ def test_settings_that_another_program_changes_are_set_again() -> None:
 
 
 def test_settings_are_looked_at_twice_a_second(
-    bench: Bench, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """While another program has echo on, an ESC hears what it sends."""
-    looks = []
-    for now in range(0, 3 * SECOND, 100 * MS):
-        bench.port().hold = now != 1500 * MS
-        before = bench.port().looks
-        if now >= bench.escs[0].report_due:
-            bench.escs[0].report(now)
-        if bench.port().looks > before:
-            looks.append(now // MS)
-    assert looks == [0, 500, 1000, 1500, 2000, 2500]
-    assert (
-        sum("changed the settings of /dev/ttyUSB0" in message for message in caplog.messages) == 1
-    )
+    world, looks = World(), list[int]()
+    loop = loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    begin = world.now
+
+    def settings_hold(_wire: Wire) -> bool:
+        looks.append(world.now)
+        return len(looks) != 3
+
+    monkeypatch.setattr(Wire, "settings_hold", settings_hold)
+    world.wires[0].stream(begin, begin + 3 * SECOND, 20 * MS)
+    run(loop, world, begin + 3 * SECOND)
+    loop.close()
+    assert all(late - early <= 530 * MS for early, late in pairwise([begin, *looks, world.now]))
+    assert len(looks) == 7, "and no more often"
+    assert sum("changed the settings of /fake/0" in message for message in caplog.messages) == 1
 
 
 def test_echo_is_off_before_anything_else_is_done_to_a_port(
