@@ -405,3 +405,15 @@ def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) ->
     bench.gateway.receive_frame(CanFrame(0x601, watch_node_5), bench.now, bench.now)
     bench.turn(1)
     assert {0x601, 0x705} <= bench.port.ids
+
+
+def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> None:
+    bench.start()
+    bench.turn(100)
+    before = bench.port
+    before.gone = True
+    bench.can.serve(bench.now)
+    assert not bench.can.is_open
+    bench.turn(600)
+    assert bench.port is not before
+    assert told(bench.take()) == ["boot-up"]

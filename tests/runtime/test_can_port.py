@@ -18,18 +18,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
 from kontronik_can_gw.runtime.driver_port import QUEUE_LENGTH, DriverPort
-from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
@@ -179,14 +174,6 @@ def test_only_data_frames_with_the_wanted_ids_are_handed_on(
     ]
     assert port.receive() == []
     assert port.state is CanState.BUS_OFF
-
-
-def test_a_call_takes_a_bounded_number_of_frames(socket_port: tuple[CanPort, FakeSocket]) -> None:
-    port, fake = socket_port
-    port.set_receive_ids({1})
-    fake.inbox = [packet(1, bytes((n,))) for n in range(200)]
-    sizes = [len(port.receive()) for _ in range(5)]
-    assert sizes == [RECEIVE_LIMIT] * 3 + [200 - 3 * RECEIVE_LIMIT, 0]
 
 
 def test_a_port_is_drained_when_nothing_waits_however_few_frames_were_passed_on(
@@ -432,17 +419,6 @@ def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> N
         assert port.overruns == 1
 
 
-def test_what_waits_can_be_thrown_away() -> None:
-    with virtual() as (port, other):
-        port.set_receive_ids({1})
-        for _ in range(200):
-            other.send(message(1, b"old"))
-        wait_for(lambda: len(port._frames) == 200, "200 frames")
-        port.discard()
-        other.send(message(1, b"new"))
-        assert receive(port, 1) == [CanFrame(1, b"new")]
-
-
 def test_own_frames_do_not_come_back_even_where_the_driver_is_told_to_return_them() -> None:
     channel = f"own-{os.getpid()}"
     config = CanConfig("virtual", channel, options={"receive_own_messages": True})
@@ -546,55 +522,3 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
             with pytest.raises(BlockingIOError):
                 os.eventfd_read(fd)
             os.close(fd)
-
-
-# --- the loop
-
-
-def test_the_loop_answers_what_the_thread_brings_and_opens_an_adapter_anew_when_its_reader_failed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    channel = f"loop-{os.getpid()}"
-    with can.Bus(interface="virtual", channel=channel) as other, PtyEsc() as esc:
-        tables = {
-            "can": {"interface": "virtual", "channel": channel},
-            "canopen": {"enabled": True, "store": "/nowhere"},
-            "esc": [{"port": esc.path}],
-        }
-        loaded = assemble(parse(tables, "test"))
-        gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
-        loop = Loop(gateway, [esc.path], loaded.config.can)
-
-        def frame_of(can_id: int) -> bytes:
-            while True:
-                frame = other.recv(120)
-                assert frame is not None
-                if frame.arbitration_id == can_id:
-                    return bytes(frame.data)
-
-        def answer_to(index: int) -> bytes:
-            other.send(message(0x601, bytes((0x40, index & 255, index >> 8, 0, 0, 0, 0, 0))))
-            return frame_of(0x581)
-
-        loop.open()
-        first = loop.can.port
-        assert isinstance(first, DriverPort)
-        thread = threading.Thread(target=loop.run)
-        thread.start()
-        try:
-            assert frame_of(0x701) == b"\0"  # boot-up: from now on the node answers
-            for index in range(0x9900, 0x9914):
-                assert answer_to(index)[1:3] == index.to_bytes(2, "little")
-
-            def failing(timeout: float | None) -> None:
-                raise can.CanOperationError("unplugged")
-
-            old = readers()
-            monkeypatch.setattr(first._bus, "recv", failing)
-            wait_for(lambda: bool(set(readers()) - set(old)), "another reader")
-            assert answer_to(0x1000)[0] == 0x43
-        finally:
-            loop.stop()
-            thread.join(120)
-        assert not thread.is_alive()
-    assert readers() == []
