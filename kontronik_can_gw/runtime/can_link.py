@@ -15,6 +15,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_controller import CanController
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
@@ -212,7 +213,7 @@ class CanLink:
         if self.port is None:
             return
         if events & select.POLLOUT:
-            self.transmitter.retry_now()
+            self.transmitter.due = NEVER
             self._watch(select.POLLIN)
         if events & select.POLLIN:
             since = self._poller.before if self._drained else 0

@@ -227,7 +227,7 @@ class Loop:
 
     def _reopen(self, now: int) -> int:
         """Open what is due. Returns the time: it may have taken long on a slow machine."""
-        for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
+        for esc in tuple(self._lost):
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
         if now >= self.can.controller.due:
