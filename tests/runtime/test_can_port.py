@@ -29,6 +29,7 @@ from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
 
+SOL = socket.SOL_SOCKET
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 _numbers = itertools.count()
 
@@ -92,9 +93,13 @@ def frames_of(port: CanPort) -> list[CanFrame]:
 
 
 @pytest.fixture
-def socket_port() -> tuple[CanPort, FakeSocket]:
-    fake = FakeSocket()
-    return SocketCanPort(fake, lambda: None), fake  # type: ignore[arg-type]
+def fake() -> FakeSocket:
+    return FakeSocket()
+
+
+@pytest.fixture
+def port(fake: FakeSocket) -> CanPort:
+    return SocketCanPort(fake, lambda: None)  # type: ignore[arg-type]
 
 
 def packet(can_id: int, data: bytes = b"") -> bytes:
@@ -108,9 +113,8 @@ def filters_of(fake: FakeSocket) -> list[tuple[int, int]]:
 
 
 def test_a_filter_names_each_id_and_shuts_out_its_29_bit_and_remote_twins(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({0x601, 0x000, 0x80})
     assert filters_of(fake) == [(can_id, 0xC00007FF) for can_id in (0x000, 0x80, 0x601)]
     port.set_receive_ids(frozenset())
@@ -146,15 +150,14 @@ def test_any_set_of_ids_fits_into_the_kernels_filters(
 
 
 @pytest.mark.parametrize("wrong", [-1, 0x800, EXTENDED - 1, EXTENDED | 0x2000_0000, 1 << 32])
-def test_what_is_no_id_is_refused(socket_port: tuple[CanPort, FakeSocket], wrong: int) -> None:
+def test_what_is_no_id_is_refused(port: CanPort, wrong: int) -> None:
     with pytest.raises(ValueError, match="no identifiers"):
-        socket_port[0].set_receive_ids([0x601, wrong])
+        port.set_receive_ids([0x601, wrong])
 
 
 def test_only_data_frames_with_the_wanted_ids_are_handed_on(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({0x601, 0, 0x602 | EXTENDED})
     fake.inbox = [
         packet(0x601, b"abc"),
@@ -177,19 +180,15 @@ def test_only_data_frames_with_the_wanted_ids_are_handed_on(
 
 
 def test_a_port_is_drained_when_nothing_waits_however_few_frames_were_passed_on(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox = [packet(1), packet(ERROR | 0x04, b"\0\x10")] * RECEIVE_LIMIT
-    found = []
-    for _ in range(3):
-        found.append((len(port.receive()), port.drained))
+    found = [(len(port.receive()), port.drained) for _ in range(3)]
     assert found == [(RECEIVE_LIMIT // 2, False), (RECEIVE_LIMIT // 2, False), (0, True)]
 
 
-def test_each_way_into_bus_off_is_counted_once(socket_port: tuple[CanPort, FakeSocket]) -> None:
-    port, fake = socket_port
+def test_each_way_into_bus_off_is_counted_once(port: CanPort, fake: FakeSocket) -> None:
     off, restarted = packet(ERROR | 0x40, bytes(8)), packet(ERROR | 0x100, bytes(8))
     fake.inbox = [off, off, restarted, off, packet(ERROR | 0x04, b"\0\x10"), off]
     port.receive()
@@ -197,9 +196,8 @@ def test_each_way_into_bus_off_is_counted_once(socket_port: tuple[CanPort, FakeS
 
 
 def test_lost_frames_are_noticed_in_the_controller_and_in_the_socket(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox = [packet(ERROR | 0x04, b"\0\x01" + bytes(6))]
     port.receive()
@@ -219,10 +217,7 @@ def test_lost_frames_are_noticed_in_the_controller_and_in_the_socket(
 
 
 @pytest.mark.parametrize("number", [errno.ENETDOWN, errno.ENODEV, errno.EIO])
-def test_an_error_does_not_end_reception(
-    socket_port: tuple[CanPort, FakeSocket], number: int
-) -> None:
-    port, fake = socket_port
+def test_an_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number: int) -> None:
     port.set_receive_ids({1})
     fake.inbox = [packet(1, b"a"), number, packet(1, b"b")]
     assert frames_of(port) == [CanFrame(1, b"a")]
@@ -233,17 +228,15 @@ def test_an_error_does_not_end_reception(
 
 
 def test_an_interface_that_goes_while_filters_are_set_is_gone(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     fake.fault = errno.ENODEV
     port.set_receive_ids({1})
     assert port.gone
     assert port.send(CanFrame(2, b"")) is Sent.GONE
 
 
-def test_a_remote_frame_is_sent_as_one(socket_port: tuple[CanPort, FakeSocket]) -> None:
-    port, fake = socket_port
+def test_a_remote_frame_is_sent_as_one(port: CanPort, fake: FakeSocket) -> None:
     port.send(CanFrame(0x701, b"", remote=True))
     assert fake.sent == [packet(0x701 | REMOTE)]
 
@@ -251,22 +244,17 @@ def test_a_remote_frame_is_sent_as_one(socket_port: tuple[CanPort, FakeSocket]) 
 @pytest.mark.parametrize(
     ("ancillary", "came"),
     [
-        ([(socket.SOL_SOCKET, 64, struct.pack("=qq", 1_700_000_000, 250_000_000))], 41_750 * MS),
-        ([(socket.SOL_SOCKET, 35, struct.pack("=ii", 1_700_000_000, 250_000_000))], 41_750 * MS),
-        (
-            [
-                (socket.SOL_SOCKET, 40, bytes(4)),
-                (socket.SOL_SOCKET, 35, struct.pack("=qq", 1_700_000_000, 0)),
-            ],
-            41_500 * MS,
-        ),
-        ([(socket.SOL_SOCKET, 64, bytes(3))], None),
+        ([(SOL, 64, struct.pack("=qq", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        ([(SOL, 35, struct.pack("=ii", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        ([(SOL, 40, bytes(4)), (SOL, 35, struct.pack("=qq", 1_700_000_000, 0))], 41_500 * MS),
+        ([(SOL, 64, bytes(3))], None),
         ([(socket.IPPROTO_TCP, 64, bytes(16))], None),
         ([], None),
     ],
 )
 def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort,
+    fake: FakeSocket,
     monkeypatch: pytest.MonkeyPatch,
     ancillary: list[tuple[int, int, bytes]],
     came: int | None,
@@ -275,7 +263,6 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
         time_ns=lambda: 1_700_000_000_500_000_000, monotonic_ns=lambda: 42 * SECOND
     )
     monkeypatch.setattr(socketcan_port, "time", clock)
-    port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox, fake.ancillary = [packet(1)], ancillary
     assert fake.options[64] == 1, "the kernel is asked for them"
@@ -288,10 +275,9 @@ FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
 @pytest.mark.parametrize("proven", [True, False])
 @pytest.mark.parametrize("stopped_before", range(7))
 def test_what_became_late_in_the_middle_of_a_turn_stays(
-    socket_port: tuple[CanPort, FakeSocket], proven: bool, stopped_before: int
+    port: CanPort, fake: FakeSocket, proven: bool, stopped_before: int
 ) -> None:
     """The process is stopped in front of one of the frames: those before have gone, and nothing after."""
-    port, fake = socket_port
     if proven:
         assert port.send(CanFrame(0x7FF, b"")) is Sent.OK
         fake.sent.clear()
@@ -303,9 +289,8 @@ def test_what_became_late_in_the_middle_of_a_turn_stays(
 
 @pytest.mark.parametrize("full", range(6))
 def test_a_queue_that_is_full_is_not_taken_for_lateness(
-    socket_port: tuple[CanPort, FakeSocket], full: int
+    port: CanPort, fake: FakeSocket, full: int
 ) -> None:
-    port, fake = socket_port
     fake.full = full
     assert port.send_all(FRAMES, lambda: 0, 1000) == (full, Sent.BUSY)
     assert len(fake.sent) == full

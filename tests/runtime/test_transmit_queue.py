@@ -38,20 +38,6 @@ def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
     assert [frame.queued for frame in sent] == [True, False] * 6
 
 
-def test_a_refused_frame_stays_first_in_its_line() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
-    queue.put(queued(0))
-    queue.put(slot(0x181, 1))
-    for _ in range(3):
-        assert send(queue, sent, 0) == 0
-    queue.put(queued(1))
-    queue.put(slot(0x182, 1))
-    queue.put(slot(0x181, 2))
-    assert send(queue, sent, 9) == 4
-    assert sent == [queued(0), slot(0x181, 2), queued(1), slot(0x182, 1)]
-    assert queue.replaced == 1
-
-
 def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     queue, sent = TransmitQueue(), list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
