@@ -221,7 +221,7 @@ def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench
     bench.speed_until(50 * MS)
     old = len(bench.wire.frames)
     assert len(bench.loop.can.transmitter.queue) > 5
-    bench.loop.can.transmitter.queue.put(CanFrame(0x123, b"old"))
+    bench.loop.can.transmitter.queue.put_all([CanFrame(0x123, b"old")])
     bus.take()
     bus.answer = Sent.OK
     bench.world.now += HELD_UP_NS

@@ -300,7 +300,7 @@ def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
 ) -> None:
     bench.begin()
     bench.port.answer = Sent.BUSY
-    bench.can.transmitter.queue.put(CanFrame(0x100, b"held"))
+    bench.can.transmitter.queue.put_all([CanFrame(0x100, b"held")])
     bench.can.transmit(bench.now)
     bench.can._is_proven = False
     bench.can.transmitter.clear()
@@ -348,11 +348,11 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
     for n in range(3000):
         port.answer = Sent.OK if n % 3 else Sent.BUSY
         for can_id in range(10):
-            bench.can.transmitter.queue.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
+            bench.can.transmitter.queue.put_all([CanFrame(0x100 + can_id, bytes((n & 255,)))])
         bench.turn()
     assert bench.can.port is before
     port.answer = Sent.BUSY
-    bench.can.transmitter.queue.put(CanFrame(0x100, b""))
+    bench.can.transmitter.queue.put_all([CanFrame(0x100, b"")])
     bench.turn(2000)
     assert bench.can.port is not before
 
