@@ -189,16 +189,10 @@ def place(tmp_path: Path, data: bytes) -> Path:
     return folder
 
 
-DAMAGED_FILES = [
-    OLD[:-5],
-    b"",
-    b"\0" * 200,
-    OLD + b"\n",
-    OLD.replace(b'"version":1', b'"version":9'),
-]
+OTHER_VERSION = OLD.replace(b'"version":1', b'"version":9')
 
 
-@pytest.mark.parametrize("data", DAMAGED_FILES)
+@pytest.mark.parametrize("data", [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OTHER_VERSION])
 def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
     tmp_path: Path, store: ParameterStore, data: bytes
 ) -> None:
@@ -398,12 +392,8 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
             for name, inode in names.items():
                 whole, safe = contents[inode], secured[inode]
                 if inode in torn:
-                    whole = (
-                        safe,
-                        whole[: (len(safe) + len(whole)) // 2],
-                        "\0" * len(whole),
-                        whole,
-                    )[damage]
+                    half = whole[: (len(safe) + len(whole)) // 2]
+                    whole = (safe, half, "\0" * len(whole), whole)[damage]
                 state[name] = whole
             found.append(state)
     return found
@@ -425,11 +415,8 @@ def recorded(
     return recorder.steps
 
 
-FILE, TEMPORARY, DAMAGED = (
-    "params/esc1.params",
-    "params/esc1.params.tmp",
-    "params/esc1.params.damaged",
-)
+FILE = "params/esc1.params"
+TEMPORARY, DAMAGED = f"{FILE}.tmp", f"{FILE}.damaged"
 
 
 def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
@@ -512,27 +499,15 @@ def test_the_simulated_loss_of_power_finds_what_a_careless_writer_does(missing: 
     elif missing == "order":
         steps[2], steps[3] = ("rename", TEMPORARY, FILE), ("fsync", FILE)
     else:
-        steps = [
-            ("unlink", FILE),
-            ("create", FILE),
-            ("write", FILE, new),
-            ("fsync", FILE),
-            *steps[4:],
-        ]
+        in_place: list[Step] = [("create", FILE), ("write", FILE, new), ("fsync", FILE)]
+        steps = [("unlink", FILE), *in_place, *steps[4:]]
     assert faults(files, steps) != []
 
 
-@pytest.mark.parametrize(
-    "failing",
-    [
-        ("create", TEMPORARY),
-        ("write", TEMPORARY),
-        ("fsync", TEMPORARY),
-        ("close", TEMPORARY),
-        ("rename", TEMPORARY),
-        ("fsync", "params"),
-    ],
-)
+OF_THE_FILE = [(step, TEMPORARY) for step in ("create", "write", "fsync", "close", "rename")]
+
+
+@pytest.mark.parametrize("failing", [*OF_THE_FILE, ("fsync", "params")])
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
 def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
     tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, failing: Step, code: int
