@@ -20,7 +20,6 @@ class CapturePart:
         self.path = path
         self.begun = now
         self.size = 0
-        self.lost = 0
         self._number = 0
         self._new = 0
         self._header: bytes | None = header

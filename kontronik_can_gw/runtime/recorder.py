@@ -192,7 +192,7 @@ class Recorder:
             self._recorded_devices = self._devices
             file.write(b"I", json_payload({"devices": self._recorded_devices}))
         if items:
-            self._remark(file, items, now)
+            self._remark(items, now)
             file.take(items)
         self.facts.bytes += file.sync()
         self.facts.file = str(file.path)
@@ -204,11 +204,11 @@ class Recorder:
         if is_large or is_old:
             self._end_part()
 
-    def _remark(self, file: "CapturePart", items: list[Item], now: int) -> None:
+    def _remark(self, items: list[Item], now: int) -> None:
         """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
         last = items[-1][0]
-        if (lost := self._overflowed + self._unwritten - file.lost) > 0:
-            file.lost += lost
+        if (lost := self._overflowed + self._unwritten - self._recorded_losses) > 0:
+            self._recorded_losses += lost
             items.append((last, Kind.LOST, 0, number_data(lost), 0, None))
         if now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
@@ -238,7 +238,6 @@ class Recorder:
     def _fail(self, error: Exception, now: int) -> None:
         file, self._file = self._file, None
         if file is not None:
-            self._recorded_losses = file.lost
             file.abandon()
         self.facts.file = ""
         self._retry_ns = self._space_ns = now + _RETRY_NS
@@ -269,13 +268,11 @@ class Recorder:
         }
         base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
         self._file = CapturePart(base.with_name(base.name + SUFFIX), json_payload(header), now)
-        self._file.lost = self._recorded_losses
         remove_oldest(self.settings.folder, self.settings.keep_bytes)
 
     def _end_part(self) -> None:
         file, self._file = self._file, None
         if file is not None:
-            self._recorded_losses = file.lost
             self.facts.file = ""
             self.facts.bytes += file.close()
 
@@ -284,12 +281,8 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
     """What a replay that begins now cannot know."""
     return {
         "escs": [
-            {
-                "energy": esc.drawn.energy_mw_ns,
-                "run_time": esc.drawn.run_time,
-                "losses": esc.losses,
-            }
-            for esc in gateway.escs
+            {"energy": e.drawn.energy_mw_ns, "run_time": e.drawn.run_time, "losses": e.losses}
+            for e in gateway.escs
         ],
         "can_state": int(gateway.status.can_state),
         "started_ns": gateway.status.started_ns,
