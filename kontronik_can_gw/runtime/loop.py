@@ -182,6 +182,7 @@ class Loop:
     def end(self) -> None:
         """A last status is sent and everything is closed."""
         now = self._clock()
+        self._housekeeping.follow_recorder(now)  # what is known of the devices by now
         self.gateway.stop(now)
         self.can.transmit(now)
         self.close()
