@@ -40,9 +40,6 @@ class TransmitQueue:
         self.dropped = 0
         """Queued frames that were lost: the queue was full, or cleared."""
 
-    def __bool__(self) -> bool:
-        return bool(self._slots or self._queue)
-
     def __len__(self) -> int:
         return len(self._slots) + len(self._queue)
 
@@ -62,10 +59,6 @@ class TransmitQueue:
         replaced = count - len(slots)
         self.replaced += replaced
         return replaced + dropped
-
-    def put(self, frame: CanFrame) -> int:
-        """Let one frame wait. Returns how many were lost by it."""
-        return self.put_all((frame,))
 
     def in_order(self) -> list[CanFrame]:
         """All that wait, in the order in which they are to be sent."""

@@ -6,7 +6,7 @@ Sending is in transmitter.py, the controller's state in can_controller.py.
 import contextlib
 import errno
 import logging
-import selectors
+import select
 import time
 from collections.abc import Callable
 
@@ -15,13 +15,14 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_controller import CanController
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.id_locks import IdLocks
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.open_can import open_can
-from kontronik_can_gw.runtime.poller import Registry
+from kontronik_can_gw.runtime.poller import Poller, StuckCheck
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.transmitter import Transmitter
@@ -38,7 +39,7 @@ class CanLink:
         self,
         config: CanConfig,
         gateway: Gateway,
-        selector: Registry,
+        poller: Poller,
         conditions: FaultLog,
         esc_at: Callable[[str], str | None] = lambda _path: None,
         clock: Callable[[], int] = time.monotonic_ns,
@@ -48,7 +49,7 @@ class CanLink:
         self.transmitter = Transmitter(config.channel, gateway, conditions, clock)
         self.controller = CanController(config, gateway, conditions)
         self._gateway = gateway
-        self._selector = selector
+        self._poller = poller
         self._conditions = conditions
         self.condition = f"CAN {config.channel}: interface"
         self._esc_at = esc_at
@@ -59,11 +60,10 @@ class CanLink:
         """What the open port was asked to receive."""
         self._is_proven = False
         """A frame was taken since the interface failed last."""
-        self._served = True
         self._drained = True
-        self._seen_waiting = False
+        self._stuck = StuckCheck()
         if (fd := self.controller.fileno()) is not None:
-            selector.register(fd, selectors.EVENT_READ, self.hear)
+            poller.register(fd, self.hear)
 
     @property
     def due(self) -> int:
@@ -109,7 +109,7 @@ class CanLink:
         self._close_port()
         self._own_ids.close()
         if (fd := self.controller.fileno()) is not None:
-            self._selector.unregister(fd)
+            self._poller.unregister(fd)
             self.controller.close()
 
     def _open(self, now: int) -> None:
@@ -124,9 +124,9 @@ class CanLink:
         self._retry.due = None
         self.transmitter.forget_failures()
         self.controller.is_off = False
-        self._served, self._seen_waiting = True, False
+        self._stuck = StuckCheck()
         if (fd := port.fileno()) is not None:
-            self._selector.register(fd, selectors.EVENT_READ, self.serve)
+            self._poller.register(fd, self.serve)
         self._receive_ids = None
         self.follow_ids()
         self._gateway.can_opened(now)
@@ -149,7 +149,7 @@ class CanLink:
         if self.port is not None:
             if (fd := self.port.fileno()) is not None:
                 with contextlib.suppress(KeyError, ValueError):
-                    self._selector.unregister(fd)
+                    self._poller.unregister(fd)
             self.port.close()
             self.port = None
 
@@ -204,19 +204,19 @@ class CanLink:
         self._receive_ids = ids
         self.port.set_receive_ids(ids)
         if not had_fd and (fd := self.port.fileno()) is not None:
-            self._selector.register(fd, selectors.EVENT_READ, self.serve)
+            self._poller.register(fd, self.serve)
         self._own_ids.lock()
 
-    def serve(self, now: int, events: int = selectors.EVENT_READ) -> None:
+    def serve(self, now: int, events: int = select.POLLIN) -> None:
         """The port is readable, or can be sent to again."""
-        self._served = True
+        self._stuck.served = True
         if self.port is None:
             return
-        if events & selectors.EVENT_WRITE:
-            self.transmitter.retry_now()
-            self._watch(selectors.EVENT_READ)
-        if events & selectors.EVENT_READ:
-            since = self._selector.before if self._drained else 0
+        if events & select.POLLOUT:
+            self.transmitter.due = NEVER
+            self._watch(select.POLLIN)
+        if events & select.POLLIN:
+            since = self._poller.before if self._drained else 0
             frames = self.port.receive()
             self._drained = self.port.drained
             self._gateway.status.received_frames += len(frames)
@@ -228,11 +228,8 @@ class CanLink:
             self._follow_reception(now)
 
     def is_stuck(self) -> bool:
-        """True if frames have waited since the last call but one and none were read: the loop does not serve this port."""
-        waiting = self.port is not None and not self._served and self.port.waits_to_be_read
-        stuck = waiting and self._seen_waiting
-        self._served, self._seen_waiting = False, waiting
-        return stuck
+        """True if the loop does not serve this port."""
+        return self._stuck.is_stuck(self.port)
 
     def transmit(self, now: int) -> None:
         """Hand what is to be sent to the interface, as far as it takes it."""
@@ -252,7 +249,7 @@ class CanLink:
             if not self._is_proven:
                 self._prove(now)
         elif answer is Sent.FULL:
-            self._watch(selectors.EVENT_READ | selectors.EVENT_WRITE)
+            self._watch(select.POLLIN | select.POLLOUT)
         elif answer is not Sent.BUSY:
             self._lost(answer, now)
             return
@@ -260,7 +257,7 @@ class CanLink:
 
     def _watch(self, events: int) -> None:
         if self.port is not None and (fd := self.port.fileno()) is not None:
-            self._selector.modify(fd, events, self.serve)
+            self._poller.register(fd, self.serve, events)
 
     def _prove(self, now: int) -> None:
         """The interface works: a frame was taken."""

@@ -15,8 +15,8 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.transmit_queue import Sent
 
-RECEIVE_LIMIT = 64
-"""Frames, error frames among them, that one call of ``receive`` takes at most."""
+RECEIVE_LIMIT, _DISCARD_LIMIT = 64, 4096
+"""Frames, error frames among them, that one call of ``receive`` or ``discard`` takes at most."""
 MAX_STANDARD_ID, MAX_EXTENDED_ID = 0x7FF, 0x1FFFFFFF
 # An enumeration's members are slow to look up.
 _DOWN, _UNKNOWN = CanState.DOWN, CanState.UNKNOWN
@@ -75,13 +75,14 @@ class CanPort(ABC):
         self._ids = frozenset(ids)
         self._filter()
 
-    def receive(self) -> Received:
-        """The data frames that have come, oldest first, at most RECEIVE_LIMIT; follow the controller's state from error frames."""
-        return self._receive(RECEIVE_LIMIT)
-
     @abstractmethod
+    def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
+        """The data frames that have come, oldest first, at most ``limit``; follow the controller's state from error frames."""
+
     def discard(self) -> None:
         """Throw away the data frames that wait to be received. What error frames say still counts; data frames lost before do not."""
+        self.receive(_DISCARD_LIMIT)
+        self._known_drops = self._drops()
 
     def send(self, frame: CanFrame) -> Sent:
         """Hand one frame to the interface."""
@@ -111,9 +112,6 @@ class CanPort(ABC):
     @abstractmethod
     def _filter(self) -> None:
         """Let only frames with ``_ids`` come."""
-
-    @abstractmethod
-    def _receive(self, limit: int) -> Received: ...
 
     @abstractmethod
     def _send_each(

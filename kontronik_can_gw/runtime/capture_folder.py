@@ -1,4 +1,4 @@
-"""The folder of captures: which files are captures, the oldest are removed, names are forced to the disk."""
+"""The folder of captures: which files are captures, the oldest are removed."""
 
 import contextlib
 import fcntl
@@ -59,13 +59,3 @@ def _is_being_written(path: Path) -> bool:
     finally:
         os.close(fd)
     return False
-
-
-def sync_folder(folder: Path) -> None:
-    """So that the file's name survives a loss of power too."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        with contextlib.suppress(OSError):  # a file system that cannot
-            os.fsync(fd)
-    finally:
-        os.close(fd)

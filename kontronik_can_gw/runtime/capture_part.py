@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from kontronik_can_gw.capture.format import block, data_payload
-from kontronik_can_gw.runtime.capture_folder import sync_folder
+from kontronik_can_gw.runtime.disk import sync_folder, write_all
 
 Item = tuple[int, int, int, bytes, int, int | None]
 """(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
@@ -20,7 +20,6 @@ class CapturePart:
         self.path = path
         self.begun = now
         self.size = 0
-        self.lost = 0
         self._number = 0
         self._new = 0
         self._header: bytes | None = header
@@ -31,7 +30,8 @@ class CapturePart:
             with contextlib.suppress(OSError):  # a file system without locks
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.write(b"H", header)
-            sync_folder(path.parent)
+            with contextlib.suppress(OSError):  # a file system that cannot
+                sync_folder(path.parent)
         except BaseException:  # nothing is in there yet
             os.close(self._fd)
             with contextlib.suppress(OSError):
@@ -40,12 +40,11 @@ class CapturePart:
 
     def write(self, kind: bytes, payload: bytes) -> None:
         """Append a block."""
-        data = memoryview(block(kind, self._number, payload))
+        data = block(kind, self._number, payload)
         self._number += 1
         self.size += len(data)
         self._new += len(data)
-        while data:
-            data = data[os.write(self._fd, data) :]
+        write_all(self._fd, data)
 
     def take(self, items: list[Item]) -> None:
         """Append what came."""

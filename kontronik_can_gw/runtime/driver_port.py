@@ -1,55 +1,80 @@
-"""A CAN interface of python-can's drivers, received from by a thread (bus_reader.py)."""
+"""A CAN interface of python-can's drivers, which have no descriptor to wait on: received from by a thread, a bounded queue, a descriptor.
+
+What may touch what: ``_read`` and ``_fail`` run in the worker's thread, everything else in the loop's. They share ``_ids``, ``_failed``
+and ``_dropped`` (each written by one side only) and the queue.
+"""
 
 import contextlib
+import logging
+import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.runtime.can_port import (
     MAX_EXTENDED_ID,
     MAX_STANDARD_ID,
+    RECEIVE_LIMIT,
     CanPort,
     Received,
 )
+from kontronik_can_gw.runtime.worker import Handover, Worker
 from kontronik_can_gw.transmit_queue import Sent
 
 if TYPE_CHECKING:
     import can
 
+log = logging.getLogger("kontronik_can_gw")
+
+QUEUE_LENGTH = 1024
+_POLL_S = 0.1
+_MAX_END_S = 1.0
+
 
 class DriverPort(CanPort):
-    """A bus of python-can. A thread reads it as soon as there is an id to receive."""
+    """A bus of python-can. A thread reads it as soon as there is an id to receive, until ``close`` or until the interface fails."""
 
     reports_full = False
 
     def __init__(self, bus: "can.BusABC") -> None:
         super().__init__()
         self._bus = bus
-        self._reader: BusReader | None = None
+        self._worker: Worker[None] | None = None
+        self._frames: Handover[tuple[CanFrame, int | None]] = Handover(QUEUE_LENGTH)
+        self._dropped = 0
+        """Frames that came while the queue was full."""
+        self._failed = False
+        """The thread has ended; the descriptor became readable."""
 
     def fileno(self) -> int | None:
-        return None if self._reader is None else self._reader.fileno()
-
-    def discard(self) -> None:
-        self._receive(QUEUE_LENGTH)
-        self._known_drops = self._drops()
+        return None if self._worker is None else self._frames.fileno()
 
     def close(self) -> None:
-        if self._reader is not None:
-            self._reader.close()  # before the driver is shut down: few of them bear both at once
+        """It takes as long as one wait of the driver. A thread that a driver holds is left running, without effect."""
+        if self._worker is not None:
+            # before the driver is shut down: few of them bear both at once
+            self._worker.stop(_MAX_END_S)
+        self._frames.close()
         with contextlib.suppress(Exception):
             # an interface that is gone may fail in its own ways; nothing is left to do
             self._bus.shutdown()
 
+    def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
+        frames = self._frames.take(limit)
+        self.drained = len(frames) < limit
+        if self._has_failed():
+            self.state = CanState.DOWN
+        self._note_drops()
+        return frames
+
     def _filter(self) -> None:
-        if self._reader is None and not self._ids:
+        if self._worker is None and not self._ids:
             return
         self._filter_bus()
-        if self._reader is None:
-            self._reader = BusReader(self._bus, self._ids)
-        self._reader.ids = self._ids
+        if self._worker is None:
+            self._worker = Worker("can-reader", self._read, failed=self._fail, wait=lambda: None)
+            self._failed = not self._worker.start()  # so that it is tried again with another one
 
     def _filter_bus(self) -> None:
         """Ask the driver for our ids; one that cannot filter is left to the thread."""
@@ -65,22 +90,12 @@ class DriverPort(CanPort):
                 return
         self.gone = True
 
-    def _receive(self, limit: int) -> Received:
-        if self._reader is None:
-            return []
-        frames: Received = [*self._reader.take(limit)]
-        self.drained = len(frames) < limit
-        if self._has_failed():
-            self.state = CanState.DOWN
-        self._note_drops()
-        return frames
-
     def _has_failed(self) -> bool:
-        self.gone = self.gone or (self._reader is not None and self._reader.failed)
+        self.gone = self.gone or self._failed
         return self.gone
 
     def _drops(self) -> int:
-        return 0 if self._reader is None else self._reader.dropped
+        return self._dropped
 
     def _send_each(
         self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
@@ -114,3 +129,36 @@ class DriverPort(CanPort):
             # what a driver lets out when its adapter has gone: OSError, termios.error ...
             return Sent.GONE
         return Sent.OK
+
+    # --- the thread's side
+
+    def _read(self, _items: list[None]) -> None:
+        assert self._worker is not None
+        if self._worker.is_ending:
+            return
+        message = self._bus.recv(_POLL_S)
+        if message is None or not self._wanted(message):
+            return
+        data, extended = bytes(message.data), message.is_extended_id
+        frame = CanFrame(message.arbitration_id, data, extended, message.is_fd)
+        # what drivers put into ``timestamp`` counts from anything
+        if not self._frames.put((frame, time.monotonic_ns())):
+            self._dropped += 1
+
+    def _fail(self, error: Exception) -> None:
+        """What a driver lets out when its adapter has gone: CanError, OSError, TypeError ..."""
+        assert self._worker is not None
+        if not self._worker.is_ending:
+            log.debug("CAN: receiving failed: %r", error)
+            self._failed = True
+            self._frames.wake()
+        self._worker.end()
+
+    def _wanted(self, message: "can.Message") -> bool:
+        """A data frame with one of our ids, not sent by ourselves."""
+        return (
+            message.arbitration_id | (EXTENDED if message.is_extended_id else 0) in self._ids
+            and not message.is_remote_frame
+            and not message.is_error_frame
+            and message.is_rx
+        )

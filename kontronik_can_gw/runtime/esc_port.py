@@ -1,7 +1,6 @@
 """One ESC's serial port as the loop has it: opened, read, lost, found again."""
 
 import logging
-import selectors
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.esc_log import EscLog
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.poller import Registry
+from kontronik_can_gw.runtime.poller import Poller, StuckCheck
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
     NoPort,
@@ -24,8 +23,6 @@ from kontronik_can_gw.runtime.snapshot import PortFacts
 from kontronik_can_gw.runtime.usb_adapters import Identity, find_adapter, identity_at
 
 MAX_RETRY_NS = SECOND
-SETTINGS_NS = SECOND // 2
-"""While another program has echo on, what the ESC sends goes back to it."""
 
 
 class EscPort:
@@ -39,7 +36,7 @@ class EscPort:
         index: int,
         path: str,
         gateway: Gateway,
-        selector: Registry,
+        poller: Poller,
         conditions: FaultLog,
         lost: "set[EscPort]",
         clock: Callable[[], int] = time.monotonic_ns,
@@ -55,7 +52,7 @@ class EscPort:
         self._lost = lost
         self._gateway = gateway
         self._protocol = gateway.escs[index].protocol
-        self._selector = selector
+        self._poller = poller
         self._conditions = conditions
         self._clock = clock
         self._empty_ns = 0
@@ -64,12 +61,8 @@ class EscPort:
         """The last read left something, which came after this."""
         self._retry = Retry(MAX_RETRY_NS)
         self.log = EscLog(index, gateway, conditions)
-        self.report_due = 0
-        """When ``report`` has something to do."""
         self._counted: dict[str, int] = {}
-        self._count_due = 0
-        self._served = True
-        self._seen_waiting = False
+        self._stuck = StuckCheck()
         self._lost_since: int | None = None
         self._proven = False
 
@@ -79,15 +72,12 @@ class EscPort:
 
     def facts(self) -> PortFacts:
         """For the statistics."""
-        is_open = self.port is not None
-        path = self.path if self.port is None else self.port.path
-        again = max(0, self.reopened)
         return PortFacts(
             self.name,
-            path,
-            is_open,
+            self.path if self.port is None else self.port.path,
+            self.port is not None,
             self.log.complaint,
-            again,
+            max(0, self.reopened),
             dict(self.line_errors),
             self._lost_since,
         )
@@ -116,8 +106,8 @@ class EscPort:
         self._lost.discard(self)
         self.log.await_telemetry(now)
         self._counted = port.line_errors()
-        self._served, self._seen_waiting = True, False
-        self._selector.register(port.fileno(), selectors.EVENT_READ, self.serve)
+        self._stuck = StuckCheck()
+        self._poller.register(port.fileno(), self.serve)
         self._gateway.port(self._index, True, now)
         said = f"{self.name}: {port.path} is open"
         if self._conditions.is_on(self.log.port_condition):
@@ -142,7 +132,7 @@ class EscPort:
 
     def serve(self, now: int, _events: int = 0) -> None:
         """The port is readable."""
-        self._served = True
+        self._stuck.served = True
         if self.port is None:
             return
         try:
@@ -159,7 +149,7 @@ class EscPort:
                 self._retry.succeeded()
             since = self._undrained_ns
             if since is None:
-                since = max(self._empty_ns, self._selector.before)
+                since = max(self._empty_ns, self._poller.before)
             # nothing came faster than the wire allows
             self._undrained_ns = (
                 None if self.port.drained else min(now, since + len(data) * self._protocol.byte_ns)
@@ -174,25 +164,19 @@ class EscPort:
     def close(self) -> None:
         """Close the port."""
         if self.port is not None:
-            self._selector.unregister(self.port.fileno())
+            self._poller.unregister(self.port.fileno())
             self.port.close()
             self.port = None
 
     def is_stuck(self) -> bool:
-        """True if bytes have waited since the last call but one and none were read: the loop does not serve this port."""
-        waiting = self.port is not None and not self._served and self.port.waits_to_be_read
-        stuck = waiting and self._seen_waiting
-        self._served, self._seen_waiting = False, waiting
-        return stuck
+        """True if the loop does not serve this port."""
+        return self._stuck.is_stuck(self.port)
 
     def report(self, now: int) -> None:
-        """Count line errors once a second, look at the port's settings twice; say why nothing comes."""
-        self.report_due = now + SETTINGS_NS
+        """Count line errors, look at the port's settings; say why nothing comes."""
         if self.port is None:
             return
-        if now >= self._count_due:
-            self._count_due = now + SECOND
-            self._count(self.port.line_errors())
+        self._count(self.port.line_errors())
         if not self.port.settings_hold():
             text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
             self._conditions.event(f"{self.name}: settings", text, now)

@@ -19,8 +19,6 @@ class _Condition:
         self.begun: int | None = None
         self.reason = ""
         self.begins: deque[int] = deque(maxlen=FLAPPING)
-        self.summing = False
-        self.due = 0
         self.count = 0
         self.total = 0
 
@@ -32,7 +30,8 @@ class FaultLog:
         self.recent: deque[str] = deque(maxlen=REMEMBERED)
         self._held: list[tuple[int, str]] | None = None
         self._known: dict[str, _Condition] = {}
-        self._summing: set[str] = set()
+        self._summing: dict[str, int] = {}
+        """Conditions that come and go: when their next sum is due."""
 
     def begin(
         self,
@@ -57,13 +56,12 @@ class FaultLog:
             return
         condition.begins.append(now)
         condition.count += 1
-        if condition.summing:
+        if name in self._summing:
             return
         often = len(condition.begins) == FLAPPING and now - condition.begins[0] < MINUTE
         if often:
-            condition.summing, condition.due = True, now + MINUTE
             condition.count = condition.total = 0
-            self._summing.add(name)
+            self._summing[name] = now + MINUTE
             text = f"{text.removesuffix('.')}. This comes and goes: from now on it is summed up once a minute."
         self.say(level, text)
 
@@ -80,7 +78,7 @@ class FaultLog:
         lasted = now - condition.begun
         condition.begun = None
         condition.total += lasted
-        if not condition.summing:
+        if name not in self._summing:
             self.say(logging.INFO, f"{text}, after {duration(lasted)}{counts}")
 
     def forget(self, name: str) -> None:
@@ -97,29 +95,23 @@ class FaultLog:
         """What was said at its beginning; empty while it is off."""
         return self._known[name].reason if self.is_on(name) else ""
 
-    @property
-    def due(self) -> int | None:
-        """When ``advance`` has something to say."""
-        return min((self._known[name].due for name in self._summing), default=None)
-
     def advance(self, now: int) -> None:
         """Say the sums that are due."""
-        for name in [name for name in self._summing if now >= self._known[name].due]:
+        for name in [name for name, due in self._summing.items() if now >= due]:
             condition = self._known[name]
-            total = condition.total + (
-                0 if condition.begun is None else now - max(condition.begun, now - MINUTE)
-            )
+            total = condition.total
+            if condition.begun is not None:
+                total += now - max(condition.begun, now - MINUTE)
             if condition.count:
                 in_all = f", {duration(total)} in all" if total else ""
                 self.say(
                     logging.WARNING,
                     f"{name}: {condition.count} more times in the last minute{in_all}; the last: {condition.reason}",
                 )
-                condition.due = now + MINUTE
+                self._summing[name] = now + MINUTE
                 condition.count = condition.total = 0
                 continue
-            condition.summing = False
-            self._summing.discard(name)
+            del self._summing[name]
             state = f"it lasts: {condition.reason}" if condition.begun is not None else "it is over"
             self.say(logging.INFO, f"{name}: no longer comes and goes, {state}")
 

@@ -5,16 +5,15 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.conflict_log import log_conflicts
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
-from kontronik_can_gw.runtime.process import process_facts
+from kontronik_can_gw.runtime.process import ProcessFacts, process_facts
 from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     ProgramFacts,
@@ -23,14 +22,20 @@ from kontronik_can_gw.runtime.snapshot import (
 )
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
+from kontronik_can_gw.runtime.worker import Report
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import Recorder
 
 log = logging.getLogger("kontronik_can_gw")
 
-PERIOD_NS = 250 * MS
-"""How often there is a round. The loop is woken for one only when it is late by as much: mostly it comes round before."""
+PERIOD_NS = SECOND // 2
+"""How often there is a round: while another program has echo on, what an ESC sends goes back to it.
+
+The loop is woken for a round only when it is late by as much: mostly it comes round before.
+"""
+PROCESS_NS = 10 * SECOND
+"""How often the process's resources are asked for: that costs more than the rest of a round."""
 STATUS_NS = SECOND
 """The service manager is given a line at most this often."""
 
@@ -69,15 +74,15 @@ class Housekeeping:
         self._last_counts: tuple[int, list[int]] = (0, [])
         self._alive_due = 0 if notifier.watchdog_ns is not None else None
         self._notify_due = 0
+        self._process, self._process_due = ProcessFacts(), 0
         self._node_states: list[tuple[int, NmtState]] = []
 
     def run(self, now: int) -> None:
         """One round."""
         self.due = now + PERIOD_NS
         for esc in self._escs:
-            if now >= esc.report_due:
-                esc.report(now)
-        log_conflicts(self._gateway, self._conditions, self._can.config.channel, now)
+            esc.report(now)
+        self._log_conflicts(now)
         self._conditions.advance(now)
         if self._status_due is not None and now >= self._status_due:
             self._log_status(now)
@@ -85,9 +90,9 @@ class Housekeeping:
         self.publish(now)
         self._notify(now)
         self.wake_due = self.due + PERIOD_NS
-        if self._alive_due is not None and self._alive_due > now:  # else something is stuck
-            self.due = min(self.due, self._alive_due)
-            self.wake_due = min(self.wake_due, self._alive_due)
+        for due in (self._alive_due, self._status_due):
+            if due is not None and due > now:  # else something is stuck
+                self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
 
     def publish(self, now: int) -> None:
         """Hand the statistics' thread a document, if it is time."""
@@ -98,7 +103,7 @@ class Housekeeping:
                 now=now,
                 wall=time.time(),
                 program=self._program,
-                process=process_facts(),
+                process=self._process_now(now),
                 ports=[esc.facts() for esc in self._escs],
                 can=_can_facts(self._can, self._conditions),
                 store=self._saver.facts(),
@@ -106,24 +111,23 @@ class Housekeeping:
                 recorder=None if self._recorder is None else self._recorder.facts,
             )
             statistics.publish(document)
-        for begins, text in statistics.reports(now):
-            if begins:
-                self._conditions.begin("statistics", text, now)
-            else:
-                self._conditions.end("statistics", text, now)
+        self._log(statistics.reports(now), now)
+
+    def _process_now(self, now: int) -> ProcessFacts:
+        if now >= self._process_due:
+            self._process_due, self._process = now + PROCESS_NS, process_facts()
+        return self._process
 
     def follow_recorder(self, now: int) -> None:
         """Give the recorder what a replay needs to know, and log what it reports."""
         if self._recorder is None:
             return
         self._recorder.note(self._gateway, now)
-        for name, begins, text in self._recorder.reports(now):
-            if name == "losses":
-                self._conditions.event("captures: losses", text, now)
-            elif begins:
-                self._conditions.begin(f"captures: {name}", text, now)
-            else:
-                self._conditions.end(f"captures: {name}", text, now)
+        self._log(self._recorder.reports(now), now)
+
+    def _log(self, reports: Sequence[Report], now: int) -> None:
+        for name, begins, text in reports:
+            (self._conditions.begin if begins else self._conditions.end)(name, text, now)
 
     def report_nodes(self, now: int) -> None:
         """Log which nodes have another state or node-ID, and stored values that were rejected."""
@@ -146,6 +150,22 @@ class Housekeeping:
             )
             name = f"{self._escs[index].name}: CANopen node"
             self._conditions.event(name, f"{name} {words}", now, logging.INFO)
+
+    def _log_conflicts(self, now: int) -> None:
+        """Others on the bus begin, or cease, to send with our ids."""
+        for conflict in self._gateway.conflicts.take():
+            bits = "29-bit id" if conflict.is_extended else "id"
+            which = f"CAN {self._can.config.channel}: {bits} {conflict.can_id:X}h"
+            if conflict.over:
+                text = f"{which}: nobody else sends with it"
+                self._conditions.end(which, text, now, f"; {conflict.count} frames")
+                continue
+            change = "Change one, as by dbc.base_id."
+            remedy = change if conflict.node is None else "Two nodes with one node-ID?"
+            text = (
+                f"{which}: somebody else sends with it too; here it is {conflict.whose}. {remedy}"
+            )
+            self._conditions.begin(which, text, now)
 
     def status_words(self) -> str:
         """How things are, in one line."""

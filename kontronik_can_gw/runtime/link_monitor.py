@@ -100,14 +100,14 @@ class LinkMonitor:
             return LinkFacts(exists=False) if -code in (errno.ENODEV, errno.ENXIO) else None
         if kind not in (_NEW_LINK, _DELETED_LINK) or len(body) < _INTERFACE.size:
             return None
-        attributes = dict(_attributes(body[_INTERFACE.size :]))
+        attributes = _attributes(body, _INTERFACE.size)
         if attributes.get(_NAME, b"").rstrip(b"\0") != self._name:
             return None
         if kind == _DELETED_LINK:
             return LinkFacts(exists=False)
         flags = _INTERFACE.unpack_from(body)[3]
-        info = dict(_attributes(attributes.get(_LINK_INFO, b"")))
-        can = dict(_attributes(info.get(_INFO_DATA, b"")))
+        info = _attributes(attributes.get(_LINK_INFO, b""))
+        can = _attributes(info.get(_INFO_DATA, b""))
         state = _number(can.get(_STATE))
         counters = can.get(_ERROR_COUNTERS)
         return LinkFacts(
@@ -152,11 +152,13 @@ def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:
         data = data[size + (-size % 4) :]
 
 
-def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(type, value) of each attribute."""
-    while len(data) >= _ATTRIBUTE.size:
-        size, kind = _ATTRIBUTE.unpack_from(data)
-        if not _ATTRIBUTE.size <= size <= len(data):
-            return
-        yield kind & _TYPE_MASK, data[_ATTRIBUTE.size : size]
-        data = data[size + (-size % 4) :]
+def _attributes(data: bytes, at: int = 0) -> dict[int, bytes]:
+    """The attributes from a place on, by their type."""
+    found = {}
+    while at + _ATTRIBUTE.size <= len(data):
+        size, kind = _ATTRIBUTE.unpack_from(data, at)
+        if not _ATTRIBUTE.size <= size <= len(data) - at:
+            break
+        found[kind & _TYPE_MASK] = data[at + _ATTRIBUTE.size : at + size]
+        at += size + (-size % 4)
+    return found

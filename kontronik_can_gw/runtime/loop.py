@@ -2,13 +2,10 @@
 
 What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` may be called from elsewhere (a signal handler,
 another thread). Threads of their own (worker.py) have the parameter store (store.py), the statistics (statistics.py), captures
-(recorder.py), the log (log_writer.py), and reception where python-can has no descriptor (bus_reader.py).
+(recorder.py), the log (log_writer.py), and reception where python-can has no descriptor (driver_port.py).
 """
 
-import contextlib
 import logging
-import os
-import selectors
 import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -27,6 +24,7 @@ from kontronik_can_gw.runtime.snapshot import ProgramFacts
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
+from kontronik_can_gw.runtime.worker import Handover
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import Recorder
@@ -68,7 +66,7 @@ class Loop:
         self._notifier = notifier or Notifier({})
         self._statistics = statistics or Statistics(None)
         self._recorder = recorder
-        self._now = 0
+        self._now = self._due = 0
         self._node_changes = 0
         self._stopping = False
         self._poller = poller or Poller(clock)
@@ -91,15 +89,15 @@ class Loop:
             program=program or ProgramFacts(""),
             status_ns=status_ns,
         )
-        self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._poller.register(self._wake_read, selectors.EVENT_READ, self._woken)
+        self._wake: Handover[None] = Handover()
+        self._poller.register(self._wake.fileno(), self._woken)
         if store is not None:
-            self._poller.register(store.fileno(), selectors.EVENT_READ, self._saver.take_results)
+            self._poller.register(store.fileno(), self._saver.take_results)
 
     def stop(self) -> None:
         """End ``run`` soon; safe in a signal handler and from another thread."""
         self._stopping = True
-        self._wake()
+        self._wake.wake()
 
     def open(self) -> None:
         """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
@@ -140,22 +138,26 @@ class Loop:
 
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
-        last, due = self._now, self._next_deadline()
+        last = self._now
         wake = last + self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
-        pause = min(wake, due) - self._clock()
+        pause = min(wake, self._due) - self._clock()
         if pause < 0:
             pause = 0
         ready = self._poller.wait(pause)
         now = self._poller.now
         late = now - last - pause
-        if late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns():
+        held_up = late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns()
+        is_idle = not (held_up or ready or now >= self._due)
+        if held_up:
             self._follow_hold_up(late, now)
-            now = self._serve(ready, now)
-        elif ready or now >= due:  # otherwise it is known that nothing has come until now
+        if not is_idle:  # otherwise it is known that nothing has come until now
             now = self._serve(ready, now)
         self._now = now
         if now >= self._housekeeping.due:
             self._housekeeping.run(now)
+            is_idle = False
+        if not is_idle:  # otherwise nothing has changed
+            self._due = self._next_deadline()
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
         """Take what has come, do what is due, send what is made of it. Returns the time."""
@@ -180,6 +182,7 @@ class Loop:
     def end(self) -> None:
         """A last status is sent and everything is closed."""
         now = self._clock()
+        self._housekeeping.follow_recorder(now)  # what is known of the devices by now
         self.gateway.stop(now)
         self.can.transmit(now)
         self.close()
@@ -196,19 +199,10 @@ class Loop:
             self._housekeeping.follow_recorder(self._clock())  # the last words
         if self._store is not None:
             self._store.close(_LAST_SAVE_S)
-        for fd in (self._wake_read, self._wake_write):
-            with contextlib.suppress(OSError):
-                os.close(fd)
-        # ``stop`` may still come: it must not write to a descriptor of another's
-        self._wake_read = self._wake_write = -1
-
-    def _wake(self) -> None:
-        with contextlib.suppress(OSError):
-            os.write(self._wake_write, b"\0")
+        self._wake.close()  # ``stop`` may still come, without effect
 
     def _woken(self, _now: int, _events: int) -> None:
-        with contextlib.suppress(OSError):
-            os.read(self._wake_read, 64)
+        self._wake.take()
 
     def _next_deadline(self) -> int:
         gateway = self.gateway
@@ -234,7 +228,7 @@ class Loop:
 
     def _reopen(self, now: int) -> int:
         """Open what is due. Returns the time: it may have taken long on a slow machine."""
-        for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
+        for esc in tuple(self._lost):
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
         if now >= self.can.controller.due:

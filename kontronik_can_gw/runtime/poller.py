@@ -7,7 +7,6 @@ bytes are still on their way to it inside the kernel.
 
 import contextlib
 import select
-import selectors
 import time
 from collections.abc import Callable
 from typing import Protocol
@@ -15,25 +14,33 @@ from typing import Protocol
 from kontronik_can_gw.esc.telemetry import MS
 
 Handler = Callable[[int, int], None]
-"""Called with the time and what has happened (selectors.EVENT_READ, EVENT_WRITE)."""
+"""Called with the time and what has happened (select.POLLIN, POLLOUT)."""
 
 
-_READ, _IN = selectors.EVENT_READ, select.POLLIN
+_IN = select.POLLIN
 
 
-class Registry(Protocol):
-    """Where descriptors are watched: a Poller."""
+class Waiting(Protocol):
+    """A port that is read."""
 
-    before: int
+    @property
+    def waits_to_be_read(self) -> bool:
+        """True while a read would find something."""
 
-    def register(self, fileobj: int, events: int, data: Handler) -> object:
-        """Watch a descriptor."""
 
-    def modify(self, fileobj: int, events: int, data: Handler) -> object:
-        """Watch it for something else."""
+class StuckCheck:
+    """Whether a port is served: ``served`` is set by who reads it."""
 
-    def unregister(self, fileobj: int) -> object:
-        """Watch it no longer. KeyError if it was not watched."""
+    def __init__(self) -> None:
+        self.served = True
+        self._seen_waiting = False
+
+    def is_stuck(self, port: Waiting | None) -> bool:
+        """True if something has waited since the last call but one and nothing was read."""
+        waiting = port is not None and not self.served and port.waits_to_be_read
+        stuck = waiting and self._seen_waiting
+        self.served, self._seen_waiting = False, waiting
+        return stuck
 
 
 class Poller:
@@ -48,17 +55,16 @@ class Poller:
         self._poll = select.poll()
         self._watched: dict[int, tuple[Handler, int]] = {}
 
-    def register(self, fileobj: int, events: int, data: Handler) -> None:
-        self._poll.register(fileobj, _mask(events))
-        self._watched[fileobj] = (data, events)
+    def register(self, fd: int, handler: Handler, events: int = select.POLLIN) -> None:
+        """Watch a descriptor; one that is watched, for something else from now on."""
+        self._poll.register(fd, events)
+        self._watched[fd] = (handler, events)
 
-    def modify(self, fileobj: int, events: int, data: Handler) -> None:
-        self.register(fileobj, events, data)
-
-    def unregister(self, fileobj: int) -> None:
-        del self._watched[fileobj]
+    def unregister(self, fd: int) -> None:
+        """Watch it no longer. KeyError if it was not watched."""
+        del self._watched[fd]
         with contextlib.suppress(KeyError):
-            self._poll.unregister(fileobj)
+            self._poll.unregister(fd)
 
     def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
         """Wait until something happens, ``pause_ns`` is over (rounded up to a millisecond), or a signal comes; then ask what is ready.
@@ -71,21 +77,16 @@ class Poller:
         happened = self._poll.poll(0)
         watched = self._watched
         return [
-            (watched[fd][0], _READ if bits == _IN else self._events(fd, bits))
+            (watched[fd][0], bits if bits == _IN else self._events(fd, bits))
             for fd, bits in happened
         ]
 
     def _events(self, fd: int, bits: int) -> int:
         if bits & select.POLLNVAL:  # a driver has closed it: it would stay readable
             self._poll.unregister(fd)
-        readable = selectors.EVENT_READ if bits & ~select.POLLOUT else 0
-        writable = selectors.EVENT_WRITE if bits & ~select.POLLIN else 0
+        readable = select.POLLIN if bits & ~select.POLLOUT else 0
+        writable = select.POLLOUT if bits & ~select.POLLIN else 0
         return self._watched[fd][1] & (readable | writable)
 
     def close(self) -> None:
         self._watched.clear()
-
-
-def _mask(events: int) -> int:
-    reading = select.POLLIN if events & selectors.EVENT_READ else 0
-    return reading | (select.POLLOUT if events & selectors.EVENT_WRITE else 0)

@@ -12,20 +12,16 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from kontronik_can_gw.capture.format import (
-    SUFFIX,
-    Kind,
-    json_payload,
-    number_data,
-)
+from kontronik_can_gw.capture.format import SUFFIX, Kind, json_payload, number_data
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.capture_folder import make_folder, remove_oldest
 from kontronik_can_gw.runtime.capture_part import CapturePart, Item
-from kontronik_can_gw.runtime.worker import Worker
+from kontronik_can_gw.runtime.disk import reason_of
+from kontronik_can_gw.runtime.worker import Faults, Report, Worker
 
 CAPACITY = 50_000
 """Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""
@@ -40,14 +36,6 @@ _STATE_NS = 2 * SECOND
 _STEP_NS = MS
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
-
-
-class Report(NamedTuple):
-    """What went wrong (``begins``) or is right again. ``name`` is the kind of fault."""
-
-    name: str
-    begins: bool
-    text: str
 
 
 @dataclass(frozen=True)
@@ -95,7 +83,7 @@ class Recorder:
         self._unwritten = 0
         """Entries that could not be written: the thread's count."""
         self._reported_overflow = 0
-        self._reports: deque[Report] = deque()
+        self._faults = Faults()
         self._state_ns = 0
         self._devices: list[Any] = []
         self._recorded_devices: list[Any] = []
@@ -103,7 +91,6 @@ class Recorder:
             "recorder", self._work, wait=self._wait, ended=self._end
         )
         self._busy_since: int | None = None
-        self._reported_slow = False
         self._file: CapturePart | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
@@ -112,7 +99,6 @@ class Recorder:
         self._space_ns = 0
         self._clock_ns = 0
         self._offset = 0
-        self._failed = False
         self._full = False
         self._recorded_losses = 0
 
@@ -149,23 +135,19 @@ class Recorder:
 
     def reports(self, now: int) -> list[Report]:
         """Take what went wrong, or is right again, since the last call."""
-        taken: list[Report] = []
-        while self._reports:
-            taken.append(self._reports.popleft())
+        taken = self._faults.take()
         if self._overflowed >= max(1, 2 * self._reported_overflow):
             self._reported_overflow = self._overflowed
             text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
-            taken.append(Report("losses", True, text))
-        since, folder = self._busy_since, self.settings.folder
-        if since is not None and now - since > _SLOW_NS and not self._reported_slow:
-            self._reported_slow = True
-            text = f"captures: {folder}: the disk does not answer; the gateway is not held up."
-            taken.append(Report("disk", True, text))
-        elif since is None and self._reported_slow:
-            self._reported_slow = False
-            taken.append(Report("disk", False, f"captures: {folder}: the disk answers again"))
+            taken.append(Report("captures: losses", True, text))
+        since = self._busy_since
+        is_slow = since is not None and now - since > _SLOW_NS
+        if is_slow or since is None:
+            text = "does not answer; the gateway is not held up." if is_slow else "answers again"
+            text = f"captures: {self.settings.folder}: the disk {text}"
+            self._faults.note("captures: disk", is_slow, text)
         self.facts.lost = self._overflowed + self._unwritten
-        return taken
+        return taken + self._faults.take()
 
     def close(self) -> None:
         """Write what waits and end the thread; a disk that does not answer is waited for 0.35 s and no longer."""
@@ -186,7 +168,8 @@ class Recorder:
             try:
                 self._write(items, now)
             except Exception as error:  # a mistake of ours is no reason to end either
-                self._fail(error, now, items)
+                self._unwritten += len(items)
+                self._fail(error, now)
             if not entries or self._file is None:
                 break
         self._busy_since = None
@@ -195,11 +178,11 @@ class Recorder:
         try:
             self._end_part()
         except Exception as error:  # whatever it is, the gateway is ending
-            self._fail(error, self._clock(), [])
+            self._fail(error, self._clock())
 
     def _write(self, items: list[Item], now: int) -> None:
         if not self._may_write(now):
-            self._lose(items)
+            self._unwritten += len(items)
             return
         if self._file is None:
             self._begin_part(items[0][0] if items else now)
@@ -209,25 +192,23 @@ class Recorder:
             self._recorded_devices = self._devices
             file.write(b"I", json_payload({"devices": self._recorded_devices}))
         if items:
-            self._remark(file, items, now)
+            self._remark(items, now)
             file.take(items)
         self.facts.bytes += file.sync()
         self.facts.file = str(file.path)
-        if self._failed:
-            self._failed = False
-            self.facts.problem = ""
-            self._reports.append(Report("folder", False, f"captures: {file.path} is written"))
+        if self.facts.problem:
+            self._note_problem("", f"{file.path} is written")
         settings = self.settings
         is_large = settings.part_bytes and file.size >= settings.part_bytes
         is_old = settings.part_ns and now - file.begun >= settings.part_ns
         if is_large or is_old:
             self._end_part()
 
-    def _remark(self, file: "CapturePart", items: list[Item], now: int) -> None:
+    def _remark(self, items: list[Item], now: int) -> None:
         """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
         last = items[-1][0]
-        if (lost := self._overflowed + self._unwritten - file.lost) > 0:
-            file.lost += lost
+        if (lost := self._overflowed + self._unwritten - self._recorded_losses) > 0:
+            self._recorded_losses += lost
             items.append((last, Kind.LOST, 0, number_data(lost), 0, None))
         if now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
@@ -249,30 +230,24 @@ class Recorder:
             if self._full:
                 self._end_part()
                 minimum = self.settings.min_free_bytes // _MB
-                self._say_failed(
+                self._note_problem(
                     f"{self.settings.folder}: less than {minimum} MB are free: nothing is recorded"
                 )
         return not self._full
 
-    def _lose(self, items: list[Item]) -> None:
-        self._unwritten += len(items)
-
-    def _fail(self, error: Exception, now: int, items: list[Item]) -> None:
-        self._lose(items)
+    def _fail(self, error: Exception, now: int) -> None:
         file, self._file = self._file, None
         if file is not None:
-            self._recorded_losses = file.lost
             file.abandon()
         self.facts.file = ""
         self._retry_ns = self._space_ns = now + _RETRY_NS
-        reason = error.strerror or str(error) if isinstance(error, OSError) else repr(error)
-        self._say_failed(f"{self.settings.folder}: cannot be written: {reason}. Trying again.")
+        folder, reason = self.settings.folder, reason_of(error)
+        self._note_problem(f"{folder}: cannot be written: {reason}. Trying again.")
 
-    def _say_failed(self, text: str) -> None:
-        self.facts.problem = text
-        if not self._failed:
-            self._failed = True
-            self._reports.append(Report("folder", True, f"captures: {text}"))
+    def _note_problem(self, problem: str, over: str = "") -> None:
+        """Nothing is recorded now because of a problem, or it is again."""
+        self.facts.problem = problem
+        self._faults.note("captures: folder", bool(problem), f"captures: {problem or over}")
 
     def _begin_part(self, since: int) -> None:
         """``since``: time of the part's first entry."""
@@ -293,13 +268,11 @@ class Recorder:
         }
         base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
         self._file = CapturePart(base.with_name(base.name + SUFFIX), json_payload(header), now)
-        self._file.lost = self._recorded_losses
         remove_oldest(self.settings.folder, self.settings.keep_bytes)
 
     def _end_part(self) -> None:
         file, self._file = self._file, None
         if file is not None:
-            self._recorded_losses = file.lost
             self.facts.file = ""
             self.facts.bytes += file.close()
 
@@ -308,12 +281,8 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
     """What a replay that begins now cannot know."""
     return {
         "escs": [
-            {
-                "energy": esc.drawn.energy_mw_ns,
-                "run_time": esc.drawn.run_time,
-                "losses": esc.losses,
-            }
-            for esc in gateway.escs
+            {"energy": e.drawn.energy_mw_ns, "run_time": e.drawn.run_time, "losses": e.losses}
+            for e in gateway.escs
         ],
         "can_state": int(gateway.status.can_state),
         "started_ns": gateway.status.started_ns,

@@ -16,12 +16,12 @@ from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import (
     MAX_EXTENDED_ID,
     MAX_STANDARD_ID,
+    RECEIVE_LIMIT,
     CanPort,
     Received,
 )
 from kontronik_can_gw.transmit_queue import Sent
 
-_DISCARD_LIMIT = 4096
 _RECEIVE_BUFFER = 1 << 20
 """Bytes asked for; the kernel grants what net.core.rmem_max allows, by default twice the usual 278 frames."""
 _SEND_BUFFER = 1
@@ -68,10 +68,6 @@ class SocketCanPort(CanPort):
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def discard(self) -> None:
-        self._receive(_DISCARD_LIMIT)
-        self._known_drops = self._drops()
-
     def close(self) -> None:
         with contextlib.suppress(Exception):
             # of an interface that is gone: nothing is left to do
@@ -84,7 +80,7 @@ class SocketCanPort(CanPort):
         except OSError:  # of an interface that was removed a moment ago
             self.gone = True
 
-    def _receive(self, limit: int) -> Received:
+    def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
         frames: Received = []
         self.drained = True
         for _ in range(limit):

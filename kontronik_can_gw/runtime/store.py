@@ -16,6 +16,7 @@ from pathlib import Path
 
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.runtime.disk import reason_of, sync_folder, write_all
 from kontronik_can_gw.runtime.locks import Taken, lock_file
 from kontronik_can_gw.runtime.worker import Handover, Worker
 
@@ -52,7 +53,7 @@ class ParameterStore:
                 f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
             ) from None
         except OSError as error:
-            return f"{path}: {_reason(error)}"
+            return f"{path}: {reason_of(error)}"
         return None
 
     def load(self, name: str) -> tuple[Stored, str | None]:
@@ -72,11 +73,11 @@ class ParameterStore:
         except OSError as error:
             # perhaps only for now: it is not touched before something is to be saved
             self._unusable.add(name)
-            return Stored(), f"{path}: {_reason(error)}"
+            return Stored(), f"{path}: {reason_of(error)}"
         except ValueError as error:
             try:
                 _keep_damaged(path)
-                _sync_folder(path.parent)
+                sync_folder(path.parent)
             except OSError:
                 self._unusable.add(name)
             return Stored(), f"{path}: {error}"
@@ -134,11 +135,11 @@ class ParameterStore:
                 _keep_damaged(path)
                 self._unusable.remove(name)
             temporary.replace(path)
-            _sync_folder(self._folder)
+            sync_folder(self._folder)
         except OSError as error:
             with contextlib.suppress(OSError):
                 temporary.unlink()
-            return f"{path}: {_reason(error)}"
+            return f"{path}: {reason_of(error)}"
         return None
 
 
@@ -149,10 +150,6 @@ def parameter_file(folder: Path, name: str) -> Path:
 
 def _temporary(path: Path) -> Path:
     return path.with_name(path.name + ".tmp")
-
-
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)
 
 
 def _keep_damaged(path: Path) -> None:
@@ -166,7 +163,7 @@ def _make_folder(folder: Path) -> None:
         return
     _make_folder(folder.parent)
     folder.mkdir(mode=0o700, exist_ok=True)
-    _sync_folder(folder.parent)
+    sync_folder(folder.parent)
 
 
 def _write_synced(path: Path, data: bytes) -> None:
@@ -174,17 +171,7 @@ def _write_synced(path: Path, data: bytes) -> None:
     path.unlink(missing_ok=True)
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
-        rest = memoryview(data)
-        while rest:
-            rest = rest[os.write(fd, rest) :]
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-
-
-def _sync_folder(folder: Path) -> None:
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
+        write_all(fd, data)
         os.fsync(fd)
     finally:
         os.close(fd)

@@ -11,6 +11,8 @@ from typing import TextIO
 
 _MAX_CHARACTERS = 800
 """Of a status line: systemd reads 4096 bytes of a datagram, and a character has up to 4."""
+_PRIORITIES = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6}
+"""Syslog's, by logging's level; anything else is for debugging, 7."""
 
 
 class Notifier:
@@ -22,14 +24,9 @@ class Notifier:
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         environment = os.environ if environment is None else environment
         address = environment.get("NOTIFY_SOCKET", "")
-        self._address = (
-            "\0" + address[1:]
-            if address.startswith("@")
-            else address
-            if address.startswith("/")
-            else ""
-        )
-        self._watchdog_ns = _watchdog_ns(environment)
+        self._address = {"@": "\0" + address[1:], "/": address}.get(address[:1], "")
+        self.watchdog_ns = _watchdog_ns(environment) if self._address else None
+        """How often ``watchdog`` is to be called at the latest: half of what the manager allows. None: it does not watch this process."""
         self._socket: socket.socket | None = None
         self._pending: dict[str, str] = {}
         self._status = ""
@@ -38,11 +35,6 @@ class Notifier:
     def present(self) -> bool:
         """True where a service manager listens."""
         return bool(self._address)
-
-    @property
-    def watchdog_ns(self) -> int | None:
-        """How often ``watchdog`` is to be called at the latest: half of what the manager allows. None: it does not watch this process."""
-        return self._watchdog_ns if self._address else None
 
     def ready(self, status: str = "") -> None:
         """The gateway has started."""
@@ -55,14 +47,14 @@ class Notifier:
 
     def stopping(self, status: str = "") -> None:
         """About to end."""
-        self._forget("READY")
+        self._pending.pop("READY", None)
         self._send({"STOPPING": "1"} | self._news(status))
 
     def watchdog(self) -> None:
         """Send a sign of life; nothing where nobody watches."""
         if self.watchdog_ns is not None:
             self._send({"WATCHDOG": "1"})
-            self._forget("WATCHDOG")
+            self._pending.pop("WATCHDOG", None)
 
     def close(self) -> None:
         """Give the socket back; a later call opens it again."""
@@ -79,10 +71,6 @@ class Notifier:
             return {}
         self._status = line
         return {"STATUS": line}
-
-    def _forget(self, *names: str) -> None:
-        for name in names:
-            self._pending.pop(name, None)
 
     def _send(self, what: dict[str, str]) -> None:
         if not self._address:
@@ -129,18 +117,5 @@ class JournalFormatter(logging.Formatter):
     """Each line begins with its priority, ``<3>`` for an error: the journal takes each as an entry of its own."""
 
     def format(self, record: logging.LogRecord) -> str:
-        mark = f"<{priority(record.levelno)}>"
+        mark = f"<{_PRIORITIES.get(record.levelno, 7)}>"
         return "\n".join(mark + line for line in super().format(record).split("\n"))
-
-
-def priority(level: int) -> int:
-    """Syslog's priority for a level of ``logging``: 2 critical, 3 error, 4 warning, 5 notice, 6 information, 7 debug."""
-    for minimum, number in (
-        (logging.CRITICAL, 2),
-        (logging.ERROR, 3),
-        (logging.WARNING, 4),
-        (logging.INFO + 1, 5),
-    ):
-        if level >= minimum:
-            return number
-    return 6 if level >= logging.INFO else 7

@@ -80,10 +80,6 @@ class Transmitter:
             self._go_on(now)
         return answer
 
-    def retry_now(self) -> None:
-        """The port takes frames again."""
-        self.due = NEVER
-
     def forget_failures(self) -> None:
         """The port is another one, or none."""
         self.due, self._busy_since = NEVER, None

@@ -1,7 +1,7 @@
 """Threads beside the loop: what waits for a disk, a driver or a reader waits there.
 
-What may touch what: a ``Handover`` may be used by any thread. Of a ``Worker`` only ``work``, ``wait`` and ``failed``, as they were given
-to it, run in its thread; everything else belongs to its owner, ``put`` to any thread.
+What may touch what: ``Handover`` and ``Faults`` may be used by any thread. Of a ``Worker`` only ``work``, ``wait`` and ``failed``, as they
+were given to it, run in its thread; everything else belongs to its owner, ``put`` to any thread.
 """
 
 import contextlib
@@ -13,7 +13,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from kontronik_can_gw.runtime import realtime
 
@@ -64,8 +64,7 @@ class Handover(Generic[Item]):
             if len(self._items) >= self._capacity:
                 return False
             self._items.append(item)
-            if self._fd >= 0:
-                os.eventfd_write(self._fd, 1)
+            self.wake()
         return True
 
     def wake(self) -> None:
@@ -82,24 +81,49 @@ class Handover(Generic[Item]):
                     os.eventfd_read(self._fd)
             items = self._items
             taken = [items.popleft() for _ in range(min(limit, len(items)))]
-            if items and self._fd >= 0:
-                os.eventfd_write(self._fd, 1)
+            if items:
+                self.wake()
         return taken
 
     def close(self) -> None:
         """Close the descriptor; may be called again."""
         with self._lock:
-            if self._fd >= 0:
-                os.close(self._fd)
-            self._fd = -1
+            fd, self._fd = self._fd, -1
+            if fd >= 0:
+                os.close(fd)
+
+
+class Report(NamedTuple):
+    """A fault that begins, or is over. ``name`` is that of the condition in the fault log."""
+
+    name: str
+    begins: bool
+    text: str
+
+
+class Faults:
+    """Faults of a worker on their way to the fault log: one report as each begins, one when it is over."""
+
+    def __init__(self) -> None:
+        self._on: set[str] = set()
+        self._reports: deque[Report] = deque()
+
+    def note(self, name: str, is_on: bool, text: str) -> None:
+        """How it is now; nothing is reported where it was so before. A name belongs to one thread."""
+        if is_on != (name in self._on):
+            (self._on.add if is_on else self._on.discard)(name)
+            self._reports.append(Report(name, is_on, text))
+
+    def take(self) -> list[Report]:
+        """The reports since the last call."""
+        return [self._reports.popleft() for _ in range(len(self._reports))]
 
 
 class Worker(Generic[Item]):
     """A thread that does what it is handed, oldest first.
 
     ``work`` is called after each ``wait`` with the items that have come, and a last time at the end, then ``ended``. What they raise is
-    given to ``failed`` and does not end the thread. ``wait`` returns when there is something to do, or when ``fileno`` is readable;
-    without it the worker waits for items only.
+    given to ``failed`` and does not end the thread. ``wait`` returns when there is something to do; without it the worker waits for items.
     """
 
     def __init__(
@@ -112,7 +136,7 @@ class Worker(Generic[Item]):
         ended: Callable[[], None] = lambda: None,
         capacity: int = sys.maxsize,
     ) -> None:
-        self.name = name
+        self._name = name
         self._work = work
         self._failed = failed or self._log_failure
         self._wait = wait or self._wait_for_items
@@ -124,15 +148,11 @@ class Worker(Generic[Item]):
     def start(self) -> bool:
         """Start the thread if it does not run yet. False: the system gives no thread now."""
         if self._thread is None:
-            thread = threading.Thread(target=self._run, name=self.name, daemon=True)
+            thread = threading.Thread(target=self._run, name=self._name, daemon=True)
             if not start_beside_the_loop(thread):
                 return False
             self._thread = thread
         return True
-
-    def fileno(self) -> int:
-        """Readable while items wait, and at the end; -1 after ``stop``."""
-        return self._items.fileno()
 
     def put(self, item: Item) -> bool:
         """Hand an item over; never waits. False: too many wait, or the worker is to end."""
@@ -184,4 +204,4 @@ class Worker(Generic[Item]):
         poll.poll()
 
     def _log_failure(self, error: Exception) -> None:
-        log.error("%s: %r", self.name, error)
+        log.error("%s: %r", self._name, error)

@@ -83,7 +83,7 @@ class Bench:
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
         self.can = CanLink(
-            loaded.config.can, self.gateway, World(), FaultLog(), clock=lambda: self.clock
+            *(loaded.config.can, self.gateway, World().poller, FaultLog()), clock=lambda: self.clock
         )
 
     @property
@@ -95,6 +95,13 @@ class Bench:
         self.can.open(self.now, wait=True)
         self.gateway.start(self.now, self.can.is_open)
         self.can.transmit(self.now)
+
+    def begin(self) -> None:
+        """The interface is open, and what was sent first is taken."""
+        self.kernel.facts = ACTIVE
+        self.start()
+        self.turn(300)
+        self.take()
 
     def turn(self, ms: int = 1) -> None:
         """As the loop does, a millisecond at a time; a deadline that stays in the past would make the loop spin."""
@@ -148,10 +155,7 @@ def test_behind_a_restart_the_node_boots_and_says_8140h_as_soon_as_the_queue_run
     bench: Bench, kernel: Kernel, late_ms: int
 ) -> None:
     """The kernel's order: error frame "restarted", then the queue is started, which rtnetlink tells; before that frames vanish."""
-    kernel.facts = ACTIVE
-    bench.start()
-    bench.turn(500)
-    bench.take()
+    bench.begin()
     kernel.facts = OFF._replace(running=False)
     bench.error_frame(CanState.BUS_OFF)
     bench.turn(200)
@@ -175,10 +179,7 @@ def test_a_driver_that_goes_on_telling_of_bus_off_behind_a_restart_does_not_make
     bench: Bench,
     kernel: Kernel,
 ) -> None:
-    kernel.facts = ACTIVE
-    bench.start()
-    bench.turn(500)
-    bench.take()
+    bench.begin()
     kernel.facts = OFF._replace(running=False)
     bench.error_frame(CanState.BUS_OFF)
     bench.turn(50)
@@ -223,9 +224,7 @@ def test_an_interface_that_is_missing_at_start_makes_one_boot_up_when_it_comes(
 def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(
     bench: Bench, kernel: Kernel
 ) -> None:
-    kernel.facts = ACTIVE
-    bench.start()
-    bench.turn(100)
+    bench.begin()
     kernel.facts = LinkFacts(exists=False)
     Port.there = False
     kernel.news = [LinkFacts(exists=False)]
@@ -242,10 +241,8 @@ def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(
     assert bench.can.port is port
 
 
-def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(
-    bench: Bench, kernel: Kernel
-) -> None:
-    kernel.facts = ACTIVE
+def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(bench: Bench) -> None:
+    bench.kernel.facts = ACTIVE
     bench.start()
     bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now, bench.now)
     assert bench.gateway.status.id_conflicts == 0
@@ -258,9 +255,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
     bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
-    kernel.facts = ACTIVE
-    bench.start()
-    bench.turn(100)
+    bench.begin()
     caplog.clear()
     kernel.facts = LinkFacts(exists=True, up=False)
     kernel.news = [kernel.facts]
@@ -291,7 +286,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> 
     side = CanLink(
         loaded.config.can,
         gateway,
-        World(),
+        World().poller,
         FaultLog(),
         lambda path: "left" if "USB1" in path else None,
     )
@@ -303,12 +298,9 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> 
 def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
     bench: Bench, kernel: Kernel
 ) -> None:
-    kernel.facts = ACTIVE
-    bench.start()
-    bench.turn(100)
-    bench.take()
+    bench.begin()
     bench.port.answer = Sent.BUSY
-    bench.can.transmitter.queue.put(CanFrame(0x100, b"held"))
+    bench.can.transmitter.queue.put_all([CanFrame(0x100, b"held")])
     bench.can.transmit(bench.now)
     bench.can._is_proven = False
     bench.can.transmitter.clear()
@@ -320,10 +312,10 @@ def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
 
 
 def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
-    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture
+    bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
-    kernel.facts = ACTIVE
+    bench.kernel.facts = ACTIVE
     bench.start()
     bench.gateway.receive_bytes(
         0, encode(LiveData(battery_voltage=2400), Layout.V4), bench.now, bench.now
@@ -356,20 +348,17 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
     for n in range(3000):
         port.answer = Sent.OK if n % 3 else Sent.BUSY
         for can_id in range(10):
-            bench.can.transmitter.queue.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
+            bench.can.transmitter.queue.put_all([CanFrame(0x100 + can_id, bytes((n & 255,)))])
         bench.turn()
     assert bench.can.port is before
     port.answer = Sent.BUSY
-    bench.can.transmitter.queue.put(CanFrame(0x100, b""))
+    bench.can.transmitter.queue.put_all([CanFrame(0x100, b"")])
     bench.turn(2000)
     assert bench.can.port is not before
 
 
-def test_bus_off_and_lost_frames_are_counted_once(bench: Bench, kernel: Kernel) -> None:
-    kernel.facts = ACTIVE
-    bench.start()
-    bench.turn(200)
-    bench.take()
+def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
+    bench.begin()
     bench.port.bus_off_count, bench.port.overruns = 2, 1
     for _ in range(2):
         bench.can.serve(bench.now)
@@ -405,3 +394,15 @@ def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) ->
     bench.gateway.receive_frame(CanFrame(0x601, watch_node_5), bench.now, bench.now)
     bench.turn(1)
     assert {0x601, 0x705} <= bench.port.ids
+
+
+def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> None:
+    bench.start()
+    bench.turn(100)
+    before = bench.port
+    before.gone = True
+    bench.can.serve(bench.now)
+    assert not bench.can.is_open
+    bench.turn(600)
+    assert bench.port is not before
+    assert told(bench.take()) == ["boot-up"]

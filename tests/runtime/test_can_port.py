@@ -18,23 +18,18 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
-from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
-from kontronik_can_gw.runtime.driver_port import DriverPort
-from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.driver_port import QUEUE_LENGTH, DriverPort
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
 
+SOL = socket.SOL_SOCKET
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 _numbers = itertools.count()
 
@@ -98,9 +93,13 @@ def frames_of(port: CanPort) -> list[CanFrame]:
 
 
 @pytest.fixture
-def socket_port() -> tuple[CanPort, FakeSocket]:
-    fake = FakeSocket()
-    return SocketCanPort(fake, lambda: None), fake  # type: ignore[arg-type]
+def fake() -> FakeSocket:
+    return FakeSocket()
+
+
+@pytest.fixture
+def port(fake: FakeSocket) -> CanPort:
+    return SocketCanPort(fake, lambda: None)  # type: ignore[arg-type]
 
 
 def packet(can_id: int, data: bytes = b"") -> bytes:
@@ -114,9 +113,8 @@ def filters_of(fake: FakeSocket) -> list[tuple[int, int]]:
 
 
 def test_a_filter_names_each_id_and_shuts_out_its_29_bit_and_remote_twins(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({0x601, 0x000, 0x80})
     assert filters_of(fake) == [(can_id, 0xC00007FF) for can_id in (0x000, 0x80, 0x601)]
     port.set_receive_ids(frozenset())
@@ -152,15 +150,14 @@ def test_any_set_of_ids_fits_into_the_kernels_filters(
 
 
 @pytest.mark.parametrize("wrong", [-1, 0x800, EXTENDED - 1, EXTENDED | 0x2000_0000, 1 << 32])
-def test_what_is_no_id_is_refused(socket_port: tuple[CanPort, FakeSocket], wrong: int) -> None:
+def test_what_is_no_id_is_refused(port: CanPort, wrong: int) -> None:
     with pytest.raises(ValueError, match="no identifiers"):
-        socket_port[0].set_receive_ids([0x601, wrong])
+        port.set_receive_ids([0x601, wrong])
 
 
 def test_only_data_frames_with_the_wanted_ids_are_handed_on(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({0x601, 0, 0x602 | EXTENDED})
     fake.inbox = [
         packet(0x601, b"abc"),
@@ -182,28 +179,16 @@ def test_only_data_frames_with_the_wanted_ids_are_handed_on(
     assert port.state is CanState.BUS_OFF
 
 
-def test_a_call_takes_a_bounded_number_of_frames(socket_port: tuple[CanPort, FakeSocket]) -> None:
-    port, fake = socket_port
-    port.set_receive_ids({1})
-    fake.inbox = [packet(1, bytes((n,))) for n in range(200)]
-    sizes = [len(port.receive()) for _ in range(5)]
-    assert sizes == [RECEIVE_LIMIT] * 3 + [200 - 3 * RECEIVE_LIMIT, 0]
-
-
 def test_a_port_is_drained_when_nothing_waits_however_few_frames_were_passed_on(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox = [packet(1), packet(ERROR | 0x04, b"\0\x10")] * RECEIVE_LIMIT
-    found = []
-    for _ in range(3):
-        found.append((len(port.receive()), port.drained))
+    found = [(len(port.receive()), port.drained) for _ in range(3)]
     assert found == [(RECEIVE_LIMIT // 2, False), (RECEIVE_LIMIT // 2, False), (0, True)]
 
 
-def test_each_way_into_bus_off_is_counted_once(socket_port: tuple[CanPort, FakeSocket]) -> None:
-    port, fake = socket_port
+def test_each_way_into_bus_off_is_counted_once(port: CanPort, fake: FakeSocket) -> None:
     off, restarted = packet(ERROR | 0x40, bytes(8)), packet(ERROR | 0x100, bytes(8))
     fake.inbox = [off, off, restarted, off, packet(ERROR | 0x04, b"\0\x10"), off]
     port.receive()
@@ -211,9 +196,8 @@ def test_each_way_into_bus_off_is_counted_once(socket_port: tuple[CanPort, FakeS
 
 
 def test_lost_frames_are_noticed_in_the_controller_and_in_the_socket(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox = [packet(ERROR | 0x04, b"\0\x01" + bytes(6))]
     port.receive()
@@ -233,10 +217,7 @@ def test_lost_frames_are_noticed_in_the_controller_and_in_the_socket(
 
 
 @pytest.mark.parametrize("number", [errno.ENETDOWN, errno.ENODEV, errno.EIO])
-def test_an_error_does_not_end_reception(
-    socket_port: tuple[CanPort, FakeSocket], number: int
-) -> None:
-    port, fake = socket_port
+def test_an_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number: int) -> None:
     port.set_receive_ids({1})
     fake.inbox = [packet(1, b"a"), number, packet(1, b"b")]
     assert frames_of(port) == [CanFrame(1, b"a")]
@@ -247,17 +228,15 @@ def test_an_error_does_not_end_reception(
 
 
 def test_an_interface_that_goes_while_filters_are_set_is_gone(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort, fake: FakeSocket
 ) -> None:
-    port, fake = socket_port
     fake.fault = errno.ENODEV
     port.set_receive_ids({1})
     assert port.gone
     assert port.send(CanFrame(2, b"")) is Sent.GONE
 
 
-def test_a_remote_frame_is_sent_as_one(socket_port: tuple[CanPort, FakeSocket]) -> None:
-    port, fake = socket_port
+def test_a_remote_frame_is_sent_as_one(port: CanPort, fake: FakeSocket) -> None:
     port.send(CanFrame(0x701, b"", remote=True))
     assert fake.sent == [packet(0x701 | REMOTE)]
 
@@ -265,22 +244,17 @@ def test_a_remote_frame_is_sent_as_one(socket_port: tuple[CanPort, FakeSocket]) 
 @pytest.mark.parametrize(
     ("ancillary", "came"),
     [
-        ([(socket.SOL_SOCKET, 64, struct.pack("=qq", 1_700_000_000, 250_000_000))], 41_750 * MS),
-        ([(socket.SOL_SOCKET, 35, struct.pack("=ii", 1_700_000_000, 250_000_000))], 41_750 * MS),
-        (
-            [
-                (socket.SOL_SOCKET, 40, bytes(4)),
-                (socket.SOL_SOCKET, 35, struct.pack("=qq", 1_700_000_000, 0)),
-            ],
-            41_500 * MS,
-        ),
-        ([(socket.SOL_SOCKET, 64, bytes(3))], None),
+        ([(SOL, 64, struct.pack("=qq", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        ([(SOL, 35, struct.pack("=ii", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        ([(SOL, 40, bytes(4)), (SOL, 35, struct.pack("=qq", 1_700_000_000, 0))], 41_500 * MS),
+        ([(SOL, 64, bytes(3))], None),
         ([(socket.IPPROTO_TCP, 64, bytes(16))], None),
         ([], None),
     ],
 )
 def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
-    socket_port: tuple[CanPort, FakeSocket],
+    port: CanPort,
+    fake: FakeSocket,
     monkeypatch: pytest.MonkeyPatch,
     ancillary: list[tuple[int, int, bytes]],
     came: int | None,
@@ -289,7 +263,6 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
         time_ns=lambda: 1_700_000_000_500_000_000, monotonic_ns=lambda: 42 * SECOND
     )
     monkeypatch.setattr(socketcan_port, "time", clock)
-    port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox, fake.ancillary = [packet(1)], ancillary
     assert fake.options[64] == 1, "the kernel is asked for them"
@@ -302,10 +275,9 @@ FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
 @pytest.mark.parametrize("proven", [True, False])
 @pytest.mark.parametrize("stopped_before", range(7))
 def test_what_became_late_in_the_middle_of_a_turn_stays(
-    socket_port: tuple[CanPort, FakeSocket], proven: bool, stopped_before: int
+    port: CanPort, fake: FakeSocket, proven: bool, stopped_before: int
 ) -> None:
     """The process is stopped in front of one of the frames: those before have gone, and nothing after."""
-    port, fake = socket_port
     if proven:
         assert port.send(CanFrame(0x7FF, b"")) is Sent.OK
         fake.sent.clear()
@@ -317,9 +289,8 @@ def test_what_became_late_in_the_middle_of_a_turn_stays(
 
 @pytest.mark.parametrize("full", range(6))
 def test_a_queue_that_is_full_is_not_taken_for_lateness(
-    socket_port: tuple[CanPort, FakeSocket], full: int
+    port: CanPort, fake: FakeSocket, full: int
 ) -> None:
-    port, fake = socket_port
     fake.full = full
     assert port.send_all(FRAMES, lambda: 0, 1000) == (full, Sent.BUSY)
     assert len(fake.sent) == full
@@ -417,11 +388,9 @@ def test_one_thread_brings_the_wanted_frames_in_order() -> None:
 def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> None:
     with virtual() as (port, other):
         port.set_receive_ids({1})
-        reader = port._reader
-        assert reader is not None
         for n in range(QUEUE_LENGTH + 20):
             other.send(message(1, n.to_bytes(2, "little")))
-        wait_for(lambda: reader.dropped == 20, "20 dropped frames")
+        wait_for(lambda: port._dropped == 20, "20 dropped frames")
         frames: list[CanFrame] = []
         while len(frames) < QUEUE_LENGTH:
             assert readable(port), "what is left keeps the descriptor readable"
@@ -433,19 +402,6 @@ def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> N
             range(QUEUE_LENGTH)
         )
         assert port.overruns == 1
-
-
-def test_what_waits_can_be_thrown_away() -> None:
-    with virtual() as (port, other):
-        port.set_receive_ids({1})
-        reader = port._reader
-        assert reader is not None
-        for _ in range(200):
-            other.send(message(1, b"old"))
-        wait_for(lambda: len(reader._frames) == 200, "200 frames")
-        port.discard()
-        other.send(message(1, b"new"))
-        assert receive(port, 1) == [CanFrame(1, b"new")]
 
 
 def test_own_frames_do_not_come_back_even_where_the_driver_is_told_to_return_them() -> None:
@@ -530,7 +486,7 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
     held = threading.Event()
     with virtual() as (port, other):
         other.send(message(1))
-        monkeypatch.setattr("kontronik_can_gw.runtime.bus_reader._MAX_END_S", 0.01)
+        monkeypatch.setattr("kontronik_can_gw.runtime.driver_port._MAX_END_S", 0.01)
         waiting = threading.Event()
 
         def holding(timeout: float | None) -> can.Message:
@@ -551,55 +507,3 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
             with pytest.raises(BlockingIOError):
                 os.eventfd_read(fd)
             os.close(fd)
-
-
-# --- the loop
-
-
-def test_the_loop_answers_what_the_thread_brings_and_opens_an_adapter_anew_when_its_reader_failed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    channel = f"loop-{os.getpid()}"
-    with can.Bus(interface="virtual", channel=channel) as other, PtyEsc() as esc:
-        tables = {
-            "can": {"interface": "virtual", "channel": channel},
-            "canopen": {"enabled": True, "store": "/nowhere"},
-            "esc": [{"port": esc.path}],
-        }
-        loaded = assemble(parse(tables, "test"))
-        gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
-        loop = Loop(gateway, [esc.path], loaded.config.can)
-
-        def frame_of(can_id: int) -> bytes:
-            while True:
-                frame = other.recv(120)
-                assert frame is not None
-                if frame.arbitration_id == can_id:
-                    return bytes(frame.data)
-
-        def answer_to(index: int) -> bytes:
-            other.send(message(0x601, bytes((0x40, index & 255, index >> 8, 0, 0, 0, 0, 0))))
-            return frame_of(0x581)
-
-        loop.open()
-        first = loop.can.port
-        assert isinstance(first, DriverPort)
-        thread = threading.Thread(target=loop.run)
-        thread.start()
-        try:
-            assert frame_of(0x701) == b"\0"  # boot-up: from now on the node answers
-            for index in range(0x9900, 0x9914):
-                assert answer_to(index)[1:3] == index.to_bytes(2, "little")
-
-            def failing(timeout: float | None) -> None:
-                raise can.CanOperationError("unplugged")
-
-            old = readers()
-            monkeypatch.setattr(first._bus, "recv", failing)
-            wait_for(lambda: bool(set(readers()) - set(old)), "another reader")
-            assert answer_to(0x1000)[0] == 0x43
-        finally:
-            loop.stop()
-            thread.join(120)
-        assert not thread.is_alive()
-    assert readers() == []

@@ -5,9 +5,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
-
-import pytest
 
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import CanConfig
@@ -68,18 +65,15 @@ def collector_off() -> Iterator[None]:
         gc.enable()
 
 
-def loaded(folder: Path, canopen: bool) -> Loaded:
-    tables: dict[str, Any] = {"esc": [{"port": "a"}, {"port": "b"}], "can": {"bitrate": 1_000_000}}
-    if canopen:
-        tables["canopen"] = {"enabled": True, "store": str(folder / "store"), "self_start": True}
-    return assemble(parse(tables, "test"))
+def loaded(folder: Path) -> Loaded:
+    """Two ESCs, with messages and nodes."""
+    canopen = {"enabled": True, "store": str(folder / "store"), "self_start": True}
+    escs = [{"port": "a"}, {"port": "b"}]
+    can = {"bitrate": 1_000_000}
+    return assemble(parse({"esc": escs, "can": can, "canopen": canopen}, "test"))
 
 
-def drive(
-    gateway: Gateway,
-    turns: range,
-    each_turn: Callable[[int, int], object] = lambda _turn, _now: None,
-) -> int:
+def drive(gateway: Gateway, turns: range, each_turn: Callable[[int, int], object]) -> int:
     """Live and info frames, damaged ones, silence, an unplugged port, a bus in trouble, a master; the CAN frames that came of it."""
     sent = 0
     for turn in turns:
@@ -118,72 +112,48 @@ def test_a_circle_would_be_found() -> None:
         assert any("Circle object" in found for found in garbage())
 
 
-@pytest.mark.parametrize("canopen", [False, True], ids=["dbc", "canopen with its PDOs"])
-def test_frames_leave_no_garbage(tmp_path: Path, canopen: bool) -> None:
-    setup = loaded(tmp_path, canopen)
-    gateway = Gateway(setup.escs, setup.layout, 0, False, setup.canopen)
-    gateway.start(0)
-    drive(gateway, START)
-    with collector_off():
-        sent = drive(gateway, STEADY)
-        assert garbage() == []
-    assert sent > FRAMES
-    if canopen:
-        assert sum(pdos for _, _, pdos in gateway.node_states()) > FRAMES
-
-
-def test_recording_leaves_no_garbage(tmp_path: Path) -> None:
-    setup = loaded(tmp_path, canopen=True)
+def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> None:
+    setup = loaded(tmp_path)
     recorder = Recorder(RecordSettings(tmp_path / "captures"))
     gateway = RecordedGateway(recorder.put, setup.escs, setup.layout, 0, False, setup.canopen)
     recorder.start()
     assert recorder._worker.stop(60)
 
-    def note(turn: int, now: int) -> None:
-        if turn % 10 == 0:
-            recorder.note(gateway, now)
-            recorder.reports(now)
-
-    try:
-        gateway.start(0)
-        drive(gateway, START, note)
-        with collector_off():
-            drive(gateway, STEADY, note)
-            recorder._work([])  # what the thread does each half second; it has ended
-            assert garbage() == []
-    finally:
-        recorder.close()
-    assert recorder.facts.bytes >= 10 * FRAMES
-
-
-def test_statistics_leave_no_garbage(tmp_path: Path) -> None:
-    setup = loaded(tmp_path, canopen=True)
-    gateway = Gateway(setup.escs, setup.layout, 0, False, setup.canopen)
     ports = [PortFacts(esc.name, "/dev/ttyUSB0", True) for esc in setup.escs]
     facts = {"wall": 0.0, "program": ProgramFacts("x"), "process": ProcessFacts(), "ports": ports}
     can = CanFacts("socketcan", "can0", 500_000, True)
     before: list[Document] = []
     written = 0
 
-    def write(turn: int, now: int) -> None:
+    def each_turn(turn: int, now: int) -> None:
         nonlocal written
+        if turn % 10 == 0:
+            recorder.note(gateway, now)
+            recorder.reports(now)
         if turn % 20 == 0:
             document = snapshot(gateway, now=now, can=can, **facts)  # type: ignore[arg-type]
             document = with_rates(document, before[-1] if before else None)
             written += len(json.dumps(document))
             before[:] = [document]
 
-    gateway.start(0)
-    drive(gateway, START, write)
-    with collector_off():
-        drive(gateway, STEADY, write)
-        assert garbage() == []
+    try:
+        gateway.start(0)
+        drive(gateway, START, each_turn)
+        with collector_off():
+            sent = drive(gateway, STEADY, each_turn)
+            recorder._work([])  # what the thread does each half second; it has ended
+            assert garbage() == []
+    finally:
+        recorder.close()
+    assert sent > FRAMES
+    assert sum(pdos for _, _, pdos in gateway.node_states()) > FRAMES
+    assert recorder.facts.bytes >= 10 * FRAMES
     assert written > 100_000
 
 
 def test_the_loop_leaves_no_garbage(tmp_path: Path) -> None:
     """With its selector, ports, conditions and the CAN side; python-can's virtual interface in place of a socket."""
-    setup = loaded(tmp_path, canopen=True)
+    setup = loaded(tmp_path)
     gateway = Gateway(setup.escs, setup.layout, 0, False, setup.canopen)
     clock = [0]
     with ExitStack() as ends:

@@ -41,6 +41,9 @@ def can_data(
     return parts + attribute(8, struct.pack("=HH", *counters))
 
 
+LINK = link_message(can=can_data())
+
+
 class FakeSocket:
     def __init__(self, *datagrams: bytes | int) -> None:
         self.datagrams = list(datagrams)
@@ -123,22 +126,13 @@ def test_after_an_overrun_the_kernel_is_asked_anew() -> None:
     assert len(fake.sent) == 1
 
 
-@given(
-    st.lists(
-        st.one_of(st.binary(max_size=200), st.just(link_message(can=can_data())).map(bytes)),
-        max_size=5,
-    )
-)
-def test_rubbish_raises_nothing(datagrams: list[bytes]) -> None:
-    heard(*(datagram for datagram in datagrams if datagram))
-
-
-@given(st.integers(0, len(link_message(can=can_data()))), st.integers(0, 255), st.integers(0, 200))
-def test_a_damaged_message_raises_nothing(end: int, value: int, place: int) -> None:
-    message = bytearray(link_message(can=can_data()))
+@given(st.integers(1, len(LINK)), st.integers(0, 255), st.integers(0, 200), st.binary(max_size=200))
+def test_a_damaged_message_and_rubbish_raise_nothing(
+    end: int, value: int, place: int, rubbish: bytes
+) -> None:
+    message = bytearray(LINK)
     message[min(place, len(message) - 1)] = value
-    if end:
-        heard(bytes(message[:end]))
+    heard(bytes(message[:end]), rubbish or b"?")
 
 
 def test_the_real_kernel_tells_of_the_loopback_interface() -> None:

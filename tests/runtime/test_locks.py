@@ -1,14 +1,9 @@
 """Node-IDs and messages belong to one gateway on a machine; nobody but a gateway can take one."""
 
-import errno
 import fcntl
 import os
-import socket
 import stat
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -73,32 +68,6 @@ def test_what_one_has_another_cannot_have_until_it_is_given_back() -> None:
     assert list(locks.SYSTEM_FOLDER.iterdir()) == []
 
 
-def test_a_lock_ends_with_the_process_whatever_ends_it() -> None:
-    code = (
-        "import sys\n"
-        "from pathlib import Path\n"
-        "from kontronik_can_gw.runtime import locks\n"
-        "locks.SYSTEM_FOLDER = Path(sys.argv[2])\n"
-        "mine = locks.Locks()\n"
-        "print(mine.hold([sys.argv[1]]), flush=True)\n"
-        "sys.stdin.read()\n"
-    )
-    mine = Locks()
-    with subprocess.Popen(
-        [sys.executable, "-c", code, NODE, str(locks.SYSTEM_FOLDER)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "[]\n"
-        assert mine.hold([NODE]) == [NODE]
-        other.kill()
-        other.wait()
-    assert mine.hold([NODE]) == []
-    mine.close()
-
-
 @pytest.mark.parametrize(
     "name", [NODE, node_lock("/dev/serial/by-id/usb-A%2F_1@115200", 127), f"{'x' * 300}/node/1"]
 )
@@ -139,15 +108,6 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_op
 
 
 # --- others
-
-
-def test_a_socket_of_any_user_keeps_nobody_from_starting() -> None:
-    """Names of abstract sockets are anybody's: they stood for node-IDs once."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
-        stranger.bind(f"\0kontronik-can-gw/{NODE}")
-        mine = Locks()
-        assert mine.hold([NODE]) == []
-        mine.close()
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder", "hard link", "link"])
@@ -310,18 +270,3 @@ def test_a_users_folder_that_others_can_change_is_reported_once_and_done_without
     mine.close()
     assert len(said) == 1
     assert "Nothing keeps a second gateway" in said[0]
-
-
-def test_where_nothing_can_be_written_the_gateway_goes_on_and_says_so_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def refuse(*_: Any, **__: Any) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    said: list[str] = []
-    mine = Locks(report=said.append)
-    assert mine.hold([NODE]) == mine.hold([NODE, node_lock(CHANNEL, 6)]) == []
-    mine.close()
-    assert len(said) == 1
-    assert "Read-only file system" in said[0]

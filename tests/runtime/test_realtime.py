@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime import realtime
@@ -24,27 +23,16 @@ class Scheduler:
         self.of: dict[int, tuple[int, int]] = {}
         self.permits = True
 
-    def _thread(self, pid: int) -> int:
-        return pid or threading.get_native_id()
-
     def set(self, pid: int, policy: int, param: os.sched_param) -> None:
         if not self.permits:
             raise PermissionError(1, "Operation not permitted")
-        self.of[self._thread(pid)] = (policy, param.sched_priority)
-
-    def policy(self, pid: int) -> int:
-        return self.of.get(self._thread(pid), (os.SCHED_OTHER, 0))[0]
-
-    def param(self, pid: int) -> os.sched_param:
-        return os.sched_param(self.of.get(self._thread(pid), (os.SCHED_OTHER, 0))[1])
+        self.of[pid or threading.get_native_id()] = (policy, param.sched_priority)
 
 
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
     scheduler = Scheduler()
     monkeypatch.setattr(os, "sched_setscheduler", scheduler.set)
-    monkeypatch.setattr(os, "sched_getscheduler", scheduler.policy)
-    monkeypatch.setattr(os, "sched_getparam", scheduler.param)
     monkeypatch.setattr(realtime, "_lock_memory", lambda: None)
     monkeypatch.setattr(realtime._Taken, "priority", None)
     return scheduler
@@ -101,16 +89,6 @@ def configuration(folder: Path, port: str, channel: str) -> Path:
         f'[can]\ninterface = "virtual"\nchannel = "{channel}"\n[run]\nrealtime_priority = 7\n[[esc]]\nport = "{port}"\n'
     )
     return file
-
-
-def test_a_run_without_the_right_ends_with_one_line(
-    kernel: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    kernel.permits = False
-    with PtyEsc() as esc:
-        assert main(["run", "-c", str(configuration(tmp_path, esc.path, "realtime"))]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "run.realtime_priority = 7: not permitted." in line
 
 
 def test_a_real_process_has_what_it_is_permitted_to(tmp_path: Path) -> None:

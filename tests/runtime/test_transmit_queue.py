@@ -30,37 +30,23 @@ def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
 def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
     queue, sent = TransmitQueue(), list[CanFrame]()
     for n in range(6):
-        queue.put(queued(n))
+        queue.put_all([queued(n)])
     for n in range(6):
-        queue.put(slot(0x181 + n))
+        queue.put_all([slot(0x181 + n)])
     while len(queue):
         assert send(queue, sent, 1) == 1
     assert [frame.queued for frame in sent] == [True, False] * 6
 
 
-def test_a_refused_frame_stays_first_in_its_line() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
-    queue.put(queued(0))
-    queue.put(slot(0x181, 1))
-    for _ in range(3):
-        assert send(queue, sent, 0) == 0
-    queue.put(queued(1))
-    queue.put(slot(0x182, 1))
-    queue.put(slot(0x181, 2))
-    assert send(queue, sent, 9) == 4
-    assert sent == [queued(0), slot(0x181, 2), queued(1), slot(0x182, 1)]
-    assert queue.replaced == 1
-
-
 def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     queue, sent = TransmitQueue(), list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
-        queue.put(queued(n))
+        queue.put_all([queued(n)])
     assert (len(queue), queue.dropped) == (QUEUE_LENGTH, 10)
-    queue.put(slot(0x181))
+    queue.put_all([slot(0x181)])
     assert len(queue) == QUEUE_LENGTH + 1, "slots are not held by a full queue"
     send(queue, sent, 2)
-    queue.put(queued(7))
+    queue.put_all([queued(7)])
     queue.clear()
     assert (len(queue), queue.dropped, queue.replaced) == (0, 10 + QUEUE_LENGTH, 0)
     assert send(queue, sent, 9) == 0
@@ -69,7 +55,7 @@ def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
 def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
     queue, sent = TransmitQueue(), list[CanFrame]()
     for number in range(10):
-        queue.put(CanFrame(1, bytes((number,)), page=number % 2))
+        queue.put_all([CanFrame(1, bytes((number,)), page=number % 2)])
     send(queue, sent, 9)
     assert [(frame.page, frame.data) for frame in sent] == [(0, b"\x08"), (1, b"\x09")]
 
@@ -93,7 +79,7 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
             put.append(frame)
             if not frame.queued:
                 newest[frame.can_id] = frame
-            queue.put(frame)
+            queue.put_all([frame])
             continue
         before, both = len(sent), 0 < len(newest) < len(queue)
         send(queue, sent, step)

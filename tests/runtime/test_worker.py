@@ -84,7 +84,6 @@ def test_an_end_whose_wake_is_read_with_the_last_items_is_not_lost(
 def test_a_worker_that_was_never_started_ends_at_once() -> None:
     worker: Worker[int] = Worker("test", lambda _items: None)
     assert worker.stop(0)
-    assert worker.fileno() == -1
 
 
 @pytest.mark.parametrize("is_logged", [True, False])

@@ -5,6 +5,7 @@ Time goes on only where the loop waits, and where a test says that the process i
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
+from typing import cast
 
 import pytest
 
@@ -26,7 +27,7 @@ from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.poller import Handler
+from kontronik_can_gw.runtime.poller import Handler, Poller
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
@@ -233,17 +234,16 @@ class World:
         self.there = True
         self.blind: set[int] = set()
         self.handlers: dict[int, Handler] = {}
+        self.poller = cast("Poller", FakePoller(self))
 
     def clock(self) -> int:
         return self.now
 
-    def register(self, fileobj: int, _events: int, data: Handler) -> None:
-        self.handlers[fileobj] = data
+    def register(self, fd: int, handler: Handler, _events: int = 1) -> None:
+        self.handlers[fd] = handler
 
-    modify = register
-
-    def unregister(self, fileobj: int) -> None:
-        del self.handlers[fileobj]
+    def unregister(self, fd: int) -> None:
+        del self.handlers[fd]
 
     def close(self) -> None:
         pass
@@ -274,7 +274,7 @@ class FakePoller:
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self.register, self.modify, self.unregister = world.register, world.modify, world.unregister
+        self.register, self.unregister = world.register, world.unregister
         self.wait, self.close = world.wait, world.close
 
     @property
@@ -307,9 +307,10 @@ def loop_in(
     patch.setattr(esc_input, "SerialPort", lambda path, _protocol: by_path[path])
     gateway = Gateway(escs, layout or layout_of(escs), world.now, canopen=canopen)
     config = CanConfig(interface="virtual", channel="world")
-    poller = FakePoller(world)
     paths = list(by_path)
-    return Loop(gateway, paths, config, True, clock=world.clock, poller=poller, notifier=notifier)  # type: ignore[arg-type]
+    return Loop(
+        gateway, paths, config, True, clock=world.clock, poller=world.poller, notifier=notifier
+    )
 
 
 def run(loop: Loop, world: World, until: int) -> None:

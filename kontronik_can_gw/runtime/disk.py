@@ -1,0 +1,25 @@
+"""What the threads that write files have in common."""
+
+import os
+from pathlib import Path
+
+
+def write_all(fd: int, data: bytes) -> None:
+    """Write all of it, however little the system takes at a time."""
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(fd, rest) :]
+
+
+def sync_folder(folder: Path) -> None:
+    """Force the names in a folder to the disk. OSError where that fails, as on a file system that cannot."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def reason_of(error: Exception) -> str:
+    """Why it failed, for a log line."""
+    return error.strerror or str(error) if isinstance(error, OSError) else repr(error)
