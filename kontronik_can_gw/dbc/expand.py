@@ -1,14 +1,13 @@
 """Expands a one-ESC DBC to several ESCs: names prefixed, ids moved, nothing lost."""
 
-import re
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc.binding import Binder, bind_key, escs_of, is_one_esc_layout
-from kontronik_can_gw.dbc.names import MAX_NAME
+from kontronik_can_gw.dbc.binding import Binder, bind_key
+from kontronik_can_gw.dbc.names import MAX_NAME, esc_prefix
 from kontronik_can_gw.dbc.writer import frame_id
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -19,21 +18,6 @@ if TYPE_CHECKING:
 
 _SDO_END, _RESTRICTED = 0x67F, 0x6E0
 """CiA 301 uses no 11-bit ids in this range: it is after the SDO requests and before the restricted ids."""
-
-
-def esc_prefix(name: str) -> str:
-    """An ESC's name as the beginning of message and signal names: ``left_front`` becomes ``LeftFront``."""
-    return "".join(part[:1].upper() + part[1:] for part in re.split(r"[^A-Za-z0-9]+", name) if part)
-
-
-def needs_expansion(
-    database: "Database",
-    node: str,
-    escs: Sequence[EscSettings],
-    bind: Mapping[str, str | float] | None = None,
-) -> bool:
-    """True for several ESCs and a DBC that describes one."""
-    return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, bind or {}))
 
 
 def expand(
@@ -54,7 +38,7 @@ def expand(
     bind = bind or {}
     ours = [message for message in database.messages if node in message.senders]
     binder = Binder([EscSettings()], bind)
-    per_esc = [m for m in ours if escs_of(m, binder)] if len(escs) > 1 else []
+    per_esc = [m for m in ours if binder.escs_of(m)] if len(escs) > 1 else []
     shift = 0 if base_id is None else base_id - min(message.frame_id for message in ours)
     once = [message for message in database.messages if message not in per_esc]
     taken = {(m.frame_id + (shift if m in ours else 0), m.is_extended_frame) for m in once}

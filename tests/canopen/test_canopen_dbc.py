@@ -24,7 +24,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.expand import esc_prefix
+from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows

@@ -10,12 +10,12 @@ import pytest
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.dbc import counters
 from kontronik_can_gw.dbc.loss import unreported
+from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.send_types import NAMES
 from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.dbc.timing import SEND_TYPES as NAMES
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -436,7 +436,7 @@ def test_what_may_count_something_else_is_refused_with_the_way_to_say_that_it_co
 
 @pytest.mark.parametrize("name", ["ABZ", "Jazz", "Brebz", "Kompass", "Physics", "Gas_CSX"])
 def test_a_word_that_only_ends_alike_is_neither(name: str) -> None:
-    assert counters.kind(name) is None
+    assert protection(name) is None
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.dbc import expand, writer
-from kontronik_can_gw.dbc.compiler import compile_layout
-from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.names import esc_prefix
+from kontronik_can_gw.dbc.prepare import compile_layout, prepare
 from kontronik_can_gw.dbc.reader import load_database, parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
@@ -424,7 +424,7 @@ def test_two_messages_that_would_get_one_name_are_refused() -> None:
     ],
 )
 def test_the_prefix_of_an_esc_is_its_name_in_pascal_case(name: str, prefix: str) -> None:
-    assert expand.esc_prefix(name) == prefix
+    assert esc_prefix(name) == prefix
 
 
 # --- what is written is what is sent ------------------------------------------------------------------------------------

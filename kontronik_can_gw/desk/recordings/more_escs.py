@@ -44,7 +44,8 @@ def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
 
 def _ids(bus: BusLayout, count: int) -> list[set[int]]:
     """The ids of each of ``count`` ESCs, as ``dbc`` gives them."""
-    from kontronik_can_gw.dbc.expand import esc_prefix, expand
+    from kontronik_can_gw.dbc.expand import expand
+    from kontronik_can_gw.dbc.names import esc_prefix
 
     escs = [EscSettings(f"esc{number}") for number in range(1, count + 1)]
     names = {message.name for message in bus.database.messages}
