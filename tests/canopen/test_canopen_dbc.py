@@ -208,7 +208,7 @@ def test_not_available_is_named_outside_the_limits_and_the_start_value() -> None
     for signal in db.signals:
         table = db.tables.get(signal.key, {})
         start = int(db.attribute("GenSigStartValue", "SG_", *signal.key) or -1)
-        if signal.is_flag or signal.name in NEVER_MISSING:
+        if signal.length == 1 or signal.name in NEVER_MISSING:
             assert NA not in table.values(), signal.name
             continue
         assert table[signal.not_available] == NA
