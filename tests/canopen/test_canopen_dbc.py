@@ -489,6 +489,7 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
     }
     text = described(bench)
     assert "SIG_VALTYPE_ 385 OilPressure : 1;" in text
+    assert "SG_ OilPressure : 25|32@1+ (1,0) [0|0] " in text
     assert "a 'switch', here/" in text
     assert "VAL_ 641" not in text
 
