@@ -10,7 +10,7 @@ from kontronik_can_gw.canopen.dbc import waiting_for_lss
 from kontronik_can_gw.cli.common import canopen_of, load_all, say, write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
-from kontronik_can_gw.config.rules import name_problem
+from kontronik_can_gw.config.parse import name_problem
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
