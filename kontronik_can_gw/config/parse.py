@@ -199,7 +199,7 @@ def _is_ambiguous(name: str, starts: set[str]) -> bool:
 def _output_problems(config: Config) -> Iterator[str]:
     """Outputs that are all off, a statistics file that is read elsewhere, node-IDs that clash."""
     files = {
-        "the configuration": config.file,
+        "the configuration": Path(config.file),
         "the DBC": config.dbc_path,
         "the EDS": config.eds_path,
     }

@@ -323,6 +323,12 @@ def test_names_of_more_than_32_characters_are_refused() -> None:
         assert words in line
     both = refused(text, escs("abcdef", "ghijklm"))
     assert "ghijklm" in both and "abcdef" not in both
+    assert "as that of Message" in refused(text.replace("EscM", "EscMessage" + "X" * 22))
+    # what stands in the file with a longer name is left as it is
+    long = text.replace("EscM", "M" * 40)
+    assert multiplied(long, ONE, base_id=0x100)[0].messages[0].name == "M" * 40
+    theirs = text + f"BO_ 9 {'T' * 40}: 8 Other\n"
+    assert multiplied(theirs, escs("a", "b"))[0].messages[-1].name == "T" * 40
 
 
 def test_two_messages_that_would_get_one_name_are_refused() -> None:
