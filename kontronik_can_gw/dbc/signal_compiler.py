@@ -32,10 +32,9 @@ class SignalCompiler:
         self.message = message
         self.signal = signal
         self.table = ValueTable(signal)
-        start = attribute(signal, "GenSigStartValue", job.database)
-        self.start = start
+        self.start = attribute(signal, "GenSigStartValue", job.database)
         self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
-        self.start_is_raw = raw_values.is_raw(start, signal)
+        self.start_is_raw = raw_values.is_raw(self.start, signal)
 
     def plan(self, page: int | None) -> SignalPlan | None:
         """The plan on a page; None, with a line in the problems, where the signal cannot be sent."""
@@ -77,10 +76,10 @@ class SignalCompiler:
             limits = raw_values.limits(signal, factor, offset)
             for end in (*(raw * factor + offset for raw in raw_range(signal)), *(limits or ())):
                 float(end)
-        except (ValueError, OverflowError):
-            raise UnfitSignal(
-                "has a factor, offset or limit that is too large or no finite number."
-            ) from None
+        except ValueError:
+            raise UnfitSignal("has a factor, offset or limit that is no finite number.") from None
+        except OverflowError:
+            raise UnfitSignal("has a factor, offset or limit that is too large.") from None
         return factor, offset, limits
 
     def _unfilled(self, page: int | None) -> SignalPlan:

@@ -354,22 +354,10 @@ def role(name: str, **bind: str | float) -> Role:
     return plan.signals[0].role
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "MsgCntr",
-        "AliveCnt",
-        "COUNTER",
-        "Counter",
-        "CTR",
-        "Motor_11_BZ",
-        "SQC",
-        "Gear_SQC",
-        "XMsgCnt",
-        "LWI_Botschaftszaehler",
-        "AliveCtr",
-    ],
-)
+COUNTERS = "MsgCntr AliveCnt COUNTER Counter CTR Motor_11_BZ SQC Gear_SQC XMsgCnt LWI_Botschaftszaehler AliveCtr"
+
+
+@pytest.mark.parametrize("name", COUNTERS.split())
 def test_a_counter_of_frames_is_known_by_its_name(name: str) -> None:
     assert role(name) is Role.ALIVE
     assert role(name, **{name: 1}) is Role.CONSTANT
