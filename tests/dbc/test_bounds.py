@@ -95,6 +95,8 @@ def test_what_is_out_of_bounds_is_one_line_and_cantools_is_not_called(
 
 
 def test_a_file_without_end_is_read_up_to_the_limit() -> None:
+    with pytest.raises(UserError, match="is empty"):
+        parse_database(b" " * MAX_BYTES, "my.dbc")
     with pytest.raises(UserError, match="larger than 8 MB"):
         load_database(Path("/dev/zero"))
 

@@ -506,6 +506,12 @@ def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_
         assert "on_loss" not in line and "link_state" in line
 
 
+def test_a_flag_with_room_for_a_code_hides_no_loss() -> None:
+    layout = compiled(FLAG.replace("0|1@1+", "0|2@1+"))
+    assert not unreported(layout, silent=False)
+    assert not any("reports the loss" in line for line in check.table(layout, ["esc1"]))
+
+
 def test_of_two_escs_each_flag_needs_a_signal_of_its_own_esc() -> None:
     text = MESSAGE + signal("LeftUndervoltage", "0|1@1+") + signal("RightUndervoltage", "1|1@1+")
     layout = compiled(text + signal("LeftLinkState", "8|8@1+"), ("left", "right"))

@@ -64,7 +64,9 @@ def facts(thing: Any, prefix: str = "") -> Any:
 
 def facts_of_message(message: Message, prefix: str = "") -> Any:
     """All but name and id."""
-    assert all(signal.name.startswith(prefix) for signal in message.signals)
+    names = [signal.name for signal in message.signals]
+    names += [name for group in message.signal_groups or [] for name in group.signal_names]
+    assert all(name.startswith(prefix) for name in names)
     found = facts(message, prefix)
     found["_signals"].sort(key=lambda signal: (signal["start"], signal["name"]))
     return found | {"_name": "", "_frame_id": 0}
