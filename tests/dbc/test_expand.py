@@ -14,6 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
+from kontronik_can_gw.canopen import dbc as canopen_dbc
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.dbc import expand, writer
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.prepare import compile_layout, prepare
@@ -23,7 +26,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
 
-SHIPPED = (Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc").read_text()
+SHIPPED = shipped("dbc/kontronik_esc.dbc").read_text()
 RICH = Path(__file__).with_name("rich.dbc").read_text()
 
 
@@ -31,7 +34,7 @@ def escs(*names: str) -> list[EscSettings]:
     return [EscSettings(name) for name in names]
 
 
-ONE, PAIR = escs("one"), escs("left", "right")
+ONE, PAIR = escs("esc1"), escs("left", "right")
 EIGHT = escs(*(f"esc{number}" for number in range(1, 9)))
 
 
@@ -90,6 +93,13 @@ def relations(text: str) -> list[str]:
 
 def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
     assert writer.dbc_text(parse_database(SHIPPED.encode(), "x")) == SHIPPED
+
+
+def test_the_shipped_file_of_the_canopen_nodes_is_written_from_rows() -> None:
+    setup = shipped_canopen([1])
+    settings = setup.esc_settings(ONE)
+    text = writer.dbc_text(canopen_dbc.database(setup.nodes(settings), settings))
+    assert text == shipped("dbc/kontronik_canopen.dbc").read_text()
 
 
 def test_the_file_for_eight_escs_keeps_the_rules() -> None:
