@@ -31,7 +31,7 @@ ORDER = (
     ("id_conflicts",),
     ("gateway",),
     ("transmit_queue",),
-    ("config.kinds", "config.keys", "config.rules", "config.parse", "config.export"),
+    ("config.kinds", "config.keys", "config.parse", "config.export"),
     ("capture",),
     ("runtime",),
     ("config",),

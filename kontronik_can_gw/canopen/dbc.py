@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from kontronik_can_gw.canopen.dbc_messages import GATEWAY, LOGGER, NodeMessages
 from kontronik_can_gw.canopen.dbc_names import Names
 from kontronik_can_gw.canopen.nodes import Nodes
-from kontronik_can_gw.dbc.expand import esc_prefix
+from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.rows import Message, Node, Rows
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings

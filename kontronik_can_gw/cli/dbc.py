@@ -12,7 +12,7 @@ from kontronik_can_gw.cli.common import canopen_of, load_all, say
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
-from kontronik_can_gw.config.rules import name_problem
+from kontronik_can_gw.config.parse import name_problem
 from kontronik_can_gw.dbc.expand import among_canopen, expand
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import choose_node, load_database

@@ -29,8 +29,8 @@ from kontronik_can_gw.config.kinds import (
     options,
     table_of,
 )
-from kontronik_can_gw.dbc import send_types
 from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.dbc.timing import SEND_TYPES
 from kontronik_can_gw.esc.protocols import PROTOCOLS, device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
@@ -106,7 +106,7 @@ class DbcConfig:
         "message name = AUTOSAR E2E data id")
     units: Mapping[str, str] = _key(meanings(units.names()), {},
         "unit text of the DBC = the unit that it means")
-    send_type: Mapping[str, str] = _key(meanings(tuple(send_types.NAMES)), {},
+    send_type: Mapping[str, str] = _key(meanings(tuple(SEND_TYPES)), {},
         "GenMsgSendType of the DBC = what it means")
 
 

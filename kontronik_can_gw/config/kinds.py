@@ -53,21 +53,25 @@ def _names(value: Any) -> tuple[str, ...]:
 def _source(value: Any) -> Any:
     is_text = isinstance(value, str) and bool(value.strip())
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not is_text and not (is_number and value == value and abs(value) != math.inf):
+    if not is_text and not (is_number and math.isfinite(value)):
         raise ValueError(f"{value!r} is neither the name of a source nor a number")
     return value
 
 
-def _bindings(value: Any) -> dict[str, Any]:
+def _table(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"{value!r} is not a table")
+    return value
+
+
+def _bindings(value: Any) -> Any:
     flat: dict[str, Any] = {}
-    for name, entry in value.items():
+    for name, entry in _table(value).items():
         if isinstance(entry, dict):
             flat |= {f"{name}.{key}": inner for key, inner in entry.items()}
         else:
             flat[name] = entry
-    return _SOURCES.check(flat)  # type: ignore[no-any-return]
+    return _SOURCES.check(flat)
 
 
 def integer(low: int, high: int, also: int | None = None) -> Kind:
@@ -111,11 +115,11 @@ def choice_of(known: Callable[[], Sequence[str]]) -> Kind:
     """One of a few texts that are asked for at each check: a list that may grow, as that of the devices."""
 
     def check(value: Any) -> str:
-        choices = known()
-        if _text(value) not in choices:
-            near = did_you_mean(value, choices, 0.5, or_known=True)
-            raise ValueError(f"{value!r} is none of {', '.join(choices)}.{near}")
-        return str(value)
+        choices, text = known(), _text(value)
+        if text not in choices:
+            near = did_you_mean(text, choices, 0.5, or_known=True)
+            raise ValueError(f"{text!r} is none of {', '.join(choices)}.{near}")
+        return text
 
     span = ", ".join(f'"{text}"' for text in known())
     return Kind(span, TEXT.schema | {"enum": list(known())}, check)
@@ -137,10 +141,10 @@ def pattern(span: str, form: str, problem: str, longest: int | None = None) -> K
     """A text of the form of a regular expression; ``problem`` follows another text in the error."""
 
     def check(value: Any) -> str:
-        length = len(_text(value))
-        if (longest is not None and length > longest) or not re.fullmatch(form, value):
-            raise ValueError(f"{value!r} {problem}")
-        return str(value)
+        text = _text(value)
+        if (longest is not None and len(text) > longest) or not re.fullmatch(form, text):
+            raise ValueError(f"{text!r} {problem}")
+        return text
 
     length = {} if longest is None else {"maxLength": longest}
     return Kind(span, {"type": "string", "pattern": f"^{form}$"} | length, check)
@@ -150,10 +154,8 @@ def table_of(kind: Kind) -> Kind:
     """A table with names of the user's, all entries of one kind."""
 
     def check(value: Any) -> dict[str, Any]:
-        if not isinstance(value, dict):
-            raise ValueError(f"{value!r} is not a table")
         checked = {}
-        for name, entry in value.items():
+        for name, entry in _table(value).items():
             try:
                 checked[name] = kind.check(entry)
             except ValueError as error:
@@ -167,9 +169,8 @@ def options(path: str, own: frozenset[str]) -> Kind:
     """A table of texts, numbers and booleans. ``own``: names that are keys of the table ``path``."""
 
     def check(value: Any) -> dict[str, Any]:
-        if not isinstance(value, dict) or not all(
-            isinstance(entry, (str, int, float)) for entry in value.values()
-        ):
+        entries = value.values() if isinstance(value, dict) else [None]
+        if not all(isinstance(entry, (str, int, float)) for entry in entries):
             raise ValueError(f"{value!r} is not a table of texts, numbers and booleans")
         for name in sorted(own & set(value)):
             raise ValueError(f"{name} has its own key: {path}.{name}")

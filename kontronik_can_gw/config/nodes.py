@@ -7,6 +7,7 @@ another node or a DBC message, they are ignored with a warning.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds, without_objects
@@ -147,38 +148,32 @@ def with_stored(
         return plain, []
     said: list[str] = []
     kept = list(stored)
-    names = [esc.name for esc in config.esc]
+
+    def ignore(number: int, what: str, why: str, **instead: Any) -> None:
+        said.append(f"{config.esc[number].name}: the stored {what} ignored: {why}")
+        kept[number] = replace(kept[number], **instead).unverified()
+
+    def ignore_node_id(number: int, why: str) -> None:
+        ignore(number, f"node-ID {kept[number].node_id} is", why, node_id=None)
+
     while clash := _clashing_node_ids(plain.settings, kept):
         for number in clash:
-            said.append(
-                f"{names[number]}: the stored node-ID {kept[number].node_id} is ignored: it cannot be this node's"
-            )
-            kept[number] = replace(kept[number], node_id=None).unverified()
-    setup = replace(plain, stored=tuple(kept))
-    while clash := [
-        n for n in _clashing_nodes(setup.nodes(escs, foreign), foreign) if kept[n] != Stored()
-    ]:
+            ignore_node_id(number, "it cannot be this node's")
+    while True:
+        setup = replace(plain, stored=tuple(kept))
+        found = _clashing_nodes(setup.nodes(escs, foreign), foreign)
+        if not (clash := [number for number in found if kept[number] != Stored()]):
+            return setup, said
         for number in clash:
-            ids = {key for key in kept[number].communication if key >> 8 in _WITH_COB_ID}
-            if ids:
-                left = {
-                    key: value
-                    for key, value in kept[number].communication.items()
-                    if key not in ids
-                }
-                kept[number] = replace(kept[number], communication=left).unverified()
-                said.append(
-                    f"{names[number]}: the stored COB-IDs are ignored: one of them is used otherwise now"
-                )
+            communication = kept[number].communication
+            left = {k: v for k, v in communication.items() if k >> 8 not in _WITH_COB_ID}
+            if len(left) < len(communication):
+                why = "one of them is used otherwise now"
+                ignore(number, "COB-IDs are", why, communication=left)
             elif kept[number].node_id is not None:
-                said.append(
-                    f"{names[number]}: the stored node-ID {kept[number].node_id} is ignored: its COB-IDs are used otherwise"
-                )
-                kept[number] = replace(kept[number], node_id=None).unverified()
+                ignore_node_id(number, "its COB-IDs are used otherwise")
             else:
                 kept[number] = Stored()
-        setup = replace(plain, stored=tuple(kept))
-    return setup, said
 
 
 _WITH_COB_ID = frozenset({0x1005, 0x1014, *range(0x1800, 0x1A00)})
@@ -194,10 +189,7 @@ def _clashing_node_ids(settings: Sequence[NodeSettings], kept: Sequence[Stored])
         number
         for number, (own, node_id) in enumerate(zip(settings, ids, strict=True))
         if kept[number].node_id is not None
-        and (
-            (node_id != UNCONFIGURED and ids.count(node_id) > 1)
-            or (node_id == UNCONFIGURED and own.read_only)
-        )
+        and (own.read_only if node_id == UNCONFIGURED else ids.count(node_id) > 1)
     ]
 
 

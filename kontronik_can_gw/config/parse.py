@@ -1,9 +1,10 @@
 """Makes a configuration of TOML: every mistake in it is reported at once, with its place, a remedy and what was meant."""
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from posixpath import normpath
 from typing import Any, cast
 
 from kontronik_can_gw.config.keys import (
@@ -14,8 +15,10 @@ from kontronik_can_gw.config.keys import (
     MqttConfig,
     required,
 )
-from kontronik_can_gw.config.rules import esc_problems, mqtt_problems, output_problems
+from kontronik_can_gw.dbc.binding import VALUES_BY_KEY
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError, did_you_mean
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 
 def load(path: Path) -> Config:
@@ -38,12 +41,10 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
     """A configuration and its mistakes; None where too little is valid to go on. UserError where the file cannot be read."""
     try:
         text = path.read_bytes().decode("utf-8-sig")  # editors on Windows write a byte order mark
-    except FileNotFoundError as error:
-        raise UserError(
-            f"{path}: cannot be read: {error.strerror}. `kontronik-can-gw init` writes an example."
-        ) from None
     except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}.") from None
+        missing = isinstance(error, FileNotFoundError)
+        advice = " `kontronik-can-gw init` writes an example." if missing else ""
+        raise UserError(f"{path}: cannot be read: {error.strerror}.{advice}") from None
     except UnicodeDecodeError:
         raise UserError(f"{path}: is not a text file in UTF-8, so no TOML configuration") from None
     try:
@@ -64,12 +65,11 @@ def mqtt_with(config: MqttConfig, given: Mapping[str, Any]) -> MqttConfig:
             values[name] = kinds[name].check(value)
         except ValueError as error:
             problems.append(f"--{name.replace('_', '-')}: {error}")
-    if not problems:
-        made = replace(config, **values)
-        problems = [f"mqtt.{problem}" for problem in mqtt_problems(made)]
-        if not problems:
-            return made
-    raise UserError(*problems)
+    made = replace(config, **values)
+    problems = problems or [f"mqtt.{problem}" for problem in _mqtt_problems(made)]
+    if problems:
+        raise UserError(*problems)
+    return made
 
 
 class _Parser:
@@ -91,7 +91,7 @@ class _Parser:
         }
         escs = self._escs(tables.get("esc", []))
         is_valid = not self.problems
-        self._problem(*esc_problems(escs))
+        self._problem(*_esc_problems(escs))
         if not is_valid:
             return None, self.problems
         config = Config(
@@ -100,7 +100,7 @@ class _Parser:
             file=self.file,
             warnings=tuple(self.warnings),
         )
-        self._problem(*output_problems(config))
+        self._problem(*_output_problems(config))
         return config, self.problems
 
     def _problem(self, *texts: str) -> None:
@@ -146,3 +146,102 @@ class _Parser:
             if f.name not in given:
                 self._problem(f"{place}.{f.name}: is required: {f.metadata['doc']}")
         return table(**values) if len(self.problems) == before else None
+
+
+# --- rules about several keys
+
+
+def name_problem(names: Sequence[str]) -> str | None:
+    """Why these ESC names are ambiguous; None where they are not."""
+    escs = {number: EscConfig(port=str(number), name=name) for number, name in enumerate(names, 1)}
+    return next((line.partition(".name: ")[2] for line in _esc_problems(escs)), None)
+
+
+def _esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
+    """Names and ports that are taken, names that are ambiguous. ``escs``: the valid ones, by their number in the file."""
+    names = {number: normalize(esc.name) for number, esc in escs.items()}
+    for number, other in _taken(names):
+        yield f"esc[{number}].name: {escs[number].name!r} is also that of esc[{other}]"
+    for number, other in _taken({number: esc.port for number, esc in escs.items()}):
+        yield f"esc[{number}].port: {escs[number].port!r} is also that of esc[{other}]"
+    for number, esc in escs.items():
+        if esc.device is not None and esc.device_number is None:
+            yield f"esc[{number}].device: {esc.device!r} is no device of the protocol {esc.protocol}"
+    for number, esc in escs.items():
+        if _is_ambiguous(names[number], {"", *names.values()}):
+            yield (
+                f"esc[{number}].name: {esc.name!r} makes signal names ambiguous. "
+                "Choose another name."
+            )
+
+
+def _taken(values: Mapping[int, object]) -> Iterator[tuple[int, int]]:
+    """Each number whose value an earlier one has, and that one."""
+    seen: dict[object, int] = {}
+    for number, value in values.items():
+        if (other := seen.setdefault(value, number)) != number:
+            yield number, other
+
+
+def _is_ambiguous(name: str, starts: set[str]) -> bool:
+    """True where a name, after one of ``starts``, and a value's name make another value's name.
+
+    "max" and "electrical_speed" give "max_electrical_speed", which is a value; "a" and "a_max" clash too.
+    """
+    rests = [name.removeprefix(start) for start in starts if name.startswith(start)]
+    return any(
+        value.startswith(rest) and value.removeprefix(rest) in VALUES_BY_KEY
+        for rest in filter(None, rests)
+        for value in VALUES_BY_KEY
+    )
+
+
+def _output_problems(config: Config) -> Iterator[str]:
+    """Outputs that are all off, a statistics file that is read elsewhere, node-IDs that clash."""
+    files = {
+        "the configuration": Path(config.file),
+        "the DBC": config.dbc_path,
+        "the EDS": config.eds_path,
+    }
+    if (path := config.statistics_path) is not None:
+        for what, other in files.items():
+            if normpath(path) == normpath(other):
+                yield f"statistics.file: {str(path)!r} is {what}, which would be overwritten"
+    if config.canopen.enabled:
+        yield from _node_id_problems(config)
+    elif not config.dbc.enabled:
+        yield (
+            "dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one."
+        )
+
+
+def _node_id_problems(config: Config) -> Iterator[str]:
+    ids = dict(enumerate(config.node_ids, 1))
+    taken = dict(_taken(ids))
+    for number, node_id in ids.items():
+        if node_id == UNCONFIGURED:
+            if config.canopen.read_only:
+                yield (
+                    f"esc[{number}]: waits for a node-ID by LSS, which canopen.read_only = true refuses. "
+                    "Give it a node_id."
+                )
+        elif not 1 <= node_id <= 127:
+            yield (
+                f"esc[{number}]: its node-ID would be {node_id}. "
+                "Choose a smaller canopen.node_id, or a node_id for it."
+            )
+        elif number in taken:
+            yield f"esc[{number}].node_id: {node_id} is also that of esc[{taken[number]}]"
+
+
+def _mqtt_problems(mqtt: MqttConfig) -> Iterator[str]:
+    """Keys that need another one."""
+    for name in ("ca_file", "cert_file", "key_file"):
+        if getattr(mqtt, name) is not None and not mqtt.tls:
+            yield f"{name}: is for TLS, which is off. Switch mqtt.tls on (--tls)."
+    if mqtt.key_file is not None and mqtt.cert_file is None:
+        yield (
+            "key_file: needs the certificate that it belongs to. Set mqtt.cert_file (--cert-file)."
+        )
+    if mqtt.password_file is not None and mqtt.username is None:
+        yield "password_file: needs a user name. Set mqtt.username (--username)."

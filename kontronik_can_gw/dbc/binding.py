@@ -9,7 +9,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Group, Value, values_of_esc
 
 if TYPE_CHECKING:
-    from cantools.database.can import Database, Message
+    from cantools.database.can import Message
 
 VALUES_BY_KEY = {normalize(name): value for name, value in VALUES.items()}
 """Every value by its normalized name."""
@@ -30,23 +30,17 @@ class Binder:
             ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
         )
 
-    def value_named(self, key: str, esc: int | None) -> Value | None:
-        """The value of a normalized name, without a final ``percent``. Here alone a bound name becomes a Value.
-
-        ``esc``: index of the ESC whose value is meant, None where the name has no prefix.
-        """
-        known = VALUES_BY_KEY if esc is None else self._known[esc]
-        return known.get(key) or known.get(key.removesuffix("percent"))
-
     def by_name(self, name: str) -> tuple[Value, int | None] | None:
         """The source of a signal name or a bound name, and its ESC (None: no ESC named, or the gateway)."""
         key = normalize(name)
-        meant: list[tuple[str, int | None]] = [(key, 0)] if len(self.escs) == 1 else []
+        meant: list[tuple[int | None, str]] = [(0, key)] if len(self.escs) == 1 else []
         for prefix, esc in self._prefixes:
             if key.startswith(prefix):
-                meant.append((key.removeprefix(prefix), esc))
-        for rest, of_esc in [*meant, (key, None)]:
-            if (value := self.value_named(rest, of_esc)) is not None:
+                meant.append((esc, key.removeprefix(prefix)))
+        for of_esc, rest in [*meant, (None, key)]:
+            known = VALUES_BY_KEY if of_esc is None else self._known[of_esc]
+            value = known.get(rest) or known.get(rest.removesuffix("percent"))
+            if value is not None:
                 return value, None if value.group is Group.GATEWAY else of_esc
         return None
 
@@ -57,6 +51,16 @@ class Binder:
             return None
         self.used.add(key)
         return self.bind[key]
+
+    def escs_of(self, message: "Message") -> set[int | None]:
+        """The ESCs that a message has values of, by index; None: of one that is not named."""
+        escs = set()
+        for signal in message.signals:
+            bound = self.bound(message.name, signal.name)
+            found = self.by_name(bound if isinstance(bound, str) else signal.name)
+            if found and found[0].group is not Group.GATEWAY:
+                escs.add(found[1])
+        return escs
 
     def suggestions(self, name: str) -> str:
         """A sentence with the nearest known names, or an empty string."""
@@ -71,23 +75,3 @@ class Binder:
 def bind_key(bind: Mapping[str, str | float], message: str, signal: str) -> str | None:
     """The key of a signal's entry in ``[dbc.bind]``: its name with that of its message, or alone."""
     return next((key for key in (f"{message}.{signal}", signal) if key in bind), None)
-
-
-def escs_of(message: "Message", binder: Binder) -> set[int | None]:
-    """The ESCs that a message has values of, by index; None: of one that is not named."""
-    escs = set()
-    for signal in message.signals:
-        bound = binder.bound(message.name, signal.name)
-        found = binder.by_name(bound if isinstance(bound, str) else signal.name)
-        if found and found[0].group is not Group.GATEWAY:
-            escs.add(found[1])
-    return escs
-
-
-def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
-    """True if our signals are bound to values of an ESC, and none names which one."""
-    escs: set[int | None] = set()
-    for message in database.messages:
-        if node in message.senders:
-            escs |= escs_of(message, binder)
-    return escs == {None}

@@ -6,9 +6,9 @@ from dataclasses import replace
 from fractions import Fraction
 
 from kontronik_can_gw.dbc import raw_values
-from kontronik_can_gw.dbc.compilation import UnfitSignal
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.dbc.value_table import ValueTable
+from kontronik_can_gw.dbc.raw_values import ValueTable
+from kontronik_can_gw.dbc.settings import UnfitSignal
 from kontronik_can_gw.esc.values import Divisor, Value
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import Role, SignalPlan

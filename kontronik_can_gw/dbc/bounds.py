@@ -10,7 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import NamedTuple
+from math import prod
 
 from kontronik_can_gw.errors import UserError
 
@@ -22,28 +22,27 @@ _MAX_DIGITS = 400
 _MAX_MESSAGE_BYTES = 4095
 """ISO 15765-2, of classic frames; SAE J1939's transport protocol has 1785, a CAN FD frame 64."""
 _MAX_BITS = _MAX_MESSAGE_BYTES * 8
-
-
-class _Bound(NamedTuple):
-    """The limits of a number, and its name for messages."""
-
-    what: str
-    low: int
-    high: int
-
-
-_ID = _Bound("CAN id", 0, 0xFFFF_FFFF)
-_LENGTH = _Bound("length in bytes", 0, _MAX_MESSAGE_BYTES)
-_START = _Bound("start bit", 0, _MAX_BITS - 1)
-_BITS = _Bound("length in bits", 0, _MAX_BITS)
-_PAGE = _Bound("multiplexer value", 0, 0xFFFF_FFFF)
-_MESSAGES = _Bound("number of messages", 0, 10_000)
-_NODES = _Bound("number of nodes", 0, 2_000)
-_SIGNALS = _Bound("number of signals", 0, 4_096)
-_TABLES = _Bound("length of the value tables that VAL_ names, in characters", 0, MAX_BYTES)
-_PAGES = _Bound("number of multiplexer values in all", 0, 65_536)
-_POWERS = _Bound("exponent", 0, 4_200)
-_NESTING = _Bound("depth of multiplexers", 0, 8)
+_MAX_NESTING = 8
+_PAGES = "number of multiplexer values in all"
+_PAGE = "multiplexer value"
+_TABLES = "length of the value tables that VAL_ names, in characters"
+_LIMITS = {
+    "CAN id": 0xFFFF_FFFF,
+    "length in bytes": _MAX_MESSAGE_BYTES,
+    "start bit": _MAX_BITS - 1,
+    "length in bits": _MAX_BITS,
+    "number of messages": 10_000,
+    "number of nodes": 2_000,
+    "number of signals": 4_096,
+    "exponent": 4_200,
+    "depth of multiplexers": _MAX_NESTING,
+    _PAGE: 0xFFFF_FFFF,
+    _PAGES: 65_536,
+    _TABLES: MAX_BYTES,
+}
+"""The largest number of each kind; the smallest is 0."""
+_Numbers = Iterator[tuple[str, int, str]]
+"""Kind, number, and where it is: "Msg.Signal: ", or empty."""
 
 STRING = r'"(?:\\"|[^"])*"'
 _TEXT = re.compile(rf"{STRING}|//[^\n]*")
@@ -64,14 +63,6 @@ _VALUES = re.compile(rf"VAL_\s*{_NUMBER}\s*(\w+)([^;]*)")
 _TABLE_NAME = re.compile(r"\s*([A-Za-z_]\w*)\s*\Z")
 
 
-def check_size(size: int, path: str) -> None:
-    """UserError for a file larger than any real DBC."""
-    if size > MAX_BYTES:
-        raise UserError(
-            f"{path}: is larger than {MAX_BYTES // 1_000_000} MB. Is it a DBC? Give one with fewer comments."
-        )
-
-
 def check_bounds(text: str, path: str) -> None:
     """UserError with the first number of a DBC that exceeds its limits: where it is, its value, the limits."""
     text = _TEXT.sub(_masked, text)
@@ -83,10 +74,10 @@ def check_bounds(text: str, path: str) -> None:
         raise UserError(
             f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. Correct it."
         )
-    for bound, number, where in _numbers(text):
-        if not bound.low <= number <= bound.high:
+    for kind, number, where in _numbers(text):
+        if not 0 <= number <= _LIMITS[kind]:
             raise UserError(
-                f"{path}: {where}{bound.what} is {number}, not {bound.low} to {bound.high}. Correct it."
+                f"{path}: {where}{kind} is {number}, not 0 to {_LIMITS[kind]}. Correct it."
             )
 
 
@@ -106,7 +97,7 @@ class _Message:
     """How a message is multiplexed, by names of signals."""
 
     name: str
-    multiplexers: list[str] = field(default_factory=list)
+    multiplexers: set[str] = field(default_factory=set)
     values: Counter[str] = field(default_factory=Counter)
     """Number of pages of each signal."""
     parents: dict[str, str] = field(default_factory=dict)
@@ -116,55 +107,53 @@ class _Message:
 
     def pages(self) -> tuple[int, int]:
         """Nesting depth of multiplexers, and the total number of pages and signals on pages."""
-        children: defaultdict[str | None, list[str]] = defaultdict(list)
-        for name in self.values.keys() - set(self.multiplexers):
-            children[self._parent(name)].append(name)
-        inner: defaultdict[str | None, list[str]] = defaultdict(list)
-        for name in self.multiplexers:
-            inner[self._parent(name)].append(name)
+        depth = total = 0
+        for name in self.multiplexers | self.values.keys():
+            chain = self._chain(name)
+            made = prod(self.values[each] for each in chain[:-1])
+            total += made * (len(chain) > 1)
+            if name in self.multiplexers:
+                depth = max(depth, len(chain))
+                total += made * self.texts[name]
+        return depth, total
 
-        def size(name: str, depth: int) -> tuple[int, int]:
-            deepest, total = (
-                depth,
-                self.texts[name] + sum(self.values[child] for child in children[name]),
-            )
-            for child in inner[name] if depth <= _NESTING.high else ():
-                nested, more = size(child, depth + 1)
-                deepest, total = max(deepest, nested), total + self.values[child] * (1 + more)
-            return deepest, total
-
-        sizes = [size(name, 1) for name in inner[None]]
-        return max((depth for depth, _ in sizes), default=0), sum(total for _, total in sizes)
+    def _chain(self, name: str) -> list[str]:
+        """A signal and the multiplexers around it, innermost first, as cantools resolves them; one too many at most."""
+        chain = [name]
+        while len(chain) <= _MAX_NESTING and (parent := self._parent(chain[-1])) is not None:
+            chain.append(parent)
+        return chain
 
     def _parent(self, name: str) -> str | None:
-        """Parent as cantools resolves it: a single multiplexer applies to all; among several, SG_MUL_VAL_ decides."""
-        if len(self.multiplexers) == 1:
-            return None if name == self.multiplexers[0] else self.multiplexers[0]
-        return self.parents.get(name)
+        """A single multiplexer applies to all; among several, SG_MUL_VAL_ decides."""
+        if len(self.multiplexers) > 1:
+            parent = self.parents.get(name)
+            return parent if parent in self.multiplexers else None
+        return next((only for only in self.multiplexers if only != name), None)
 
 
-def _numbers(text: str) -> Iterator[tuple[_Bound, int, str]]:
-    """Each number with its limits and its place."""
+def _numbers(text: str) -> _Numbers:
+    """Each number with its kind and its place."""
     for found in _POWER.finditer(text):
-        yield _POWERS, int(found[1].replace("_", "") or "0"), f"line {_line(text, found)}: "
+        yield "exponent", int(found[1].replace("_", "") or "0"), f"line {_line(text, found)}: "
     for found in _NODE_LIST.finditer(text):
-        yield _NODES, len(found[1].split()), ""
+        yield "number of nodes", len(found[1].split()), ""
     messages: defaultdict[int, list[_Message]] = defaultdict(list)
     message, signals, count = _Message(""), 0, 0
     for found in _MESSAGE_OR_SIGNAL.finditer(text):
         if found[1]:
             message, signals, count = _Message(found[2]), 0, count + 1
             messages[int(found[1])].append(message)
-            yield _MESSAGES, count, ""
-            yield _ID, int(found[1]), f"{message.name}: "
-            yield _LENGTH, int(found[3]), f"{message.name}: "
+            yield "number of messages", count, ""
+            yield "CAN id", int(found[1]), f"{message.name}: "
+            yield "length in bytes", int(found[3]), f"{message.name}: "
             continue
         name, mark, signals = found[4], found[5] or "", signals + 1
-        yield _SIGNALS, signals, f"{message.name}: "
-        yield _START, int(found[6]), f"{message.name}.{name}: "
-        yield _BITS, int(found[7]), f"{message.name}.{name}: "
+        yield "number of signals", signals, f"{message.name}: "
+        yield "start bit", int(found[6]), f"{message.name}.{name}: "
+        yield "length in bits", int(found[7]), f"{message.name}.{name}: "
         if mark.endswith("M"):
-            message.multiplexers.append(name)
+            message.multiplexers.add(name)
         if mark.startswith("m") and (value := _INTEGER.search(mark)):
             yield _PAGE, int(value[0]), f"{message.name}.{name}: "
             message.values[name] += 1
@@ -174,11 +163,11 @@ def _numbers(text: str) -> Iterator[tuple[_Bound, int, str]]:
     for message in (each for same_id in messages.values() for each in same_id):
         nesting, pages = message.pages()
         total += pages
-        yield _NESTING, nesting, f"{message.name}: "
+        yield "depth of multiplexers", nesting, f"{message.name}: "
         yield _PAGES, total, f"{message.name}: "
 
 
-def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple[_Bound, int, str]]:
+def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> _Numbers:
     """Ranges of SG_MUL_VAL_; like cantools, any one character separates the two numbers."""
     total = 0
     for found in _RANGES.finditer(text):
@@ -197,9 +186,7 @@ def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple
             message.parents[name] = parent
 
 
-def _value_tables(
-    text: str, messages: Mapping[int, list[_Message]]
-) -> Iterator[tuple[_Bound, int, str]]:
+def _value_tables(text: str, messages: Mapping[int, list[_Message]]) -> _Numbers:
     """Sizes of value tables; one used by many signals counts once for each."""
     tables = {
         found[1]: (len(found[2]), found[2].count('"') // 2) for found in _VALUE_TABLE.finditer(text)

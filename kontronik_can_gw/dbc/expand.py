@@ -1,14 +1,13 @@
 """Expands a one-ESC DBC to several ESCs: names prefixed, ids moved, nothing lost."""
 
-import re
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc.binding import Binder, bind_key, escs_of, is_one_esc_layout
-from kontronik_can_gw.dbc.names import MAX_NAME
+from kontronik_can_gw.dbc.binding import Binder, bind_key
+from kontronik_can_gw.dbc.names import MAX_NAME, esc_prefix
 from kontronik_can_gw.dbc.writer import frame_id
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -19,21 +18,6 @@ if TYPE_CHECKING:
 
 _SDO_END, _RESTRICTED = 0x67F, 0x6E0
 """CiA 301 uses no 11-bit ids in this range: it is after the SDO requests and before the restricted ids."""
-
-
-def esc_prefix(name: str) -> str:
-    """An ESC's name as the beginning of message and signal names: ``left_front`` becomes ``LeftFront``."""
-    return "".join(part[:1].upper() + part[1:] for part in re.split(r"[^A-Za-z0-9]+", name) if part)
-
-
-def needs_expansion(
-    database: "Database",
-    node: str,
-    escs: Sequence[EscSettings],
-    bind: Mapping[str, str | float] | None = None,
-) -> bool:
-    """True for several ESCs and a DBC that describes one."""
-    return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, bind or {}))
 
 
 def expand(
@@ -54,12 +38,12 @@ def expand(
     bind = bind or {}
     ours = [message for message in database.messages if node in message.senders]
     binder = Binder([EscSettings()], bind)
-    per_esc = [m for m in ours if escs_of(m, binder)] if len(escs) > 1 else []
+    per_esc = [m for m in ours if binder.escs_of(m)] if len(escs) > 1 else []
     shift = 0 if base_id is None else base_id - min(message.frame_id for message in ours)
     once = [message for message in database.messages if message not in per_esc]
     taken = {(m.frame_id + (shift if m in ours else 0), m.is_extended_frame) for m in once}
     shifted = [(m.frame_id + shift, m.is_extended_frame) for m in per_esc]
-    step = _step(shifted, taken, len(escs), id_step, file)
+    step = _step(shifted, taken, len(escs), id_step, file) if per_esc else 0
     copies = []
     for message in database.messages:
         distance = shift if message in ours else 0
@@ -71,7 +55,7 @@ def expand(
             copies.append(_copy(message, distance, None))
     moved = [made for made in copies if made.old in ours]
     problems = _id_problems([made.new for made in moved], len(escs), base_id)
-    problems += _length_problems(copies, per_esc, escs)
+    problems += _length_problems(copies, escs)
     if problems:
         raise UserError(*(f"{file}: {problem}" for problem in problems))
     messages = [made.new for made in copies]
@@ -172,18 +156,18 @@ def _id_problems(messages: Sequence["Message"], count: int, base_id: int | None)
     return problems
 
 
-def _length_problems(
-    copies: Sequence[_Copy], per_esc: Sequence["Message"], escs: Sequence[EscSettings]
-) -> list[str]:
-    """One line for all names that become too long."""
-    names = [made.new.name for made in copies]
-    names += [new for made in copies for _, new in made.signals()]
-    if all(len(name) <= MAX_NAME for name in names):
-        return []
-    signals = (signal.name for message in per_esc for signal in message.signals)
-    longest = max(signals, key=len, default="")
+def _length_problems(copies: Sequence[_Copy], escs: Sequence[EscSettings]) -> list[str]:
+    """One line for all names that become too long with a prefix."""
+    stems: set[str] = set()
+    for made in copies:
+        if made.esc is not None:
+            names = [made.new.name, *(new for _, new in made.signals())]
+            stems |= {name.removeprefix(esc_prefix(made.esc.name)) for name in names}
+    longest = max(sorted(stems), key=len, default="")
     room = MAX_NAME - len(longest)
     long = [esc.name for esc in escs if len(esc_prefix(esc.name)) > room]
+    if not long:
+        return []
     remedy = (
         f"Take ESC names of at most {room} letters" if room > 0 else "Shorten the names in the DBC"
     )
@@ -195,8 +179,7 @@ def _relations(specifics: "DbcSpecifics | None", copies: Sequence[_Copy]) -> "Db
     """Copies attributes of relations (BA_REL_), which refer to messages and signals by id and name."""
     moved: dict[int, list[tuple[int, dict[str, str]]]] = {}
     for made in copies:
-        names = dict(made.signals())
-        moved.setdefault(frame_id(made.old), []).append((frame_id(made.new), names))
+        moved.setdefault(frame_id(made.old), []).append((frame_id(made.new), dict(made.signals())))
     specifics = deepcopy(specifics)
     relations = specifics.relation_attributes if specifics is not None else None
     if relations is not None:
@@ -206,9 +189,8 @@ def _relations(specifics: "DbcSpecifics | None", copies: Sequence[_Copy]) -> "Db
         messages.clear()
         for number, by_signal in old_signals.items():
             for new, names in moved.get(number, [(number, {})]):
-                signals[new] = OrderedDict(
-                    (names.get(name, name), nodes) for name, nodes in by_signal.items()
-                )
+                renamed = ((names.get(name, name), nodes) for name, nodes in by_signal.items())
+                signals[new] = OrderedDict(renamed)
         for number, by_node in old_messages.items():
             for new, _ in moved.get(number, [(number, {})]):
                 messages[new] = by_node
@@ -222,12 +204,12 @@ def _step(
     wanted: int | None,
     file: str,
 ) -> int:
-    if not ids:
-        return 0
-    every = [i for i, _ in ids] + [i for i, _ in taken]
-    for step in [wanted] if wanted is not None else range(1, max(every) - min(every) + 2):
-        moved = [(i + n * step, extended) for i, extended in ids for n in range(count)]
-        if len(set(moved)) == len(moved) and not taken & set(moved):
+    """The distance of the ids from ESC to ESC: ``wanted``, else the smallest without a clash."""
+    every = [i for i, _ in (*ids, *taken)]
+    widest = max(every) - min(every) + 1
+    for step in [wanted] if wanted is not None else range(1, widest + 1):
+        moved = {(i + n * step, extended) for i, extended in ids for n in range(count)}
+        if len(moved) == len(ids) * count and not taken & moved:
             return step
     if wanted is not None:
         raise UserError(

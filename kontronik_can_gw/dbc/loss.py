@@ -1,9 +1,10 @@
-"""Flags without a code for "not available": finds the signal of their message that reports lost telemetry."""
+"""What signals hide: flags without a code for "not available" where nothing reports lost telemetry, values that a protocol lacks."""
 
 import math
 import struct
 from collections.abc import Sequence
 
+from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
@@ -14,15 +15,10 @@ _OF_LINK = frozenset({"link_state", "data_age"})
 def is_mute(signal: SignalPlan) -> bool:
     """True for a flag that shows one of its two values without telemetry."""
     source = signal.source
-    if (
-        source is None
-        or source.bit is None
-        or source.group not in (Group.LIVE, Group.INFO)
-        or not source.supplied
-        or signal.is_float
-    ):
+    if source is None or source.bit is None or signal.is_float or not source.supplied:
         return False
-    return signal.not_available in {value * signal.slope + signal.intercept for value in (0, 1)}
+    values = {value * signal.slope + signal.intercept for value in (0, 1)}
+    return source.group in (Group.LIVE, Group.INFO) and signal.not_available in values
 
 
 def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
@@ -55,21 +51,13 @@ def unreported(layout: Layout, silent: bool) -> list[str]:
     found = []
     for message in layout.messages:
         stops = bool(message.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in message.paces
-        flags = [
-            signal
-            for signal in message.signals
-            if is_mute(signal) and reporter(message, signal) is None
-        ]
-        if not flags or (silent and stops):
-            continue
-        names = ", ".join(flag.name for flag in flags[:3]) + (
-            f" and {len(flags) - 3} more" if len(flags) > 3 else ""
-        )
-        remedy = ', or set dbc.on_loss = "silent"' if stops else ""
-        found.append(
-            f"{layout.file}: {message.name}: without telemetry {names} are sent as if they were known, and no signal of the message "
-            f"reports the loss. Add one bound to link_state, or with NotAvailable in its value table{remedy}."
-        )
+        flags = [s.name for s in message.signals if is_mute(s) and reporter(message, s) is None]
+        if flags and not (silent and stops):
+            remedy = ', or set dbc.on_loss = "silent"' if stops else ""
+            found.append(
+                f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent as if they were known, and no signal "
+                f"of the message reports the loss. Add one bound to link_state, or with NotAvailable in its value table{remedy}."
+            )
     return found
 
 
@@ -78,14 +66,11 @@ def unsupplied(layout: Layout, escs: Sequence[EscSettings]) -> list[str]:
     found = []
     for message in layout.messages:
         missing = [s for s in message.signals if s.source is not None and not s.source.supplied]
-        if not missing:
-            continue
-        names = ", ".join(signal.name for signal in missing[:3]) + (
-            f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        )
-        whose = sorted({escs[signal.esc or 0].protocol for signal in missing})
-        found.append(
-            f"{layout.file}: {message.name}: {names}: not supplied by the protocol {' or '.join(whose)}, never available. "
-            "A flag, which has no code for that, is sent as 0 or its start value."
-        )
+        if missing:
+            names = listed((signal.name for signal in missing), 3)
+            whose = " or ".join(sorted({escs[signal.esc or 0].protocol for signal in missing}))
+            found.append(
+                f"{layout.file}: {message.name}: {names}: not supplied by the protocol {whose}, never available. "
+                "A flag, which has no code for that, is sent as 0 or its start value."
+            )
     return found

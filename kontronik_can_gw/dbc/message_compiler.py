@@ -1,11 +1,12 @@
 """Compiles one message of a DBC: its frame, its times, its pages, its signals, its E2E protection."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc import counters
-from kontronik_can_gw.dbc.compilation import Compilation
-from kontronik_can_gw.dbc.placement import placement_problems
+from kontronik_can_gw.dbc.names import is_e2e
+from kontronik_can_gw.dbc.raw_values import bits, raw_range
+from kontronik_can_gw.dbc.settings import Compilation
 from kontronik_can_gw.dbc.signal_compiler import SignalCompiler
 from kontronik_can_gw.dbc.timing import timing
 from kontronik_can_gw.esc.telemetry import MS
@@ -22,8 +23,7 @@ def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
     """The plan of a message; None, with lines in the problems, where it cannot be sent."""
     where = f"{job.file}: {message.name}"
     before = len(job.problems)
-    is_fd = message.is_fd or message.length > 8
-    job.problems += _frame_problems(message, is_fd and not job.fd_allowed, is_fd, where)
+    job.problems += _frame_problems(job, message, where)
     if _is_empty(message) or message.length > FD_LENGTHS[-1]:
         return None
     send_type, cycle_ms, delay_ms = timing(job, message, where)
@@ -32,7 +32,7 @@ def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
         job.problems.append(f"{where}: {problem}")
         return None
     signals = _signals(job, message)
-    job.problems += placement_problems(message, where)
+    job.problems += _placement_problems(message, where)
     job.problems += _page_problems(message, pages, signals, where)
     job.problems += _crc_problems(job, message, signals, where)
     if len(job.problems) > before:
@@ -41,7 +41,7 @@ def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
         name=message.name,
         can_id=message.frame_id,
         extended=message.is_extended_frame,
-        fd=is_fd,
+        fd=_is_fd(message),
         length=message.length,
         send_type=send_type,
         cycle_ns=cycle_ms * MS if SendType.CYCLIC in send_type else 0,
@@ -54,18 +54,20 @@ def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
     )
 
 
+def _is_fd(message: "Message") -> bool:
+    return message.is_fd or message.length > 8
+
+
 def _is_empty(message: "Message") -> bool:
     return message.is_container or message.length == 0 or not message.signals
 
 
-def _frame_problems(
-    message: "Message", is_forbidden: bool, is_fd: bool, where: str
-) -> Iterator[str]:
-    if is_forbidden:
+def _frame_problems(job: Compilation, message: "Message", where: str) -> Iterator[str]:
+    if _is_fd(message) and not job.fd_allowed:
         yield (
             f"{where}: is a CAN FD message ({message.length} bytes). Set can.fd = true, or shorten it."
         )
-    if is_fd and message.length not in FD_LENGTHS:
+    if _is_fd(message) and message.length not in FD_LENGTHS:
         lengths = ", ".join(map(str, FD_LENGTHS[9:]))
         yield f"{where}: CAN FD has no frames of {message.length} bytes, but {lengths}."
     if _is_empty(message):
@@ -94,16 +96,41 @@ def _signals(job: Compilation, message: "Message") -> list[SignalPlan]:
     return [plan for plan in plans if plan is not None]
 
 
+def _placement_problems(message: "Message", where: str) -> Iterator[str]:
+    """Signals outside the message, and signals that overlap on a page."""
+    room = message.length * 8
+    used: Counter[int | None] = Counter()
+    """Bit mask of the used bits, for each page."""
+    placed: list[tuple[str, int, set[int | None]]] = []
+    every = {None, *(page for s in message.signals for page in s.multiplexer_ids or ())}
+    for signal in message.signals:
+        mask = sum(1 << bit for bit in bits(signal)) if signal.length <= room else 1 << room
+        if mask.bit_length() > room:
+            yield (
+                f"{where}.{signal.name}: lies outside the message's {message.length} bytes. "
+                "Move or shorten it."
+            )
+            continue
+        pages: set[int | None] = set(signal.multiplexer_ids or every)
+        left = mask if any(used[page] & mask for page in pages) else 0
+        for other, others_mask, others_pages in placed if left else ():
+            if others_mask & left and others_pages & pages and other != signal.name:
+                yield f"{where}.{signal.name}: overlaps {other}. Move one of them."
+                left &= ~others_mask
+        for page in pages:
+            used[page] |= mask
+        placed.append((signal.name, mask, pages))
+
+
 def _page_problems(
     message: "Message", pages: Sequence[int], signals: Sequence[SignalPlan], where: str
 ) -> Iterator[str]:
     """Multiplexer values that do not fit, and signals that have to be on every page."""
     for multiplexer in message.signals:
         if multiplexer.is_multiplexer:
-            bits = multiplexer.length - (1 if multiplexer.is_signed else 0)
-            room = 0 if multiplexer.is_float else 1 << bits
+            largest = -1 if multiplexer.is_float else raw_range(multiplexer)[1]
             for page in pages:
-                if page >= room:
+                if page > largest:
                     yield f"{where}.{multiplexer.name}: cannot hold the multiplexer value {page} (m{page})."
     for signal in signals:
         if signal.page is not None and signal.role in (Role.ALIVE, Role.CRC):
@@ -129,7 +156,7 @@ def _crc_problems(
     asked = message.name in job.settings.data_ids or bound(message.name, crc.name) is not None
     fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
     has_counter = len(alive) == 1 and alive[0].high >= 14
-    by_names = has_counter and counters.is_e2e(
+    by_names = has_counter and is_e2e(
         crc.name, str(bound(message.name, alive[0].name) or alive[0].name)
     )
     key = f"dbc.e2e_data_ids.{message.name} = 0x{message.frame_id & 0xFFFF:X}"

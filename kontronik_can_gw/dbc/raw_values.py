@@ -1,14 +1,64 @@
-"""Raw values of a signal: their range, numbers as they stand in the file, constants as bits."""
+"""Raw values of a signal: their bits, their range, numbers as they stand in the file, constants, the codes in a value table."""
 
 import math
 import struct
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.signals.plan import Piece
+
 if TYPE_CHECKING:
     from cantools.database.can import Signal
 
-_LARGEST_FLOAT = int(struct.unpack("<f", b"\xff\xff\x7f\x7f")[0])
+_NOT_AVAILABLE = frozenset({"notavailable", "sna", "na", "signalnotavailable"})
+_ERROR = frozenset({"error", "err", "invalid"})
+
+
+class ValueTable:
+    """The value table of a signal: texts of values, codes for "not available" and "error"."""
+
+    def __init__(self, signal: "Signal") -> None:
+        self.entries = {int(raw): str(text) for raw, text in (signal.choices or {}).items()}
+        self.codes = {normalize(text): raw for raw, text in self.entries.items()}
+        """Raw values by normalized text."""
+        self.not_available = self._first(_NOT_AVAILABLE)
+        self.error = self._first(_ERROR)
+        self.special = [raw for text, raw in self.codes.items() if text in _NOT_AVAILABLE | _ERROR]
+        """Raw values that are codes and no values."""
+        self.texts = {
+            raw: text
+            for raw, text in self.entries.items()
+            if normalize(text) not in _NOT_AVAILABLE | _ERROR
+        }
+        """Entries that are values."""
+
+    def _first(self, texts: frozenset[str]) -> int | None:
+        return next((raw for text, raw in self.codes.items() if text in texts), None)
+
+
+def bits(signal: "Signal") -> list[int]:
+    """The signal's bits from its least significant one, each as byte * 8 + bit in byte."""
+    if signal.byte_order == "little_endian":
+        return list(range(signal.start, signal.start + signal.length))
+    # big-endian: start is the most significant bit, downward within a byte, then the next byte
+    found, at = [], signal.start
+    for _ in range(signal.length):
+        found.append(at)
+        at = at + 15 if at % 8 == 0 else at - 1
+    return found[::-1]
+
+
+def pieces(signal: "Signal") -> tuple[Piece, ...]:
+    """The signal as runs of adjacent bits."""
+    found: list[Piece] = []
+    for shift, at in enumerate(bits(signal)):
+        last = found[-1] if found else None
+        if last and at == last.at + last.width:
+            found[-1] = last._replace(width=last.width + 1)
+        else:
+            found.append(Piece(shift, 1, at))
+    return tuple(found)
 
 
 def raw_range(signal: "Signal") -> tuple[int, int]:
@@ -19,14 +69,12 @@ def raw_range(signal: "Signal") -> tuple[int, int]:
     return 0, (1 << length) - 1
 
 
-def is_raw(value: Any, low: int, high: int) -> bool:
+def is_raw(value: Any, signal: "Signal") -> bool:
     """True for a whole number within the raw range."""
-    return (
-        isinstance(value, (int, float))
-        and math.isfinite(value)
-        and value == int(value)
-        and low <= value <= high
-    )
+    if not isinstance(value, (int, float)) or not math.isfinite(value) or value != int(value):
+        return False
+    low, high = raw_range(signal)
+    return low <= value <= high
 
 
 def exact(number: Any) -> Fraction:
@@ -39,14 +87,13 @@ def text(value: Fraction) -> str:
     return f"{float(value):.10g}"
 
 
-def float_bits(number: float, length: int) -> int:
-    """The bits of a float of 32 or 64 bits. OverflowError where it is too large."""
-    return int.from_bytes(struct.pack("<f" if length == 32 else "<d", number), "little")
-
-
-def is_float_of(number: int, length: int) -> bool:
-    """True where a float of 32 or 64 bits holds a number of this size."""
-    return length != 32 or abs(number) <= _LARGEST_FLOAT
+def float_bits(number: float | Fraction, length: int) -> int | None:
+    """The bits of a float of 32 or 64 bits; None where it is too large."""
+    try:
+        packed = struct.pack("<f" if length == 32 else "<d", float(number))
+        return int.from_bytes(packed, "little")
+    except OverflowError:
+        return None
 
 
 def constant(signal: "Signal", value: float, factor: Fraction, offset: Fraction) -> int | None:
@@ -55,10 +102,7 @@ def constant(signal: "Signal", value: float, factor: Fraction, offset: Fraction)
         return None
     raw = (exact(value) - offset) / factor
     if signal.is_float:
-        try:
-            return float_bits(float(raw), signal.length)
-        except OverflowError:
-            return None
+        return float_bits(raw, signal.length)
     low, high = raw_range(signal)
     return int(raw) if raw.denominator == 1 and low <= raw <= high else None
 

@@ -5,13 +5,11 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc import counters, raw_values
+from kontronik_can_gw.dbc import names, raw_values
 from kontronik_can_gw.dbc.bound_value import bound_plan
-from kontronik_can_gw.dbc.compilation import Compilation, UnfitSignal
-from kontronik_can_gw.dbc.placement import pieces
-from kontronik_can_gw.dbc.raw_values import exact, raw_range
+from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
-from kontronik_can_gw.dbc.value_table import ValueTable
+from kontronik_can_gw.dbc.settings import Compilation, UnfitSignal
 from kontronik_can_gw.esc.values import Group, Value, divisor_of_settings
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import Role, SignalPlan
@@ -21,8 +19,8 @@ if TYPE_CHECKING:
 
 _SUSPECT = {
     None: "",
-    counters.Kind.COUNTER: ' If it counts the frames: bind = "alive".',
-    counters.Kind.CHECKSUM: ' If it is the CRC of AUTOSAR E2E profile 1: bind = "crc".',
+    Role.ALIVE: ' If it counts the frames: bind = "alive".',
+    Role.CRC: ' If it is the CRC of AUTOSAR E2E profile 1: bind = "crc".',
 }
 
 
@@ -33,10 +31,10 @@ class SignalCompiler:
         self.job = job
         self.message = message
         self.signal = signal
-        self.where = f"{job.file}: {message.name}.{signal.name}"
         self.table = ValueTable(signal)
         self.start = attribute(signal, "GenSigStartValue", job.database)
         self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
+        self.start_is_raw = raw_values.is_raw(self.start, signal)
 
     def plan(self, page: int | None) -> SignalPlan | None:
         """The plan on a page; None, with a line in the problems, where the signal cannot be sent."""
@@ -44,37 +42,50 @@ class SignalCompiler:
             self._check()
             return self._filled(self._unfilled(page))
         except UnfitSignal as error:
-            self.job.problems.append(f"{self.where}: {error}")
+            self.job.problems.append(f"{self._where}: {error}")
             return None
 
+    @property
+    def _where(self) -> str:
+        return f"{self.job.file}: {self.message.name}.{self.signal.name}"
+
     def _check(self) -> None:
-        """UnfitSignal for numbers that nothing can be computed with."""
-        signal, length = self.signal, self.signal.length
+        """UnfitSignal for a length or a value table that cannot be sent."""
+        signal, length, entries = self.signal, self.signal.length, self.table.entries
         if signal.is_float and length not in (32, 64):
             raise UnfitSignal(f"a float of {length} bits cannot be sent; 32 and 64 can.")
-        given = (signal.scale, signal.offset, signal.minimum or 0, signal.maximum or 0)
-        if not all(math.isfinite(number) for number in given):
-            raise UnfitSignal("has a factor, offset or limit that is no finite number.")
-        if signal.scale == 0:
-            raise UnfitSignal("has factor 0.")
         if signal.is_float:
-            if not all(raw_values.is_float_of(raw, length) for raw in self.table.entries):
-                raise UnfitSignal("has a value table with numbers that no 32-bit float holds.")
+            if any(raw_values.float_bits(raw, length) is None for raw in entries):
+                raise UnfitSignal(
+                    f"has a value table with numbers that no {length}-bit float holds."
+                )
             return
         low, high = raw_range(signal)
-        wide = [
-            f"{raw} {text!r}" for raw, text in self.table.entries.items() if not low <= raw <= high
-        ]
-        if wide:
+        if wide := [f"{raw} {text!r}" for raw, text in entries.items() if not low <= raw <= high]:
             raise UnfitSignal(
                 f"cannot hold {', '.join(wide)} of its value table; its values are {low} to {high}."
             )
 
+    def _scale(self) -> tuple[Fraction, Fraction, tuple[Fraction, Fraction] | None]:
+        """Factor, offset, and limits as raw values. UnfitSignal for numbers that nothing can be computed with."""
+        signal = self.signal
+        if signal.scale == 0:
+            raise UnfitSignal("has factor 0.")
+        try:
+            factor, offset = exact(signal.scale), exact(signal.offset)
+            limits = raw_values.limits(signal, factor, offset)
+            for end in (*(raw * factor + offset for raw in raw_range(signal)), *(limits or ())):
+                float(end)
+        except ValueError:
+            raise UnfitSignal("has a factor, offset or limit that is no finite number.") from None
+        except OverflowError:
+            raise UnfitSignal("has a factor, offset or limit that is too large.") from None
+        return factor, offset, limits
+
     def _unfilled(self, page: int | None) -> SignalPlan:
         """The plan as a constant 0."""
         signal, table = self.signal, self.table
-        factor, offset = exact(signal.scale), exact(signal.offset)
-        limits = raw_values.limits(signal, factor, offset)
+        factor, offset, limits = self._scale()
         low, high = raw_range(signal)
         if limits is not None:
             low, high = max(low, math.ceil(limits[0])), min(high, math.floor(limits[1]))
@@ -90,7 +101,7 @@ class SignalCompiler:
             length=signal.length,
             signed=signal.is_signed,
             is_float=signal.is_float,
-            pieces=pieces(signal),
+            pieces=raw_values.pieces(signal),
             low=low,
             high=high,
             not_available=not_available,
@@ -106,20 +117,19 @@ class SignalCompiler:
         """The raw value for "not available": by the value table, else the start value, else an end of the range."""
         if self.table.not_available is not None:
             return self.table.not_available
-        low, high = raw_range(self.signal)
         # a start value that is a mere default does not mean "not available"; a flag has nothing better
-        usable = self.start_is_set or self.signal.length == 1
-        if usable and raw_values.is_raw(self.start, low, high):
+        if self.start_is_raw and (self.start_is_set or self.signal.length == 1):
             return int(self.start)
+        low, high = raw_range(self.signal)
         return low if self.signal.is_signed else high
 
     def _float(self, plan: SignalPlan, limits: tuple[Fraction, Fraction] | None) -> SignalPlan:
         """The plan with the codes as bits of a float: from the value table, else NaN."""
-        codes = [
-            raw_values.float_bits(math.nan if raw is None else float(raw), plan.length)
+        not_available, error = (
+            raw_values.float_bits(math.nan if raw is None else raw, plan.length) or 0
             for raw in (self.table.not_available, self.table.error)
-        ]
-        plan = replace(plan, not_available=codes[0], error=codes[1])
+        )
+        plan = replace(plan, not_available=not_available, error=error)
         if limits is None:
             return plan
         return replace(plan, limits=(float(limits[0]), float(limits[1])))
@@ -144,36 +154,28 @@ class SignalCompiler:
         name = self.signal.name if bound is None else bound
         if (found := self.job.binder.by_name(name)) is not None:
             return self._bound(plan, *found)
-        kind = counters.kind(name)
-        if kind is counters.Kind.COUNTER:
-            if plan.is_float or plan.low > 0 or plan.high < 2:
+        if (role := names.protection(name)) is not None:
+            if role is Role.ALIVE and (plan.is_float or plan.low > 0 or plan.high < 2):
                 raise UnfitSignal(
                     "an alive counter needs a whole number of 2 bits or more that begins at 0. Or bind it to a constant."
                 )
-            return replace(plan, role=Role.ALIVE)
-        if kind is counters.Kind.CHECKSUM:
-            return replace(plan, role=Role.CRC)
+            return replace(plan, role=role)
         if bound is None and self.job.settings.unbound == "start_value":
             return replace(plan, constant=self._start_value(plan), unbound=True)
-        raise self._no_source(name, bound)
-
-    def _no_source(self, name: str, bound: str | None) -> UnfitSignal:
         self.job.unbound += bound is None
         via = "" if bound is None else f" (bound by dbc.bind to {bound!r})"
-        return UnfitSignal(
-            f"no such source{via}.{self.job.binder.suggestions(name)}{_SUSPECT[counters.suspect(name)]} "
-            "Bind it under [dbc.bind] or rename it."
-        )
+        hints = self.job.binder.suggestions(name) + _SUSPECT[names.suspected_protection(name)]
+        raise UnfitSignal(f"no such source{via}.{hints} Bind it under [dbc.bind] or rename it.")
 
     def _bound(self, plan: SignalPlan, value: Value, esc: int | None) -> SignalPlan:
         escs = self.job.binder.escs
         if esc is None and value.group is not Group.GATEWAY:
-            names = " or ".join(f"{e.name}.{value.name}" for e in escs[:2])
-            raise UnfitSignal(f"does not say of which ESC. Prefix it or bind it: {names}.")
+            examples = " or ".join(f"{e.name}.{value.name}" for e in escs[:2])
+            raise UnfitSignal(f"does not say of which ESC. Prefix it or bind it: {examples}.")
         divisor = Fraction(1) if esc is None else divisor_of_settings(value, escs[esc])
         plan = bound_plan(plan, self.table, value, divisor, self._flag_on_loss())
         if value.unit and not plan.unit:
-            self.job.warnings.append(f"{self.where}: has no unit; {value.unit} is taken.")
+            self.job.warnings.append(f"{self._where}: has no unit; {value.unit} is taken.")
         return replace(plan, esc=esc)
 
     def _start_value(self, plan: SignalPlan) -> int:
@@ -184,7 +186,7 @@ class SignalCompiler:
         raw = None
         if plan.is_float and isinstance(start, (int, float)):
             raw = raw_values.constant(self.signal, start, Fraction(1), Fraction(0))
-        elif raw_values.is_raw(start, *raw_range(self.signal)):
+        elif raw_values.is_raw(start, self.signal):
             raw = int(start)
         if raw is None:
             raise UnfitSignal(
@@ -197,5 +199,5 @@ class SignalCompiler:
         if self.table.not_available is not None:
             return None
         chosen = self.job.settings.flags_on_loss
-        own = self.start_is_set and raw_values.is_raw(self.start, *raw_range(self.signal))
+        own = self.start_is_set and self.start_is_raw
         return None if chosen is None and own else chosen or 0

@@ -4,7 +4,7 @@ cantools' own writer leaves out attributes that equal their default, rewrites st
 of database comments and text attributes.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc import rows
@@ -24,48 +24,47 @@ _LONG_NAMES = frozenset(
 
 def dbc_text(database: "Database") -> str:
     """The DBC text: sections in the usual order, signals in bit order, one line for each entry, LF line ends."""
-    sections = [
+    dbc: Any = database.dbc
+    definitions = [("", d) for d in dbc.attribute_definitions.values()]
+    definitions += [("REL_", d) for d in dbc.relation_attribute_definitions.values()]
+    sections = (
         [f'VERSION "{_escaped(database.version or "")}"'],
         ["NS_ :"],
         ["BS_:"],
         [" ".join(["BU_:", *(node.name for node in database.nodes)])],
-        [
-            f"VAL_TABLE_ {name} {_texts(table)} ;"
-            for name, table in database.dbc.value_tables.items()
-        ]
-        if database.dbc
-        else [],
-        *(
-            [_head(message), *(_signal(signal) for signal in _sorted(message))]
-            for message in database.messages
-        ),
+        [f"VAL_TABLE_ {name} {_texts(table)} ;" for name, table in dbc.value_tables.items()],
+        *([_head(m), *(_signal(s) for s in _sorted(m))] for m in database.messages),
         [
             f"BO_TX_BU_ {frame_id(m)} : {','.join(m.senders)};"
             for m in database.messages
             if len(m.senders) > 1
         ],
-        list(_environment(database)),
-        list(_comments(database)),
-        list(_definitions(database)),
-        list(_defaults(database)),
-        list(_attributes(database)),
+        [*_environment(dbc.environment_variables.values())],
+        [*_comments(database)],
+        [f"BA_DEF_{rel} {_definition(d)};" for rel, d in definitions],
         [
-            f"VAL_ {frame_id(message)} {signal.name} {_texts(signal.choices)} ;"
-            for message, signal in _pairs(database)
-            if signal.choices
+            f'BA_DEF_DEF_{rel} "{d.name}" {_default(d)};'
+            for rel, d in definitions
+            if d.default_value is not None
+        ],
+        [*_attributes(database), *_relations(dbc.relation_attributes)],
+        [
+            f"VAL_ {frame_id(m)} {s.name} {_texts(s.choices)} ;"
+            for m, s in _pairs(database)
+            if s.choices
         ],
         [
-            f"SIG_GROUP_ {frame_id(message)} {group.name} {group.repetitions} : {' '.join(group.signal_names)};"
-            for message in database.messages
-            for group in message.signal_groups or ()
+            f"SIG_GROUP_ {frame_id(m)} {group.name} {group.repetitions} : {' '.join(group.signal_names)};"
+            for m in database.messages
+            for group in m.signal_groups or ()
         ],
         [
-            f"SIG_VALTYPE_ {frame_id(message)} {signal.name} : {1 if signal.length == 32 else 2};"
-            for message, signal in _pairs(database)
-            if signal.is_float
+            f"SIG_VALTYPE_ {frame_id(m)} {s.name} : {1 if s.length == 32 else 2};"
+            for m, s in _pairs(database)
+            if s.is_float
         ],
-        list(_multiplexing(database)),
-    ]
+        [*_multiplexing(database)],
+    )
     return "\n\n".join("\n".join(section) for section in sections if section) + "\n"
 
 
@@ -114,16 +113,15 @@ def _signal(signal: "Signal") -> str:
     )
 
 
-def _environment(database: "Database") -> Iterator[str]:
-    variables = database.dbc.environment_variables.values() if database.dbc else ()
+def _environment(variables: Any) -> Iterator[str]:
     for v in variables:
         yield (
             f'EV_ {v.name}: {v.env_type} [{_number(v.minimum)}|{_number(v.maximum)}] "{_escaped(v.unit)}" '
             f"{_number(v.initial_value)} {v.env_id} {v.access_type} {','.join(v.access_nodes)};"
         )
-    yield from (
-        f"ENVVAR_DATA_ {v.name}: {v.data_size};" for v in variables if v.data_size is not None
-    )
+    for v in variables:
+        if v.data_size is not None:
+            yield f"ENVVAR_DATA_ {v.name}: {v.data_size};"
 
 
 def _owners(database: "Database") -> Iterator[tuple[str, Any]]:
@@ -134,9 +132,9 @@ def _owners(database: "Database") -> Iterator[tuple[str, Any]]:
         yield f"BO_ {frame_id(message)} ", message
         for signal in _sorted(message):
             yield f"SG_ {frame_id(message)} {signal.name} ", signal
-    if database.dbc:
-        for variable in database.dbc.environment_variables.values():
-            yield f"EV_ {variable.name} ", variable
+    dbc: Any = database.dbc
+    for variable in dbc.environment_variables.values():
+        yield f"EV_ {variable.name} ", variable
 
 
 def _comments(database: "Database") -> Iterator[str]:
@@ -145,35 +143,20 @@ def _comments(database: "Database") -> Iterator[str]:
             yield f'CM_ {owner}"{_escaped(thing.comment)}";'
 
 
-def _of_definitions(database: "Database") -> Iterator[tuple[str, Any]]:
-    if database.dbc:
-        yield from (("", d) for d in database.dbc.attribute_definitions.values())
-        yield from (("REL_", d) for d in database.dbc.relation_attribute_definitions.values())
+def _definition(definition: Any) -> str:
+    kind, name = definition.kind or "", definition.type_name
+    values, ends = "", (definition.minimum, definition.maximum)
+    if name == "ENUM":
+        values = ",".join(f'"{_escaped(choice)}"' for choice in definition.choices)
+    elif name != "STRING" and None not in ends:
+        values = " ".join(map(_number, ends))
+    return f'{kind} "{definition.name}" {name} {values}'.lstrip()
 
 
-def _definitions(database: "Database") -> Iterator[str]:
-    for rel, definition in _of_definitions(database):
-        kind = f"{definition.kind} " if definition.kind else ""
-        if definition.type_name == "ENUM":
-            values = ",".join(f'"{_escaped(choice)}"' for choice in definition.choices)
-        else:
-            ends = (definition.minimum, definition.maximum)
-            values = (
-                ""
-                if definition.type_name == "STRING" or None in ends
-                else " ".join(map(_number, ends))
-            )
-        yield f'BA_DEF_{rel} {kind}"{definition.name}" {definition.type_name} {values};'
-
-
-def _defaults(database: "Database") -> Iterator[str]:
-    for rel, definition in _of_definitions(database):
-        value = definition.default_value
-        if value is not None:
-            quoted = definition.type_name in ("STRING", "ENUM")
-            yield f'BA_DEF_DEF_{rel} "{definition.name}" ' + (
-                f'"{_escaped(str(value))}";' if quoted else f"{_number(value)};"
-            )
+def _default(definition: Any) -> str:
+    value = definition.default_value
+    is_text = definition.type_name in ("STRING", "ENUM")
+    return f'"{_escaped(str(value))}"' if is_text else _number(value)
 
 
 def _value(attribute: Any) -> str:
@@ -186,31 +169,30 @@ def _value(attribute: Any) -> str:
 
 
 def _attributes(database: "Database") -> Iterator[str]:
-    if not database.dbc:
-        return
     order = {"": 0, "BU_": 1, "BO_": 2, "SG_": 3, "EV_": 4}
     owners = sorted([("", database), *_owners(database)], key=lambda pair: order[pair[0][:3]])
     for owner, thing in owners:
-        attributes: Iterable[Any] = thing.dbc.attributes.values() if thing.dbc else ()
-        yield from (
-            f'BA_ "{a.name}" {owner}{_value(a)};' for a in attributes if a.name not in _LONG_NAMES
-        )
-    relations = database.dbc.relation_attributes
+        for attribute in thing.dbc.attributes.values() if thing.dbc else ():
+            if attribute.name not in _LONG_NAMES:
+                yield f'BA_ "{attribute.name}" {owner}{_value(attribute)};'
+
+
+def _relations(relations: Any) -> Iterator[str]:
     if relations is None:
         return
-    for number, by_signal in relations.node_signal_relations.items():
-        for signal, by_node in by_signal.items():
-            for node, found in by_node.items():
-                yield from (
-                    f'BA_REL_ "{a.name}" BU_SG_REL_ {node} SG_ {number} {signal} {_value(a)};'
-                    for a in found.values()
-                )
-    for number, by_node in relations.node_message_relations.items():
-        for node, found in by_node.items():
-            yield from (
-                f'BA_REL_ "{a.name}" BU_BO_REL_ {node} {number} {_value(a)};'
-                for a in found.values()
-            )
+    owners = [
+        (f"BU_SG_REL_ {node} SG_ {number} {signal}", found)
+        for number, by_signal in relations.node_signal_relations.items()
+        for signal, by_node in by_signal.items()
+        for node, found in by_node.items()
+    ]
+    owners += [
+        (f"BU_BO_REL_ {node} {number}", found)
+        for number, by_node in relations.node_message_relations.items()
+        for node, found in by_node.items()
+    ]
+    for owner, found in owners:
+        yield from (f'BA_REL_ "{a.name}" {owner} {_value(a)};' for a in found.values())
 
 
 def _multiplexing(database: "Database") -> Iterator[str]:

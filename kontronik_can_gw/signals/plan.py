@@ -1,4 +1,4 @@
-"""Compiled messages: their signals, bits, what fills them and when they are sent. Made from a DBC (dbc/compiler.py) or a PDO mapping."""
+"""Compiled messages: their signals, bits, what fills them and when they are sent. Made from a DBC (dbc/prepare.py) or a PDO mapping."""
 
 import math
 from collections.abc import Mapping

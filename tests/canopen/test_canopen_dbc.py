@@ -24,7 +24,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.expand import esc_prefix
+from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
@@ -209,7 +209,7 @@ def test_not_available_is_named_outside_the_limits_and_the_start_value() -> None
     for signal in db.signals:
         table = db.tables.get(signal.key, {})
         start = int(db.attribute("GenSigStartValue", "SG_", *signal.key) or -1)
-        if signal.is_flag or signal.name in NEVER_MISSING:
+        if signal.length == 1 or signal.name in NEVER_MISSING:
             assert NA not in table.values(), signal.name
             continue
         assert table[signal.not_available] == NA
@@ -471,6 +471,7 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
     }
     text = described(bench)
     assert "SIG_VALTYPE_ 385 OilPressure : 1;" in text
+    assert "SG_ OilPressure : 25|32@1+ (1,0) [0|0] " in text
     assert "a 'switch', here/" in text
     assert "VAL_ 641" not in text
 

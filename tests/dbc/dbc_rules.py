@@ -7,13 +7,11 @@ No DBC library is used, so that a mistake in one of them cannot hide a mistake i
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from itertools import pairwise
-
-FIRST_GATEWAY_ID = 0x6D8
-"""Each ESC has its own ids: those of the file plus 0..7."""
+from typing import Any, NamedTuple
 
 LONGEST_NAME = 32
 LONGEST_SIGNAL_NAME = 28
@@ -38,15 +36,13 @@ ENUMS: dict[str, dict[int, str]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Signal:
+class Signal(NamedTuple):
     """One SG_ line. `minimum` and `maximum` are physical."""
 
     message_id: int
     name: str
     start: int
     length: int
-    intel: bool
     signed: bool
     factor: Decimal
     offset: Decimal
@@ -60,12 +56,9 @@ class Signal:
         return self.message_id, self.name
 
     @property
-    def is_flag(self) -> bool:
-        return self.length == 1
-
-    @property
-    def is_alive_counter(self) -> bool:
-        return self.name.endswith("Alive")
+    def has_codes(self) -> bool:
+        """All but flags and alive counters have codes for not available and error."""
+        return self.length > 1 and not self.name.endswith("Alive")
 
     @property
     def not_available(self) -> int:
@@ -78,19 +71,14 @@ class Signal:
         return self.not_available + (1 if self.signed else -1)
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """One BO_ line with its signals."""
 
     id: int
     name: str
     dlc: int
     sender: str
-    signals: tuple[Signal, ...]
-
-    @property
-    def is_of_an_esc(self) -> bool:
-        return self.id < FIRST_GATEWAY_ID
+    signals: list[Signal]
 
 
 @dataclass
@@ -98,7 +86,6 @@ class Database:
     """What the lines of a DBC say. Comment and value keys: ("",), ("BU_", name), ("BO_", id), ("SG_", id, name)."""
 
     data: bytes
-    lines: list[str]
     sections: list[str] = field(default_factory=list)
     not_understood: list[str] = field(default_factory=list)
     nodes: list[str] = field(default_factory=list)
@@ -106,23 +93,22 @@ class Database:
     comments: list[tuple[tuple[str | int, ...], str]] = field(default_factory=list)
     definitions: dict[str, list[str]] = field(default_factory=dict)
     """Attribute name to the texts of an ENUM."""
-    attributes: list[tuple[str, tuple[str | int, ...], str]] = field(default_factory=list)
-    value_tables: list[tuple[tuple[int, str], list[tuple[int, str]]]] = field(default_factory=list)
+    attributes: dict[tuple[str | int, ...], str] = field(default_factory=dict)
+    """Without quotes, by name and key; never a default."""
+    tables: dict[tuple[int, str], dict[int, str]] = field(default_factory=dict)
 
     @property
     def signals(self) -> list[Signal]:
         return [signal for message in self.messages for signal in message.signals]
 
-    @property
-    def tables(self) -> dict[tuple[int, str], dict[int, str]]:
-        return {key: dict(pairs) for key, pairs in self.value_tables}
+    def named(self, signal: Signal) -> dict[int, str]:
+        """Texts of a signal's values, without the codes."""
+        table = self.tables.get(signal.key, {})
+        return {number: text for number, text in table.items() if text not in CODES}
 
     def attribute(self, name: str, *key: str | int) -> str | None:
-        """The one value that a BA_ line gives, without quotes; None if there is none, never a default."""
-        return next(
-            (value.strip('"') for n, k, value in self.attributes if (n, k) == (name, key or ("",))),
-            None,
-        )
+        """The value that a BA_ line gives."""
+        return self.attributes.get((name, *(key or ("",))))
 
     def number(self, name: str, message: Message) -> int:
         """A whole-number attribute of a message; -1 if it is missing or no number."""
@@ -131,104 +117,74 @@ class Database:
 
     def send_type(self, message: Message) -> str:
         """The send type of a message by its index; empty if there is none."""
-        choices, index = (
-            self.definitions.get("GenMsgSendType", []),
-            self.number("GenMsgSendType", message),
-        )
-        return choices[index] if 0 <= index < len(choices) else ""
+        index = self.number("GenMsgSendType", message)
+        return dict(enumerate(self.definitions.get("GenMsgSendType", []))).get(index, "")
 
 
 NUMBER = r"[-+]?[0-9]+(?:\.[0-9]+)?"
 NAME = r"[A-Za-z_][A-Za-z0-9_]*"
-OBJECT = rf"(?:(?P<kind>BU_|BO_|SG_) (?P<object>(?:[0-9]+ )?{NAME}|[0-9]+) )?"
-SIGNAL_LINE = re.compile(
-    rf"^ SG_ (?P<name>{NAME}) : (?P<start>[0-9]+)\|(?P<length>[0-9]+)@(?P<order>[01])(?P<sign>[-+])"
-    rf" \((?P<factor>{NUMBER}),(?P<offset>{NUMBER})\) \[(?P<minimum>{NUMBER})\|(?P<maximum>{NUMBER})\]"
-    rf' "(?P<unit>[^"]*)" (?P<receivers>{NAME}(?:,{NAME})*)$'
-)
-LINES: dict[str, re.Pattern[str]] = {
-    "VERSION": re.compile(r'^VERSION ""$'),
-    "NS_": re.compile(r"^NS_ :$"),
-    "BS_": re.compile(r"^BS_:$"),
-    "BU_": re.compile(rf"^BU_:(?P<nodes>(?: {NAME})*)$"),
-    "BO_": re.compile(
-        rf"^BO_ (?P<id>[0-9]+) (?P<name>{NAME}): (?P<dlc>[0-9]+) (?P<sender>{NAME})$"
-    ),
-    "CM_": re.compile(rf'^CM_ {OBJECT}"(?P<text>[^"]*)";$'),
-    "BA_DEF_": re.compile(
-        r'^BA_DEF_ (?:(?:BU_|BO_|SG_) )?"(?P<name>[^"]+)" (?:INT|FLOAT|STRING|ENUM|HEX) ?(?P<rest>.*);$'
-    ),
-    "BA_DEF_DEF_": re.compile(r'^BA_DEF_DEF_ "[^"]+" .+;$'),
-    "BA_": re.compile(rf'^BA_ "(?P<name>[^"]+)" {OBJECT}(?P<value>"[^"]*"|{NUMBER});$'),
-    "VAL_": re.compile(
-        rf'^VAL_ (?P<id>[0-9]+) (?P<name>{NAME})(?P<pairs>(?: -?[0-9]+ "[^"]*")+) ;$'
-    ),
+OBJECT = rf"(?:(BU_|BO_|SG_) ((?:[0-9]+ )?{NAME}|[0-9]+) )?"
+LINES = {
+    "VERSION": r'VERSION ""',
+    "NS_": r"NS_ :",
+    "BS_": r"BS_:",
+    "BU_": rf"BU_:((?: {NAME})*)",
+    "BO_": rf"BO_ ([0-9]+) ({NAME}): ([0-9]+) ({NAME})",
+    "SG_": rf" SG_ ({NAME}) : ([0-9]+)\|([0-9]+)@1([-+]) \(({NUMBER}),({NUMBER})\) \[({NUMBER})\|({NUMBER})\]"
+    rf' "([^"]*)" ({NAME}(?:,{NAME})*)',
+    "CM_": rf'CM_ {OBJECT}"([^"]*)";',
+    "BA_DEF_": r'BA_DEF_ (?:(?:BU_|BO_|SG_) )?"([^"]+)" (?:INT|FLOAT|STRING|ENUM|HEX) ?(.*);',
+    "BA_DEF_DEF_": r'BA_DEF_DEF_ "[^"]+" .+;',
+    "BA_": rf'BA_ "([^"]+)" {OBJECT}("[^"]*"|{NUMBER});',
+    "VAL_": rf'VAL_ ([0-9]+) ({NAME})((?: -?[0-9]+ "[^"]*")+) ;',
 }
+"""Each kind of line that the rules allow."""
 
 
-def _key(match: re.Match[str]) -> tuple[str | int, ...]:
-    kind, words = match["kind"], (match["object"] or "").split()
-    if kind is None:
-        return ("",)
-    return (kind, *(int(word) if word.isdigit() else word for word in words))
+def _key(kind: str | None, place: str | None) -> tuple[str | int, ...]:
+    words = (place or "").split()
+    return (kind or "", *(int(word) if word.isdigit() else word for word in words))
 
 
 def parse(data: bytes) -> Database:
     """Read the bytes of a DBC line by line; what does not fit goes to `not_understood`."""
-    db = Database(data, data.decode("latin-1").split("\n"))
-    for number, line in enumerate(db.lines, 1):
+    db = Database(data)
+    for number, line in enumerate(data.decode("latin-1").split("\n"), 1):
         if not line:
             continue
         keyword = re.split(r"[ :]", line.lstrip(), maxsplit=1)[0]
-        pattern = SIGNAL_LINE if keyword == "SG_" else LINES.get(keyword)
-        match = pattern.match(line) if pattern else None
-        if match is None:
+        match = re.fullmatch(LINES.get(keyword, "(?!)"), line)
+        if match is None or (keyword == "SG_" and not db.messages):
             db.not_understood.append(f"line {number}: {line}")
             continue
         if keyword != "SG_":
             db.sections.append(keyword)
-        match keyword:
-            case "BU_":
-                db.nodes += match["nodes"].split()
-            case "BO_":
-                db.messages.append(
-                    Message(int(match["id"]), match["name"], int(match["dlc"]), match["sender"], ())
-                )
-            case "SG_" if db.messages:
-                message = db.messages.pop()
-                signal = Signal(
-                    message_id=message.id,
-                    name=match["name"],
-                    start=int(match["start"]),
-                    length=int(match["length"]),
-                    intel=match["order"] == "1",
-                    signed=match["sign"] == "-",
-                    factor=Decimal(match["factor"]),
-                    offset=Decimal(match["offset"]),
-                    minimum=Decimal(match["minimum"]),
-                    maximum=Decimal(match["maximum"]),
-                    unit=match["unit"],
-                    receivers=tuple(match["receivers"].split(",")),
-                )
-                signals = (*message.signals, signal)
-                db.messages.append(
-                    Message(message.id, message.name, message.dlc, message.sender, signals)
-                )
-            case "CM_":
-                db.comments.append((_key(match), match["text"]))
-            case "BA_DEF_":
-                db.definitions[match["name"]] = re.findall(r'"([^"]*)"', match["rest"])
-            case "BA_":
-                db.attributes.append((match["name"], _key(match), match["value"]))
-            case "VAL_":
-                pairs = [
-                    (int(n), text)
-                    for n, text in re.findall(r'(-?[0-9]+) "([^"]*)"', match["pairs"])
-                ]
-                db.value_tables.append(((int(match["id"]), match["name"]), pairs))
-            case _:
-                pass
+        _add(db, keyword, match.groups())
     return db
+
+
+def _add(db: Database, keyword: str, found: Sequence[Any]) -> None:
+    match keyword, *found:
+        case "BU_", names:
+            db.nodes += names.split()
+        case "BO_", number, name, dlc, sender:
+            db.messages.append(Message(int(number), name, int(dlc), sender, []))
+        case "SG_", name, start, length, sign, *numbers, unit, receivers:
+            factor, offset, low, high = map(Decimal, numbers)
+            of, start, length, signed = db.messages[-1], int(start), int(length), sign == "-"
+            scale = (factor, offset, low, high, unit, tuple(receivers.split(",")))
+            of.signals.append(Signal(of.id, name, start, length, signed, *scale))
+        case "CM_", kind, place, text:
+            db.comments.append((_key(kind, place), text))
+        case "BA_DEF_", name, rest:
+            db.definitions[name] = re.findall(r'"([^"]*)"', rest)
+        case "BA_", name, kind, place, value:
+            db.attributes[name, *_key(kind, place)] = value.strip('"')
+        case "VAL_", number, name, pairs:
+            texts = re.findall(r'(-?[0-9]+) "([^"]*)"', pairs)
+            db.tables[int(number), name] = {int(n): text for n, text in texts}
+        case _:
+            pass
 
 
 # --- the rules, in the order of the file -----------------------------------------------------------------------------
@@ -272,8 +228,8 @@ def names_are_pascal_case(db: Database) -> Iterator[str]:
     for signal in db.signals:
         if len(signal.name) > LONGEST_SIGNAL_NAME:
             yield f"{signal.name} is longer than {LONGEST_SIGNAL_NAME}"
-    for (_, name), pairs in db.value_tables:
-        for _, text in pairs:
+    for (_, name), table in db.tables.items():
+        for text in table.values():
             if not re.fullmatch(r"[A-Z][A-Za-z0-9]*", text):
                 yield f"{name}: the value text {text!r} is not PascalCase"
 
@@ -294,11 +250,9 @@ def limits_leave_out_the_codes(db: Database) -> Iterator[str]:
     """[min|max] is the whole type less the two codes, of an enum 0 to its greatest name. It always contains 0: canmatrix
     checks the default start value against it."""
     for signal in db.signals:
-        if signal.is_flag or signal.is_alive_counter:
+        if not signal.has_codes:
             continue
-        named = [
-            number for number, text in db.tables.get(signal.key, {}).items() if text not in CODES
-        ]
+        named = db.named(signal)
         if signal.signed:
             raw = (signal.error + 1, (1 << (signal.length - 1)) - 1)
         else:
@@ -314,21 +268,12 @@ def enums_are_closed(db: Database) -> Iterator[str]:
     """Every value that the gateway can send has a name, and nothing else has: one unknown sample costs all names."""
     found = set()
     for signal in db.signals:
-        named = {
-            number: text
-            for number, text in db.tables.get(signal.key, {}).items()
-            if text not in CODES
-        }
+        named = db.named(signal)
         if named or signal.name in ENUMS:
             found.add(signal.name)
             if named != ENUMS.get(signal.name):
                 yield f"{signal.name} has {named}"
-            if (signal.factor, signal.offset, signal.signed, signal.unit) != (
-                Decimal(1),
-                Decimal(0),
-                False,
-                "",
-            ):
+            if signal.signed or signal.unit or signal.factor != 1 or signal.offset:
                 yield f"{signal.name} is an enum with scale, sign or unit"
     for missing in set(ENUMS) - found:
         yield f"{missing} is missing"

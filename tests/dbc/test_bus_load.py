@@ -1,12 +1,11 @@
 """The computed bus load: bits of a frame, frames a second, and what is said of a bus that is full."""
 
 import pytest
-from packer_oracle import Msg, Sig, dbc_text, read
+from dbc_bench import compiled
+from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.dbc.prepare import check_load, prepare
-from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.dbc.prepare import check_load
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout
 
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
@@ -22,9 +21,7 @@ BA_ "VFrameFormat" BO_ {message.dbc_id} {frame_format + message.extended if fram
 BA_ "GenMsgSendType" BO_ {message.dbc_id} {kind};
 BA_ "GenMsgCycleTime" BO_ {message.dbc_id} {cycle};
 BA_ "GenMsgDelayTime" BO_ {message.dbc_id} {delay};"""
-    escs = [EscSettings("left"), EscSettings("right")]
-    database = read(dbc_text([message], more))
-    return prepare(database, "my.dbc", escs, DbcSettings(), fd_allowed=True)[1]
+    return compiled(dbc_text([message], more), ("left", "right"))
 
 
 def message_of(*names: str, length: int = 8, extended: bool = False) -> Msg:
@@ -87,22 +84,21 @@ def test_half_of_the_bus_is_no_warning_and_all_of_it_no_error() -> None:
     assert check_load(layout, 26_999)
     assert "75% of 18 kbit/s" in str(check_load(layout, 18_000))
     assert "100% of 13 kbit/s" in str(check_load(layout, 13_500))
-    with pytest.raises(UserError, match=r"my\.dbc: .* 100% of 13 kbit/s"):
+    with pytest.raises(UserError, match=r"my_car\.dbc: .* 100% of 13 kbit/s"):
         check_load(layout, 13_499)
+    fd = layout_of(message_of("LeftBatteryVoltage", length=64), frame_format=FD)
+    assert check_load(fd, 250_000, 2_000_000) is None
+    with pytest.raises(UserError):
+        check_load(fd, 250_000, 67_900)
 
 
 def test_the_bits_of_canopen_nodes_count_too() -> None:
     layout = layout_of(message_of("LeftBatteryVoltage"))
     assert check_load(layout, 36_000, further_bits=4_500) is None
     warning = str(check_load(layout, 36_000, further_bits=8_100))
-    assert warning.startswith("my.dbc: the messages and the CANopen nodes need 60% of 36 kbit/s")
+    assert warning.startswith(
+        "my_car.dbc: the messages and the CANopen nodes need 60% of 36 kbit/s"
+    )
     assert "CANopen" not in str(check_load(layout, 18_000))
     alone = str(check_load(Layout("", "", ()), 1_000_000, further_bits=600_000))
     assert alone.startswith("the CANopen nodes need 60% of 1000 kbit/s")
-
-
-def test_a_can_fd_bus_is_judged_at_its_own_data_rate() -> None:
-    layout = layout_of(message_of("LeftBatteryVoltage", length=64), frame_format=FD)
-    assert check_load(layout, 250_000, 2_000_000) is None
-    with pytest.raises(UserError):
-        check_load(layout, 250_000, 67_900)

@@ -1,6 +1,7 @@
 """The shipped DBCs are read alike by cantools, canmatrix, opendbc and asammdf, without an error or a warning."""
 
 import logging
+import math
 import random
 from pathlib import Path
 from typing import Any
@@ -34,37 +35,11 @@ def frame(message: Message, raw: dict[str, int]) -> bytes:
 
 
 def not_available(message: Message) -> dict[str, int]:
-    return {
-        s.name: 0 if s.is_flag or s.is_alive_counter else s.not_available for s in message.signals
-    }
+    return {s.name: s.not_available if s.has_codes else 0 for s in message.signals}
 
 
 def error(message: Message) -> dict[str, int]:
-    return {s.name: 0 if s.is_flag or s.is_alive_counter else s.error for s in message.signals}
-
-
-def valid(message: Message, choice: random.Random, file: Path) -> dict[str, int]:
-    """Raw values that the gateway may send: within the limits, of an enum one with a name."""
-    tables = layout(file).tables
-    raw = {}
-    for signal in message.signals:
-        low, high = int(signal.minimum / signal.factor), int(signal.maximum / signal.factor)
-        named = [number for number in tables.get(signal.key, {}) if low <= number <= high]
-        raw[signal.name] = (
-            choice.choice(named) if named else choice.choice([low, high, choice.randint(low, high)])
-        )
-    return raw
-
-
-def random_frames(message: Message) -> list[bytes]:
-    """Any bytes whatever, and the two extremes; the same on each run."""
-    choice = random.Random(message.id)
-    size = message.dlc
-    return [
-        bytes(size),
-        b"\xff" * size,
-        *(choice.randbytes(size) for _ in range(FRAMES_PER_MESSAGE)),
-    ]
+    return {s.name: s.error if s.has_codes else 0 for s in message.signals}
 
 
 # --- cantools -------------------------------------------------------------------------------------------------------
@@ -94,7 +69,7 @@ def test_cantools_names_the_two_codes(cantools_database: Any, text: str, raw_of:
     for message in layout().messages:
         decoded = cantools_database.decode_message(message.id, frame(message, raw_of(message)))
         for signal in message.signals:
-            expected = 0 if signal.is_flag or signal.is_alive_counter else text
+            expected = text if signal.has_codes else 0
             assert decoded[signal.name] == expected, signal.name
 
 
@@ -124,27 +99,16 @@ def matrix_of(file: Path, caplog: pytest.LogCaptureFixture) -> Any:
 
 @BOTH
 def test_canmatrix_sees_what_the_lines_say(file: Path, caplog: pytest.LogCaptureFixture) -> None:
-    canmatrix_matrix, db = matrix_of(file, caplog), layout(file)
+    matrix, db = matrix_of(file, caplog), layout(file)
     comments = dict(db.comments)
-    assert [ecu.name for ecu in canmatrix_matrix.ecus] == db.nodes
-    assert canmatrix_matrix.attributes == {
-        "LayoutVersion": db.attribute("LayoutVersion"),
-        "BusType": "CAN",
-    }
-    assert len(canmatrix_matrix.frames) == len(db.messages)
-    for message, seen in zip(db.messages, canmatrix_matrix.frames, strict=True):
-        assert (seen.name, seen.arbitration_id.id, seen.size) == (
-            message.name,
-            message.id,
-            message.dlc,
-        )
-        assert (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed) == (
-            False,
-        ) * 4
-        assert (seen.transmitters, seen.comment) == (
-            [message.sender],
-            comments[("BO_", message.id)],
-        )
+    assert [ecu.name for ecu in matrix.ecus] == db.nodes
+    assert matrix.attributes == {"LayoutVersion": db.attribute("LayoutVersion"), "BusType": "CAN"}
+    for message, seen in zip(db.messages, matrix.frames, strict=True):
+        place = (seen.name, seen.arbitration_id.id, seen.size, seen.transmitters, seen.comment)
+        comment = comments[("BO_", message.id)]
+        assert place == (message.name, message.id, message.dlc, [message.sender], comment)
+        kinds = (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed)
+        assert not any(kinds)
         assert seen.attributes["GenMsgSendType"] == db.send_type(message)
         assert seen.cycle_time == db.number("GenMsgCycleTime", message)
         for signal in message.signals:
@@ -206,17 +170,16 @@ def test_all_readers_find_the_same_raw_values_in_any_bytes(
 
     opendbc, matrix = DBC(str(file)), matrix_of(file, caplog)
     database: Any = cantools.database.load_file(file)
+    choice = random.Random(1)
     for message in layout(file).messages:
-        matrix_frame = matrix.frame_by_name(message.name)
-        for data in random_frames(message):
+        frames = [bytes(message.dlc), b"\xff" * message.dlc]
+        for data in frames + [choice.randbytes(message.dlc) for _ in range(FRAMES_PER_MESSAGE)]:
             expected = {signal.name: raw_value(signal, data) for signal in message.signals}
-            assert (
-                database.decode_message(message.id, data, decode_choices=False, scaling=False)
-                == expected
+            assert expected == database.decode_message(
+                message.id, data, decode_choices=False, scaling=False
             )
-            assert {
-                name: seen.raw_value for name, seen in matrix_frame.decode(data).items()
-            } == expected
+            decoded = matrix.frame_by_name(message.name).decode(data)
+            assert {name: seen.raw_value for name, seen in decoded.items()} == expected
             for name, its in opendbc.msgs[message.id].sigs.items():
                 raw = get_raw_value(data, its)
                 raw -= (raw >> (its.size - 1) << its.size) if its.is_signed else 0
@@ -228,7 +191,7 @@ def test_all_readers_find_the_same_raw_values_in_any_bytes(
 CODES = ("NotAvailable", "Error")
 
 
-def recorded(path: Path, file: Path, moments: list[dict[str, dict[str, int]]]) -> Any:
+def recorded(path: Path, file: Path, moments: list[dict[str, int]]) -> Any:
     """An MF4 of raw CAN frames, one of each message per moment and 0.1 s, decoded by asammdf with the DBC."""
     import can
     from asammdf import MDF
@@ -236,13 +199,9 @@ def recorded(path: Path, file: Path, moments: list[dict[str, dict[str, int]]]) -
     with can.MF4Writer(path) as writer:
         for number, moment in enumerate(moments):
             for message in layout(file).messages:
+                at, data = 1_700_000_000 + number / 10, frame(message, moment)
                 writer.on_message_received(
-                    can.Message(
-                        timestamp=1_700_000_000 + number / 10,
-                        arbitration_id=message.id,
-                        is_extended_id=False,
-                        data=frame(message, moment[message.name]),
-                    )
+                    can.Message(at, arbitration_id=message.id, is_extended_id=False, data=data)
                 )
     with MDF(path) as measurement:
         return measurement.extract_bus_logging({"CAN": [(str(file), 0)]})
@@ -250,37 +209,32 @@ def recorded(path: Path, file: Path, moments: list[dict[str, dict[str, int]]]) -
 
 @BOTH
 def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path, file: Path) -> None:
+    """Of values that the gateway may send: within the limits, of an enum one with a name, and the two codes."""
     import numpy as np
 
     choice = random.Random(2)
     db = layout(file)
-    raw: list[dict[str, dict[str, int]]] = []
-    for moment in range(30):
-        raw.append({message.name: valid(message, choice, file) for message in db.messages})
-        for (message_id, name), table in db.tables.items():
-            codes = {text: number for number, text in table.items()}
-            if moment < len(CODES) and CODES[moment] in codes:
-                (owner,) = (message.name for message in db.messages if message.id == message_id)
-                raw[moment][owner][name] = codes[CODES[moment]]
+    raw: list[dict[str, int]] = [{} for _ in range(30)]
+    for signal in db.signals:
+        table = db.tables.get(signal.key, {})
+        low, high = int(signal.minimum / signal.factor), int(signal.maximum / signal.factor)
+        named = [number for number in table if low <= number <= high]
+        codes = {text: number for number, text in table.items()}
+        for moment, values in enumerate(raw):
+            ends = named or [low, high, choice.randint(low, high)]
+            code = CODES[moment] if moment < len(CODES) else ""
+            values[signal.name] = codes.get(code, choice.choice(ends))
     decoded = recorded(tmp_path / "raw.mf4", file, raw)
-    for message in db.messages:
-        for signal in message.signals:
-            seen = decoded.get(signal.name)
-            sent = [moment[message.name][signal.name] for moment in raw]
-            assert list(decoded.get(signal.name, raw=True).samples) == sent, signal.name
-            assert seen.unit == signal.unit
-            table = db.tables.get(signal.key, {})
-            if set(table.values()) - set(CODES):
-                assert [text.decode() for text in seen.samples] == [
-                    table[number] for number in sent
-                ]
-            else:
-                expected = [
-                    float("nan") if number in table else float(number * signal.factor)
-                    for number in sent
-                ]
-                np.testing.assert_allclose(
-                    seen.samples.astype(float), expected, rtol=1e-12, err_msg=signal.name
-                )
-                assert (seen.samples.dtype.kind == "f") == bool(table), signal.name
+    for signal in db.signals:
+        seen, table = decoded.get(signal.name), db.tables.get(signal.key, {})
+        sent = [moment[signal.name] for moment in raw]
+        assert list(decoded.get(signal.name, raw=True).samples) == sent, signal.name
+        assert seen.unit == signal.unit
+        if db.named(signal):
+            assert [text.decode() for text in seen.samples] == [table[number] for number in sent]
+            continue
+        expected = [math.nan if n in table else float(n * signal.factor) for n in sent]
+        samples = seen.samples.astype(float)
+        np.testing.assert_allclose(samples, expected, rtol=1e-12, err_msg=signal.name)
+        assert (seen.samples.dtype.kind == "f") == bool(table), signal.name
     decoded.close()

@@ -2,45 +2,19 @@
 
 import random
 import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+from dbc_bench import compiled, refused
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.reader import load_database, parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.signals.plan import Layout
 
-SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 VOLTAGE = Sig("BatteryVoltage", 0, 16, factor="0.01", unit="V")
 CURRENT = Sig("BatteryCurrent", 16, 16, signed=True, factor="0.1", unit="A")
-
-
-def load(
-    text: str,
-    settings: DbcSettings | None = None,
-    names: Sequence[str] = ("esc1",),
-    fd: bool = False,
-    taken: Mapping[int, str] | None = None,
-) -> Layout:
-    database = parse_database(text.encode(), "my_car.dbc")
-    escs = [EscSettings(name) for name in names]
-    return prepare(database, "my_car.dbc", escs, settings or DbcSettings(), fd, taken)[1]
-
-
-def mistakes(*arguments: Any, **more: Any) -> list[str]:
-    """What ``load`` refuses these with."""
-    with pytest.raises(UserError) as caught:
-        load(*arguments, **more)
-    assert caught.value.exit_code == 2
-    lines = list(caught.value.problems)
-    assert lines and all(line and "\n" not in line and len(line) < 500 for line in lines)
-    return lines
 
 
 def one(*signals: Sig, length: int = 8) -> str:
@@ -82,6 +56,9 @@ REFUSED: list[tuple[list[Sig], list[str]]] = [
     ([volts(factor="0")], ["Power.BatteryVoltage", "factor 0"]),
     *(([volts(**{k: v})], ["Power.BatteryVoltage", "finite"]) for k, v in (
         ("factor", "1e400"), ("offset", "-1e400"), ("maximum", "1e999"))),
+    *(([volts(length=64, **more)], ["Power.BatteryVoltage", "too large"]) for more in (
+        {"factor": "1e300"}, {"factor": "1e-300", "maximum": "1e300", "signed": True, "is_float": True})),
+    ([volts(length=64, signed=True, is_float=True, texts={10**350: "SNA"})], ["Power.BatteryVoltage", "64-bit float"]),
     *(([errors(**more)], ["Power.CrcErrors", "counter", "factor 1"]) for more in (
         {"factor": "2"}, {"factor": "0.1"}, {"offset": "1"}, {"signed": True}, {"minimum": "5", "maximum": "100"},
         {"minimum": "-5", "maximum": "-1"})),
@@ -113,21 +90,16 @@ REFUSED: list[tuple[list[Sig], list[str]]] = [
 def test_a_mistake_of_a_signal_is_one_line_with_its_place(
     signals: list[Sig], words: list[str]
 ) -> None:
-    only(mistakes(one(*signals)), "my_car.dbc: ", *words)
+    only(refused(one(*signals)), "my_car.dbc: ", *words)
 
 
 def test_what_lies_near_a_mistake_is_none() -> None:
     current = Sig("BatteryCurrent", 16, 16, signed=True, mux="m1", unit="A")
-    assert load(one(PAGE, volts(8, mux="m0"), current)).messages[0].pages == (0, 1)
-    assert load(
-        one(
-            PAGE,
-            Sig("Crc8", 8, 8),
-            Sig("AliveCounter", 16, 4),
-            Sig("Timing", 24, 8, unit="us", mux="m1"),
-        )
-    ).messages
-    assert load(one(Sig("Page", 0, 5, mux="M"), volts(16, mux="m16"))).messages[0].pages == (16,)
+    assert compiled(one(PAGE, volts(8, mux="m0"), current)).messages[0].pages == (0, 1)
+    crc, alive = Sig("Crc8", 8, 8), Sig("AliveCounter", 16, 4)
+    assert compiled(one(PAGE, crc, alive, Sig("Timing", 24, 8, unit="us", mux="m1"))).messages
+    wide = compiled(one(Sig("Page", 0, 5, mux="M"), volts(16, mux="m16")))
+    assert wide.messages[0].pages == (16,)
 
 
 @pytest.mark.parametrize(
@@ -139,53 +111,37 @@ def test_what_lies_near_a_mistake_is_none() -> None:
     ],
 )  # fmt: skip
 def test_a_constant_that_cannot_be_sent_exactly_is_refused(signal: Sig, constant: float) -> None:
-    lines = mistakes(one(signal), DbcSettings({"Version": constant}))
+    lines = refused(one(signal), bind={"Version": constant})
     only(lines, "my_car.dbc: Power.Version", f"constant {constant}")
 
 
 def test_suggestions_go_without_prefix_and_without_likeness_there_is_none() -> None:
-    text = one(
-        Sig("LeftBatteryVoltag", 0, 16, unit="V"), Sig("RightBatteryVoltage", 16, 16, unit="V")
-    )
-    only(
-        mistakes(text, names=("left", "right")),
-        "LeftBatteryVoltag: no such source",
-        "battery_voltage",
-    )
-    (line,) = mistakes(one(Sig("TestOvervoltag", 0, 1)))
+    text = one(Sig("LeftBatteryVoltag", 0, 16, unit="V"), Sig("RightBatteryVoltage", 16, 16))
+    lines = refused(text, ("left", "right"))
+    only(lines, "LeftBatteryVoltag: no such source", "battery_voltage")
+    (line,) = refused(one(Sig("TestOvervoltag", 0, 1)))
     assert "Did you mean test_overvoltage or " in line and line.partition("?")[0].count(" or ") == 2
-    (line,) = mistakes(one(Sig("Qqq", 0, 16)))
+    (line,) = refused(one(Sig("Qqq", 0, 16)))
     assert "Did you mean" not in line
-    lines = mistakes(one(Sig("U", 0, 16)), DbcSettings({"U": "batery_voltage"}))
+    lines = refused(one(Sig("U", 0, 16)), bind={"U": "batery_voltage"})
     only(lines, "my_car.dbc: Power.U", "'batery_voltage'", "Did you mean battery_voltage")
 
 
-def test_a_16_bit_float_is_refused() -> None:
-    text = one(volts(signed=True, is_float=True)).replace(
-        "BatteryVoltage : 2;", "BatteryVoltage : 1;"
-    )
-    only(mistakes(text), "my_car.dbc: Power.BatteryVoltage", "16 bits", "32 and 64")
-
-
-def test_two_levels_of_multiplexing_are_refused() -> None:
+def test_a_16_bit_float_and_two_levels_of_multiplexing_are_refused() -> None:
+    text = one(volts(signed=True, is_float=True)).replace("Voltage : 2;", "Voltage : 1;")
+    only(refused(text), "my_car.dbc: Power.BatteryVoltage", "16 bits", "32 and 64")
     text = one(PAGE, Sig("Under", 8, 8, mux="m0M"), volts(16, mux="m1"))
     text += "SG_MUL_VAL_ 256 Under Page 0-0;\nSG_MUL_VAL_ 256 BatteryVoltage Under 1-1;\n"
-    only(mistakes(text), "my_car.dbc: Power", "more than one level")
+    only(refused(text), "my_car.dbc: Power", "more than one level")
 
 
 # --- messages, ids, lengths, nodes ----------------------------------------------------------------------------------------
 
 
-def file_of(*messages: tuple[Any, ...], **more: Any) -> str:
+def file_of(*messages: tuple[Any, ...]) -> str:
     """Messages of (name, id, signal, sender, 29 bits)."""
     filled = [(*m, *("Gateway", False)[len(m) - 3 :]) for m in messages]
-    return dbc_text(
-        [
-            Msg(name, can_id, 8, [signal], ext, sender)
-            for name, can_id, signal, sender, ext in filled
-        ],
-        **more,
-    )
+    return dbc_text(Msg(name, n, 8, [signal], ext, by) for name, n, signal, by, ext in filled)
 
 
 FOO = Sig("Foo", 0, 8)
@@ -194,49 +150,40 @@ POWER, FLOW = ("Power", 0x123, VOLTAGE), ("Flow", 0x123, CURRENT)
 
 
 def test_ids_and_names_are_each_of_one_message() -> None:
-    only(mistakes(file_of(POWER, FLOW)), "my_car.dbc", "Flow", "123h", "Power")
-    gateway = DbcSettings(node="Gateway")
-    only(mistakes(file_of(THEIRS, POWER), gateway), "Power", "123h", "Brake")
-    twice = mistakes(file_of(POWER, ("Power", 0x124, CURRENT)))
+    only(refused(file_of(POWER, FLOW)), "my_car.dbc", "Flow", "123h", "Power")
+    only(refused(file_of(THEIRS, POWER), node="Gateway"), "Power", "123h", "Brake")
+    twice = refused(file_of(POWER, ("Power", 0x124, CURRENT)))
     only(twice, "my_car.dbc", "Power", "two messages have this name")
-    assert any("123h" in line for line in mistakes(file_of(POWER, ("Power", 0x123, CURRENT))))
+    assert any("123h" in line for line in refused(file_of(POWER, ("Power", 0x123, CURRENT))))
     # among messages of others it is none of our business, and 11 and 29 bits do not meet
-    (_,) = load(
-        file_of(THEIRS, ("Wheel", 0x123, FOO, "Other"), ("Power", 0x124, VOLTAGE)), gateway
-    ).messages
-    assert [m.extended for m in load(file_of(POWER, (*FLOW, "Gateway", True))).messages] == [
-        False,
-        True,
-    ]
+    text = file_of(THEIRS, ("Wheel", 0x123, FOO, "Other"), ("Power", 0x124, VOLTAGE))
+    assert len(compiled(text, node="Gateway").messages) == 1
+    both = compiled(file_of(POWER, (*FLOW, "Gateway", True))).messages
+    assert [message.extended for message in both] == [False, True]
 
 
 def test_an_id_that_is_taken_by_canopen_is_named_with_its_user() -> None:
     text = file_of(("Power", 0x181, VOLTAGE), ("Flow", 0x181, CURRENT, "Gateway", True))
-    lines = mistakes(text, taken={0x181: "TPDO1 of node 1"})
+    lines = refused(text, taken={0x181: "TPDO1 of node 1"})
     only(lines, "my_car.dbc: Power", "181h", "TPDO1 of node 1", "680h")
 
 
 def test_can_fd_is_refused_unless_allowed_and_some_lengths_are_none() -> None:
-    only(mistakes(one(VOLTAGE, length=12)), "my_car.dbc: Power", "CAN FD", "12 bytes", "can.fd")
-    assert load(one(VOLTAGE, length=12), fd=True).messages[0].fd
+    text = one(VOLTAGE, length=12)
+    only(refused(text, fd=False), "my_car.dbc: Power", "CAN FD", "12 bytes", "can.fd")
+    assert compiled(text).messages[0].fd
     for length in (9, 11, 13, 63, 65, 100, 1000):
-        only(mistakes(one(VOLTAGE, length=length), fd=True), "my_car.dbc: Power", f"{length} bytes")
+        only(refused(one(VOLTAGE, length=length)), "my_car.dbc: Power", f"{length} bytes")
 
 
 def test_the_node_is_the_only_one_that_sends_ours_or_the_one_that_is_named() -> None:
     text = file_of(("Power", 1, VOLTAGE), ("Brake", 2, FOO, "Other"))
     for node in ("Motor", "Logger"):
-        only(
-            mistakes(text, DbcSettings(node=node)),
-            "my_car.dbc",
-            f"'{node}'",
-            "Gateway, Other",
-            "dbc.node",
-        )
-    only(mistakes(text), "my_car.dbc", "several nodes", "Gateway, Other", "dbc.node")
-    assert load(text.replace("Gateway", "KontronikGateway")).node == "KontronikGateway"
+        only(refused(text, node=node), "my_car.dbc", f"'{node}'", "Gateway, Other", "dbc.node")
+    only(refused(text), "my_car.dbc", "several nodes", "Gateway, Other", "dbc.node")
+    assert compiled(text.replace("Gateway", "KontronikGateway")).node == "KontronikGateway"
     silent = one(VOLTAGE).replace("8 Gateway", "8 Vector__XXX")
-    only(mistakes(silent), "my_car.dbc", "no message has a transmitter")
+    only(refused(silent), "my_car.dbc", "no message has a transmitter")
 
 
 # --- timing -------------------------------------------------------------------------------------------------------------
@@ -247,32 +194,27 @@ def timed(more: str) -> str:
 
 
 def test_send_types_are_known_and_a_cycle_has_a_time() -> None:
-    lines = mistakes(timed('BA_ "GenMsgSendType" BO_ 256 6;'))
+    lines = refused(timed('BA_ "GenMsgSendType" BO_ 256 6;'))
     only(lines, "my_car.dbc: Power", "GenMsgSendType 'Wrong'", "CyclicAndOnChange")
     for number in (0, 3, 4):
         text = timed(f'BA_ "GenMsgSendType" BO_ 256 {number};')
-        only(mistakes(text), "Power", "GenMsgCycleTime is 0")
+        only(refused(text), "Power", "GenMsgCycleTime is 0")
 
 
 @pytest.mark.parametrize("attribute", ["GenMsgCycleTime", "GenMsgDelayTime"])
-@pytest.mark.parametrize("value", ['"soon"', '"inf"', '"nan"', '"-1"'])
-def test_an_invalid_time_is_refused(attribute: str, value: str) -> None:
-    text = timed(f'BA_ "{attribute}" BO_ 256 {value};').replace(
-        f'"{attribute}" INT 0 65535', f'"{attribute}" STRING '
-    )
-    (line,) = mistakes(
-        text.replace(f'BA_DEF_DEF_ "{attribute}" 0', f'BA_DEF_DEF_ "{attribute}" ""')
-    )
-    assert "my_car.dbc" in line
+def test_an_invalid_time_is_refused(attribute: str) -> None:
+    for value in ("soon", "inf", "nan", "-1"):
+        text = timed(f'BA_ "{attribute}" BO_ 256 "{value}";')
+        text = text.replace(f'"{attribute}" INT 0 65535', f'"{attribute}" STRING ')
+        text = text.replace(f'BA_DEF_DEF_ "{attribute}" 0', f'BA_DEF_DEF_ "{attribute}" ""')
+        assert len(refused(text)) == 1
 
 
 def test_a_start_value_that_is_no_number_does_no_harm() -> None:
     text = timed('BA_ "GenSigStartValue" SG_ 256 BatteryVoltage 1;')
-    text = re.sub(
-        r'BA_DEF_ SG_ "GenSigStartValue".*', 'BA_DEF_ SG_ "GenSigStartValue" ENUM "a","b";', text
-    )
+    text = re.sub(r'(?m)^(BA_DEF_ SG_ "GenSigStartValue").*', r'\1 ENUM "a","b";', text)
     text = text.replace('BA_DEF_DEF_ "GenSigStartValue" 0', 'BA_DEF_DEF_ "GenSigStartValue" "a"')
-    assert load(text).messages[0].signals[0].not_available == 65535
+    assert compiled(text).messages[0].signals[0].not_available == 65535
 
 
 # --- bindings -----------------------------------------------------------------------------------------------------------
@@ -281,42 +223,30 @@ def test_a_start_value_that_is_no_number_does_no_harm() -> None:
 @pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
 def test_keys_that_bind_nothing_are_named_with_the_nearest_signal(names: tuple[str, ...]) -> None:
     keys = ("Power.BatteryVoltge", "Nope.Signal", "BatteryVolt")
-    lines = mistakes(one(VOLTAGE), DbcSettings(dict.fromkeys(keys, 1)), names)
-    assert sorted(line.partition(": ")[0] for line in lines) == sorted(
-        f"dbc.bind.{key}" for key in keys
-    )
-    assert all("my_car.dbc" in line for line in lines)
+    lines = refused(one(VOLTAGE), names, bind=dict.fromkeys(keys, 1))
+    assert {line.partition(": ")[0] for line in lines} == {f"dbc.bind.{key}" for key in keys}
     assert any("Did you mean" in line and "BatteryVoltage" in line for line in lines)
     # a signal of another node is no signal of ours; one of ours may have the name of theirs
     text = file_of(("Power", 1, VOLTAGE), ("Brake", 9, FOO, "Other"))
-    only(
-        mistakes(text, DbcSettings({"Foo": 1}, "Gateway"), names), "dbc.bind.Foo", "no such signal"
-    )
+    only(refused(text, names, bind={"Foo": 1}, node="Gateway"), "dbc.bind.Foo", "no such signal")
     text = file_of(("Power", 1, Sig("U", 0, 16, unit="V")), ("Brake", 9, Sig("U", 0, 8), "Other"))
-    assert len(load(text, DbcSettings({"U": "battery_voltage"}, "Gateway"), names).messages) == len(
-        names
-    )
+    layout = compiled(text, names, bind={"U": "battery_voltage"}, node="Gateway")
+    assert len(layout.messages) == len(names)
 
 
 def test_a_signal_that_does_not_say_of_which_esc_is_refused() -> None:
+    pair = ("left", "right")
     left, right = (
-        Sig("LeftBatteryVoltage", 0, 16, unit="V"),
-        Sig("RightBatteryVoltage", 16, 16, unit="V"),
+        Sig(f"{name}BatteryVoltage", at, 16, unit="V") for name, at in (("Left", 0), ("Right", 16))
     )
-    lines = mistakes(
-        one(left, Sig("U", 16, 16, unit="V")),
-        DbcSettings({"U": "right.battery_voltag"}),
-        ("left", "right"),
-    )
+    lines = refused(one(left, Sig("U", 16, 16, unit="V")), pair, bind={"U": "right.battery_voltag"})
     only(lines, "Power.U", "right.battery_voltag", "battery_voltage")
-    text = one(left, right, Sig("BatteryCurrent", 32, 16, signed=True, unit="A"))
-    lines = mistakes(text, names=("left", "right"))
+    lines = refused(one(left, right, Sig("BatteryCurrent", 32, 16, signed=True, unit="A")), pair)
     only(
         lines,
         "Power.BatteryCurrent",
         "of which ESC",
-        "left.battery_current",
-        "right.battery_current",
+        "left.battery_current or right.battery_current",
     )
 
 
@@ -324,25 +254,19 @@ def test_a_signal_that_does_not_say_of_which_esc_is_refused() -> None:
 
 
 def test_all_mistakes_come_at_once_each_naming_its_place() -> None:
+    power = [Sig("BattVolt", 0, 16, unit="V"), Sig("BatteryCurrent", 8, 16, unit="V")]
+    heat = [Sig("BecTemperature", 60, 8, unit="degC"), Sig("CrcErrors", 0, 8, factor="2")]
     messages = [
-        Msg(
-            "Power",
-            0x10,
-            8,
-            [Sig("BattVolt", 0, 16, unit="V"), Sig("BatteryCurrent", 8, 16, unit="V")],
-        ),
-        Msg(
-            "Heat",
-            0x10,
-            8,
-            [Sig("BecTemperature", 60, 8, unit="degC"), Sig("CrcErrors", 0, 8, factor="2")],
-        ),
+        Msg("Power", 0x10, 8, power),
+        Msg("Heat", 0x10, 8, heat),
         Msg("Wide", 0x11, 16, [VOLTAGE]),
     ]
-    lines = mistakes(
+    lines = refused(
         dbc_text(messages, 'BA_ "GenMsgSendType" BO_ 17 6;'),
-        DbcSettings({"Nope": 1}, data_ids={"None": 1}),
+        fd=False,
         taken={0x11: "SYNC"},
+        bind={"Nope": 1},
+        data_ids={"None": 1},
     )
     for words in (
         ("Power.BattVolt", "no such source"),
@@ -359,7 +283,6 @@ def test_all_mistakes_come_at_once_each_naming_its_place() -> None:
     ):
         assert any(all(word in line for word in words) for line in lines), (words, lines)
     assert len(lines) == 11
-    assert all("my_car.dbc" in line for line in lines)
 
 
 # --- files that are no DBC ----------------------------------------------------------------------------------------------
@@ -419,20 +342,16 @@ def broken(rng: random.Random, text: str) -> str:
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize("batch", range(5))
-def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words(batch: int) -> None:
-    text = SHIPPED.read_text()
-    refusals: list[tuple[str, ...]] = []
-    for seed in range(batch * 20, batch * 20 + 20):
+def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words() -> None:
+    text = shipped("dbc/kontronik_esc.dbc").read_text()
+    refusals = 0
+    for seed in range(100):
         rng = random.Random(seed)
         mutated = broken(rng, text)
         names = rng.choice((("esc1",), ("left", "right")))
         try:
-            load(mutated, DbcSettings(node="KontronikGateway"), names)
-        except UserError as error:
-            refusals.append(error.problems)
-    assert all(problems for problems in refusals)
-    assert all(
-        "\n" not in line and "my_car.dbc" in line for problems in refusals for line in problems
-    ), refusals
-    assert 2 < len(refusals) < 20
+            compiled(mutated, names, node="KontronikGateway")
+        except UserError:
+            refusals += 1
+            refused(mutated, names, node="KontronikGateway")
+    assert 20 < refusals < 90

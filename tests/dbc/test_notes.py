@@ -1,21 +1,12 @@
 """What is said of a signal that cannot carry all that its source gives: resolution, range, states, codes."""
 
 import pytest
-from packer_oracle import Msg, Sig, dbc_text, read
-
-from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.esc.telemetry import EscSettings
+from dbc_bench import compiled
+from packer_oracle import Msg, Sig, dbc_text
 
 CODES = {255: "NotAvailable", 254: "Error"}
 SIGNED_CODES = {-128: "NotAvailable", -127: "Error"}
 NO_NAMES = "the value table has no name of it: sent as the ESC's number"
-
-
-def notes(signal: Sig) -> list[str]:
-    database = read(dbc_text([Msg("EscPower", 0x100, 8, [signal])]))
-    layout = prepare(database, "my.dbc", [EscSettings("esc1")], DbcSettings())[1]
-    return list(layout.messages[0].signals[0].notes)
 
 
 def volts(length: int, factor: str, **more: object) -> Sig:
@@ -65,4 +56,5 @@ def percent(**more: object) -> Sig:
     ids=lambda value: value.line if isinstance(value, Sig) else "",
 )  # fmt: skip
 def test_what_a_signal_cannot_carry_is_noted(signal: Sig, expected: list[str]) -> None:
-    assert notes(signal) == expected
+    layout = compiled(dbc_text([Msg("EscPower", 0x100, 8, [signal])]))
+    assert list(layout.messages[0].signals[0].notes) == expected

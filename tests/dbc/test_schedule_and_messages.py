@@ -10,7 +10,6 @@ from pathlib import Path
 
 import dialogue
 import pytest
-from e2e import p01
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get, read
@@ -284,13 +283,8 @@ def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
 
 
 def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> None:
-    for kind, cycle in (
-        (EVENT, 0),
-        (ON_CHANGE, 0),
-        (CYCLIC_AND_EVENT, 40),
-        (CYCLIC_AND_ON_CHANGE, 30),
-        (CYCLIC, 50),
-    ):
+    cycles = {EVENT: 0, ON_CHANGE: 0, CYCLIC_AND_EVENT: 40, CYCLIC_AND_ON_CHANGE: 30, CYCLIC: 50}
+    for kind, cycle in cycles.items():
         bench = lone(kind, cycle, 15)
         rng = random.Random(kind)
         for n in range(300):
@@ -364,22 +358,13 @@ def test_on_loss_an_event_message_is_sent_exactly_once_with_not_available(
 
 
 def escs_message(n: int) -> Msg:
-    return Msg(
-        f"EscLink{n}",
-        0x200 + n,
-        8,
-        [Sig("LinkState", 0, 8), Sig("Losses", 8, 8), Sig("DataAge", 16, 16, unit="ms")],
-    )
+    signals = [Sig("LinkState", 0, 8), Sig("Losses", 8, 8), Sig("DataAge", 16, 16, unit="ms")]
+    return Msg(f"EscLink{n}", 0x200 + n, 8, signals)
 
 
 def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() -> None:
-    kinds = [
-        (CYCLIC, 20),
-        (EVENT, 0),
-        (ON_CHANGE, 0),
-        (CYCLIC_AND_EVENT, 50),
-        (CYCLIC_AND_ON_CHANGE, 30),
-    ]
+    kinds = [(CYCLIC, 20), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50)]
+    kinds += [(CYCLIC_AND_ON_CHANGE, 30)]
     messages = [
         (Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]), kind, cycle, 0)
         for n, (kind, cycle) in enumerate(kinds)
@@ -393,19 +378,13 @@ def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() ->
         bench.until(3 * SECOND)
         with_values = [frame for _, frame in bench.sent if frame.can_id < 0x200]
         assert (not with_values) == silent
-        for n, (kind, cycle) in enumerate(kinds):
+        for n, (_, cycle) in enumerate(kinds):
             link = [(when, frame) for when, frame in bench.sent if frame.can_id == 0x200 + n]
             assert link, (n, silent)
             assert get(link[-1][1].data, 0, 8, True) == 4  # Lost
             assert get(link[-1][1].data, 8, 8, True) == 1
-            if kind in (
-                EVENT,
-                ON_CHANGE,
-            ):
-                # without a cycle: on the loss, and then each second, for age and counters
-                assert len(link) == 3
-            else:
-                assert len(link) >= 2250 // cycle - 1
+            # without a cycle: on the loss, and then each second, for age and counters
+            assert len(link) >= 2250 // cycle - 1 if cycle else len(link) == 3
 
 
 def test_silent_says_nothing_before_the_first_frame_but_for_the_link() -> None:
@@ -443,8 +422,8 @@ def test_values_are_back_with_the_first_frame_after_a_loss() -> None:
 
 def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
     signals = [
-        Sig("LeftBatteryVoltage", 0, 16, factor="0.01"),
-        Sig("RightBatteryVoltage", 16, 16, factor="0.01"),
+        replace(VOLTAGE, name="LeftBatteryVoltage"),
+        replace(VOLTAGE, name="RightBatteryVoltage", start=16),
     ]
     bench = Bench([(Msg("Both", 0x100, 8, signals), EVENT, 0, 0)], ("left", "right"))
     bench.live(volts(1), 0)
@@ -478,7 +457,7 @@ def test_info_of_another_device_is_gone_with_the_telemetry() -> None:
     assert bench.times()[-1] == 260
 
 
-# --- alive counter, pages, E2E ------------------------------------------------------------------------------------------
+# --- alive counter, pages ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -580,31 +559,6 @@ def test_a_cycle_adds_its_page_to_a_changed_one_that_had_to_wait() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("length", "modulus"), [(4, 15), (5, 15), (8, 15)])
-def test_frames_with_e2e_protection_pass_the_check_through_losses_and_returns(
-    length: int, modulus: int
-) -> None:
-    crc, alive = Sig("Crc8", 0, 8), Sig("AliveCounter", 8, length)
-    bench = Bench(
-        [
-            (
-                Msg("EscPower", 0x100, 8, [crc, alive, Sig("BatteryVoltage", 16, 16)]),
-                CYCLIC_AND_EVENT,
-                20,
-                0,
-            )
-        ]
-    )
-    for _ in range(3):
-        bench.feed(bench.now + 200 * MS)
-        bench.until(bench.now + 600 * MS)
-    assert len(bench.sent) > 100
-    assert bench.raws(length, 8) == [number % modulus for number in range(len(bench.sent))]
-    for _, frame in bench.sent:
-        assert p01.e2e_p01_check(bytearray(frame.data), 0x100)
-        assert not p01.e2e_p01_check(bytearray(frame.data), 0x101)
-
-
 # --- ids of 29 bits, CAN FD, other lengths -------------------------------------------------------------------------------
 
 
@@ -638,10 +592,7 @@ def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
         assert (frame.can_id, frame.extended, frame.fd) == (0x123, extended, fd_format > 0)
         assert frame.data == (number << at).to_bytes(size, "little")
     assert len(bench.sent) == 3
-    for other, conflicts in (
-        (not extended, 0),
-        (extended, 1),
-    ):  # its id, and the other of the number
+    for other, conflicts in ((not extended, 0), (extended, 1)):  # of the number, and its id
         bench.gateway.receive_frame(CanFrame(0x123, b"", other), bench.now, bench.now)
         assert bench.gateway.status.id_conflicts == conflicts
 
@@ -678,15 +629,9 @@ def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame
 
 
 def health(kind: int, cycle: int = 0, delay: int = 0) -> Bench:
-    signals = [
-        Sig("GatewayState", 0, 8),
-        Sig("CanState", 8, 8),
-        Sig("EscsOk", 16, 8),
-        Sig("EscCount", 24, 8),
-    ]
-    return Bench(
-        [(Msg("Health", 0x300, 8, signals), kind, cycle, delay)], ("left", "right"), start=True
-    )
+    names = ("GatewayState", "CanState", "EscsOk", "EscCount")
+    message = Msg("Health", 0x300, 8, [Sig(name, 8 * n, 8) for n, name in enumerate(names)])
+    return Bench([(message, kind, cycle, delay)], ("left", "right"), start=True)
 
 
 @pytest.mark.parametrize("kind", [ON_CHANGE, EVENT, CYCLIC_AND_ON_CHANGE])
@@ -730,11 +675,9 @@ def test_the_last_word_is_every_page_that_changed_without_regard_to_the_minimum_
 
 
 def test_messages_without_a_cycle_are_sent_once_at_the_start() -> None:
-    messages = [
-        (Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]), kind, cycle, 0)
-        for n, (kind, cycle) in enumerate(((0, 50), (1, 0), (2, 0), (3, 50)))
-    ]
-    bench = Bench(messages, start=True)
+    kinds = [(CYCLIC, 50), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50)]
+    messages = [Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]) for n in range(4)]
+    bench = Bench([(m, *kind, 0) for m, kind in zip(messages, kinds, strict=True)], start=True)
     assert [frame.can_id for _, frame in bench.sent] == [0x101, 0x102]
 
 

@@ -43,12 +43,8 @@ def test_a_violation_is_reported_by_its_rule(rule: str, pattern: str, replacemen
         pattern, replacement, DATA.decode("ascii"), count=1, flags=re.MULTILINE
     )
     assert changes == 1
-    assert [
-        finding for finding in findings(mutant.encode("latin-1")) if finding.startswith(f"{rule}: ")
-    ]
-
-
-def test_every_rule_is_shown_able_to_fail() -> None:
+    found = findings(mutant.encode("latin-1"))
+    assert any(finding.startswith(f"{rule}: ") for finding in found)
     assert {rule for rule, _, _ in MUTATIONS} == set(RULES)
 
 
@@ -111,7 +107,7 @@ def test_one_esc_loads_the_bus_below_ten_percent_and_eight_fit_on_it(
     for message in db.messages:
         cycle, delay = db.number("GenMsgCycleTime", message), db.number("GenMsgDelayTime", message)
         each = {"Event": 100.0, "Cyclic": 1000 / (cycle or 1), "CyclicAndOnChange": 1000 / delay}
-        hertz += each[db.send_type(message)] * (escs if message.is_of_an_esc else 1)
+        hertz += each[db.send_type(message)] * (escs if message.name.startswith("Esc") else 1)
     assert least < hertz * 135 / 500_000 < most
 
 

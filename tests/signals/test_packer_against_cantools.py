@@ -25,7 +25,7 @@ from packer_oracle import (
     read,
 )
 
-from kontronik_can_gw.dbc.compiler import compile_layout
+from kontronik_can_gw.dbc.prepare import compile_layout
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES

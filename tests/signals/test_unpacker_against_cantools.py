@@ -11,7 +11,7 @@ from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text,
 from test_packer_against_cantools import ESCS, MESSAGES
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.compiler import compile_layout
+from kontronik_can_gw.dbc.prepare import compile_layout
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc

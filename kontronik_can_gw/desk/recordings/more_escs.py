@@ -17,7 +17,8 @@ def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
 
     ``ours``: ids of the layout that came (29 bits with EXTENDED), ``others``: how often each other one came.
     """
-    from kontronik_can_gw.dbc.expand import esc_prefix, expand
+    from kontronik_can_gw.dbc.expand import expand
+    from kontronik_can_gw.dbc.names import esc_prefix
 
     if len(bus.escs) != 1 or not ours or not others:
         return ""
