@@ -44,9 +44,11 @@ class Core:
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
+        state = self.escs[esc]
         if now >= self._next_expiry:
             self.expire(now, but=esc)  # a message may hold values of several ESCs
-        for events in self.escs[esc].receive_each(data, now, since):
+            self._report(esc, state.expire(now), now)
+        for events in state.receive_each(data, now, since):
             self._report(esc, events, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
@@ -96,7 +98,7 @@ class Core:
         if not events:
             return
         self.messages.on_event(esc, events, now)
-        if events & Event.LINK:
+        if events & (Event.LINK | Event.INFO):
             self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
             escs_ok = sum([e.live is not None for e in self.escs])
             if escs_ok != self._status.escs_ok:

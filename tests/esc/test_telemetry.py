@@ -59,7 +59,8 @@ def esc(**known: int) -> EscTelemetry:
 
 def read(telemetry: EscTelemetry, data: bytes, now: int, since: int | None = None) -> int:
     """Bytes that came after ``since``, or just now: the port was empty a moment ago. The events of all frames."""
-    return reduce(or_, telemetry.receive_each(data, now, now if since is None else since), 0)
+    events = telemetry.expire(now)
+    return reduce(or_, telemetry.receive_each(data, now, now if since is None else since), events)
 
 
 def alive(now: int = SECOND) -> EscTelemetry:

@@ -10,7 +10,14 @@ from dataclasses import dataclass, fields
 from zlib import crc32
 
 from kontronik_can_gw.esc.decoder import Reading
-from kontronik_can_gw.esc.kontronik.codec import FORMS, FORMS_BY_HEADER, MAX_LENGTH, Form, Kind, Layout
+from kontronik_can_gw.esc.kontronik.codec import (
+    FORMS,
+    FORMS_BY_HEADER,
+    MAX_LENGTH,
+    Form,
+    Kind,
+    Layout,
+)
 from kontronik_can_gw.esc.kontronik.fields import Data, LiveData
 from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
