@@ -171,9 +171,7 @@ class Gateway:
         """When ``advance`` is to be called at the latest."""
         due = self.core.next_deadline()
         for output in self._outputs:
-            of_output = output.next_deadline()
-            if of_output < due:
-                due = of_output
+            due = min(due, output.next_deadline())
         return due
 
     @property

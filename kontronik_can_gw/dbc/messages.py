@@ -4,7 +4,7 @@ Pure: ``on_event`` and time (``advance``) mark messages as pending, ``take`` pac
 over at most once in a step: in the order of the times at which the messages became due, then of their index.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
@@ -123,10 +123,10 @@ class Messages:
             if Group.GATEWAY in m.plan.paces and (m.by_event or m.on_change)
         ]
         self.schedule = Schedule(layout.messages, now)
-        self.pending: dict[int, int] = {}
-        """The messages that ``take`` hands over, and since when they are pending."""
+        self.pending: dict[tuple[int, ...], int] = {}
+        """Messages that ``take`` hands over, in groups that became pending together, and since when."""
         self._why: dict[int, int] = {}
-        """Of pending messages whose cycle is over: CYCLE (it is sent in any case), or both; all others: REQUEST (where it is news)."""
+        """Of a pending message that the schedule knows: CYCLE, it is sent in any case, REQUEST, where it is news, or both."""
         self._followers = [
             [
                 [self._followers_of(esc, up, events) for events in range(Event.ALL + 1)]
@@ -167,10 +167,9 @@ class Messages:
             for message in paged:
                 message.add_all_pages()  # no further event brings the others
         if at_once:
-            self.pending = dict.fromkeys(at_once, now) | self.pending
+            self.pending.setdefault(at_once, now)
         for index in scheduled:
-            if index not in self.pending:
-                self._request(index, now)
+            self._request(index, now)
 
     def on_gateway_change(self, now: int, each_second: bool = False) -> None:
         """The gateway's own state changed; ``each_second``: only its counters, which is news for messages that have no cycle."""
@@ -198,23 +197,25 @@ class Messages:
         for index, message in self._of_gateway:
             if message.by_event:
                 message.add_all_pages()
-            self.pending[index] = now
+            self._let_go(index, now, REQUEST)
 
     def advance(self, now: int) -> None:
         """Let time pass: cycles, and what a minimum distance has put off."""
         if now < self.schedule.next_due:
             return
         for when, index, why in self.schedule.due(now):
-            if (since := self.pending.get(index)) is not None:
-                when, why = min(since, when), self._why.get(index, REQUEST) | why
-            self.pending[index], self._why[index] = when, why
+            self._let_go(index, when, why)
 
     def _request(self, index: int, now: int) -> None:
         """Let a message be handed over as soon as its minimum distance allows."""
         if self.schedule.may_go(index, now):
-            self.pending.setdefault(index, now)
+            self._let_go(index, now, REQUEST)
         elif self._is_news(self._messages[index], now):
             self.schedule.defer(index)
+
+    def _let_go(self, index: int, since: int, why: int) -> None:
+        self.pending[(index,)] = min(since, self.pending.get((index,), since))
+        self._why[index] = self._why.get(index, 0) | why
 
     # --- frames
 
@@ -224,9 +225,15 @@ class Messages:
             return []
         pending, self.pending = self.pending, {}
         why, self._why = self._why, {}
+        order: Iterable[int]
+        if len(pending) == 1:
+            (order,) = pending
+        else:
+            marks = sorted((since, index) for group, since in pending.items() for index in group)
+            order = dict.fromkeys(index for _, index in marks)
         messages, escs, gateway = self._messages, self._escs, self._gateway
         frames: list[CanFrame] = []
-        for _, index in sorted(zip(pending.values(), pending, strict=True)):
+        for index in order:
             message = messages[index]
             if message.is_stateless:
                 frames.append(message.frame(escs, gateway, now, 0, 0))

@@ -21,7 +21,8 @@ class Drawn:
         voltage, current = fields.get("battery_voltage"), fields.get("battery_current")
         speed = fields.get("electrical_speed")
         self._speed = None if speed is None else speed.word
-        self._voltage = self._current = None
+        self._voltage: int | None = None
+        self._current = 0
         if voltage is not None and current is not None:
             self._voltage, self._current = voltage.word, current.word
             self._unit = SECOND_NS // 1000 * voltage.per_unit * current.per_unit
@@ -41,7 +42,7 @@ class Drawn:
 
     def add(self, live: Sequence[int], ns: int) -> None:
         """Time passed since a reading, which was fresh all the while."""
-        if self._voltage is not None and self._current is not None:
+        if self._voltage is not None:
             power = live[self._voltage] * live[self._current]
             if power > 0:
                 self._sum += power * ns
