@@ -80,7 +80,8 @@ class Core:
         """Let time pass: time-outs, cyclic messages."""
         if now >= self._next_expiry:
             self.expire(now)
-        self.messages.advance(now)
+        if now >= self.messages.schedule.next_due:
+            self.messages.advance(now)
 
     def next_deadline(self) -> int:
         """When ``advance`` is to be called at the latest."""

@@ -117,6 +117,7 @@ class Messages:
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
+        self._stateless = [m.frame if m.is_stateless else None for m in self._messages]
         self._of_gateway = [
             (i, m)
             for i, m in enumerate(self._messages)
@@ -201,8 +202,6 @@ class Messages:
 
     def advance(self, now: int) -> None:
         """Let time pass: cycles, and what a minimum distance has put off."""
-        if now < self.schedule.next_due:
-            return
         for when, index, why in self.schedule.due(now):
             self._let_go(index, when, why)
 
@@ -231,13 +230,15 @@ class Messages:
         else:
             marks = sorted((since, index) for group, since in pending.items() for index in group)
             order = dict.fromkeys(index for _, index in marks)
-        messages, escs, gateway = self._messages, self._escs, self._gateway
+        escs, gateway, stateless = self._escs, self._gateway, self._stateless
         frames: list[CanFrame] = []
         for index in order:
-            message = messages[index]
-            if message.is_stateless:
-                frames.append(message.frame(escs, gateway, now, 0, 0))
-            elif self._is_sent(message, why.get(index, REQUEST), now):
+            frame = stateless[index]
+            if frame is not None:
+                frames.append(frame(escs, gateway, now, 0, 0))
+                continue
+            message = self._messages[index]
+            if self._is_sent(message, why.get(index, REQUEST), now):
                 frames.append(self._frame(index, message, now))
                 while self._stopping and message.pages_to_send:
                     frames.append(self._frame(index, message, now))
