@@ -63,10 +63,6 @@ class Form:
     def __repr__(self) -> str:
         return f"Form({self.kind.value}, {self.layout.value}, {self.length} bytes)"
 
-    def decode(self, buffer: bytes, at: int = 0) -> Data:
-        """The fields of a frame of this form; nothing is checked here."""
-        return tuple.__new__(self.data_type, self.fields_of(buffer, at))
-
     def encode(self, data: Data) -> bytes:
         """The frame with reserved bytes 0 and its CRC. ValueError naming the field that does not fit its wire type."""
         try:
