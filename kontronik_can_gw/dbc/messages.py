@@ -127,7 +127,7 @@ class Messages:
         self.pending: dict[tuple[int, ...], int] = {}
         """Messages that ``take`` hands over, in groups that became pending together, and since when."""
         self._why: dict[int, int] = {}
-        """Of a pending message that the schedule knows: CYCLE, it is sent in any case, REQUEST, where it is news, or both."""
+        """Of pending messages CYCLE, it is sent in any case, REQUEST, where it is news, or both; REQUEST of those that are missing."""
         self._followers = [
             [
                 [self._followers_of(esc, up, events) for events in range(Event.ALL + 1)]

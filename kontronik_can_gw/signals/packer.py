@@ -57,11 +57,6 @@ def quotient(numerator: int, denominator: int) -> float:
         return math.inf if numerator > 0 else -math.inf
 
 
-def not_available_bits(signal: SignalPlan) -> int:
-    """What a signal holds when its value is not available, at its place."""
-    return place(signal.pieces, signal.not_available)
-
-
 def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
     """An alive counter runs 0..modulus-1: to its greatest value, with an E2E profile 1 CRC to 14 of 4 bits."""
     return min(signal.high + 1, 15) if has_crc else signal.high + 1
@@ -82,8 +77,7 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
     crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
     if crc is not None:
         data = f"protected({data}, {crc.pieces[0].at // 8}, {plan.data_id})"
-    place_text = "0" if len(plan.pages) == 1 else "place"
-    of_frame = f"({plan.can_id}, {data}, {plan.extended}, {plan.fd}, {place_text}, False, False)"
+    of_frame = f"({plan.can_id}, {data}, {plan.extended}, {plan.fd}, place, False, False)"
     lines += [*_bits(plan), f"    return new(CanFrame, {of_frame})"]
     return _compiled(plan, "frame", lines)  # type: ignore[no-any-return]
 
@@ -177,7 +171,7 @@ def _terms(signals: Sequence[SignalPlan]) -> list[str]:
         steps, condition = _steps(signal, source)
         term = _placed(signal, _value(signal, steps))
         if condition is not None:
-            term = f"({term} if {condition} else {not_available_bits(signal):#x})"
+            term = f"({term} if {condition} else {place(signal.pieces, signal.not_available):#x})"
         terms.append(term)
     for (word, distance), mask in flags.items():
         moved = f" << {distance}" if distance > 0 else f" >> {-distance}" if distance else ""
