@@ -5,6 +5,7 @@ over at most once in a step: in the order of the times at which the messages bec
 """
 
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
@@ -228,8 +229,10 @@ class Messages:
         if len(pending) == 1:
             (order,) = pending
         else:
-            marks = sorted((since, index) for group, since in pending.items() for index in group)
-            order = dict.fromkeys(index for _, index in marks)
+            by_time: dict[int, set[int]] = {}
+            for group, since in pending.items():
+                by_time.setdefault(since, set()).update(group)
+            order = dict.fromkeys(chain.from_iterable(sorted(by_time[t]) for t in sorted(by_time)))
         escs, gateway, stateless = self._escs, self._gateway, self._stateless
         frames: list[CanFrame] = []
         for index in order:
