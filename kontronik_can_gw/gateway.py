@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.core import Core
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.id_conflicts import IdConflicts
@@ -34,7 +34,7 @@ class Gateway:
         further: Sequence[MakeOutput] = (),
     ) -> None:
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
-        self.core = Core(escs, layout, self.status, now, silent_on_loss, self._follow)
+        self.core = Core(escs, layout, self.status, now, silent_on_loss)
         self.escs = self.core.escs
         self.nodes: Nodes | None = None
         if canopen is not None:
@@ -43,9 +43,9 @@ class Gateway:
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
         )
+        self.core.followers = [output.on_event for output in self._outputs]
         self.conflicts = IdConflicts(self.core.messages.own_ids(), self._outputs)
         self._being_saved: list[tuple[int, Output]] = []
-        self._link_changes: list[int] = []
         self._dropped = False
 
     def start(self, now: int, can_open: bool = True) -> None:
@@ -171,15 +171,13 @@ class Gateway:
         """When ``advance`` is to be called at the latest."""
         due = self.core.next_deadline()
         for output in self._outputs:
-            of_output = output.next_deadline()
-            if of_output < due:
-                due = of_output
+            due = min(due, output.next_deadline())
         return due
 
     @property
     def frames_wait(self) -> bool:
         """True while ``take_frames`` has something to do."""
-        return self.core.messages.is_pending or any(output.frames for output in self._outputs)
+        return bool(self.core.messages.pending) or any(o.frames for o in self._outputs)
 
     def take_frames(self, now: int) -> list[CanFrame]:
         """The frames to send: those of the outputs, oldest first, then those of the messages that are due, with the values of now."""
@@ -188,16 +186,17 @@ class Gateway:
             if output.frames:
                 frames += output.frames
                 output.frames.clear()
-        return frames + self.core.take(now)
+        frames += self.core.take(now)
+        return frames
 
     def not_sent(self, now: int) -> None:
         """The frames that were taken last were thrown away. The gateway itself need not know; who records it does."""
 
     def take_link_changes(self) -> list[int]:
         """ESCs whose link state, layout or device changed since the last call."""
-        if not self._link_changes:
+        if not self.core.link_changes:
             return []
-        changes, self._link_changes = self._link_changes, []
+        changes, self.core.link_changes = self.core.link_changes, []
         return changes
 
     @property
@@ -208,12 +207,6 @@ class Gateway:
     def node_states(self) -> list[tuple[int, Any, int]]:
         """Of each ESC's node: node-ID, state, PDOs sent so far. Empty without nodes."""
         return [state for output in self._outputs for state in output.node_states()]
-
-    def _follow(self, esc: int, events: int, now: int) -> None:
-        for output in self._outputs:
-            output.on_event(esc, events, now)
-        if events & Event.LINK:
-            self._link_changes.append(esc)
 
 
 def _nodes(setup: "CanopenSetup", layout: Layout, core: Core, status: GatewayStatus) -> "Nodes":

@@ -4,7 +4,9 @@ Pure: ``on_event`` and time (``advance``) mark messages as pending, ``take`` pac
 over at most once in a step: in the order of the times at which the messages became due, then of their index.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from typing import NamedTuple
 
 from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
@@ -12,11 +14,9 @@ from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.output import Owner
-from kontronik_can_gw.signals import e2e
-from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
+from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
 
-_new = tuple.__new__
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
     Group.INFO: Event.INFO,
@@ -28,62 +28,33 @@ _EVENT_OF_PACE = {
 class _Message:
     """One message at work.
 
-    ``last`` holds the bits of the last frame of each page, without alive counter and CRC, of a message that is sent on change;
-    ``pages_to_send`` the places of the pages that have to follow without waiting for an event.
+    ``last`` holds the last frame of each page, with alive counter 0, of a message that is sent on change; ``pages_to_send`` the
+    places of the pages that have to follow without waiting for an event.
     """
-
-    __slots__ = (
-        "alive",
-        "alive_modulus",
-        "by_event",
-        "can_id",
-        "crc_at",
-        "extended",
-        "fd",
-        "is_free",
-        "is_paged",
-        "is_plain",
-        "last",
-        "length",
-        "on_change",
-        "pack",
-        "page",
-        "pages",
-        "pages_to_send",
-        "plan",
-        "silent_able",
-        "triggers",
-    )
 
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
         self.plan = plan
-        self.can_id, self.length, self.extended, self.fd = (
-            plan.can_id,
-            plan.length,
-            plan.extended,
-            plan.fd,
-        )
-        self.pages = [page or 0 for page in plan.pages]
+        self.frame = compile_frame(plan)
         self.is_paged = len(plan.pages) > 1
-        # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
-        self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
-        self.pack = compile_pack(plan)
-        self.page = 0
+        self.place = 0
         self.pages_to_send: list[int] = []
         self.alive = 0
-        crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
-        alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
-        self.crc_at = None if crc is None else crc.pieces[0].at // 8
-        self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 0
-        self.last: dict[int, int] = {}
+        roles = {signal.role: signal for signal in plan.signals}
+        alive = roles.get(Role.ALIVE)
+        self.alive_modulus = 0 if alive is None else alive_modulus(alive, Role.CRC in roles)
+        self.last: dict[int, CanFrame] = {}
         # messages with the link's state always go on
         self.silent_able = (
             silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         )
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
-        # sending it leaves nothing to note, and its bits are its data
-        self.is_plain = not self.on_change and not self.alive_modulus and self.crc_at is None
+        # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
+        self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
+        # one that was asked for is sent, and there is nothing to note
+        self.is_stateless = self.is_free and not (
+            self.silent_able or self.on_change or self.alive_modulus
+        )
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:
@@ -104,20 +75,30 @@ class _Message:
     def add_all_pages(self) -> None:
         """Let all pages follow, of a message that has several."""
         if self.is_paged:
-            self.pages_to_send = list(range(len(self.pages)))
+            self.pages_to_send = list(range(len(self.plan.pages)))
 
     def turn_page(self) -> None:
         """Let the page follow whose turn it is, of a message that has several."""
         if self.is_paged:
-            if self.page not in self.pages_to_send:
-                self.pages_to_send.append(self.page)
-            self.page = (self.page + 1) % len(self.pages)
+            if self.place not in self.pages_to_send:
+                self.pages_to_send.append(self.place)
+            self.place = (self.place + 1) % len(self.plan.pages)
 
     def next_place(self) -> int:
         """The place of the page to send: the first of those that are to follow, else that whose turn it is."""
+        if not self.is_paged:
+            return 0
         if not self.pages_to_send:
             self.turn_page()
         return self.pages_to_send.pop(0)
+
+
+class _Followers(NamedTuple):
+    """The messages that follow a combination of events: those that go at once, those of the schedule, those that send all pages."""
+
+    at_once: tuple[int, ...]
+    scheduled: tuple[int, ...]
+    paged: tuple[_Message, ...]
 
 
 class Messages:
@@ -137,55 +118,60 @@ class Messages:
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
+        self._stateless = [m.frame if m.is_stateless else None for m in self._messages]
         self._of_gateway = [
             (i, m)
             for i, m in enumerate(self._messages)
             if Group.GATEWAY in m.plan.paces and (m.by_event or m.on_change)
         ]
-        self._schedule = Schedule(layout.messages, now)
-        self._pending: dict[int, tuple[int, int, int]] = {}
-        """By message: (since when, message, CYCLE: it is sent in any case, REQUEST: where it is news)."""
-        self._listeners = [
+        self.schedule = Schedule(layout.messages, now)
+        self.pending: dict[tuple[int, ...], int] = {}
+        """Messages that ``take`` hands over, in groups that became pending together, and since when."""
+        self._why: dict[int, int] = {}
+        """Of pending messages CYCLE, it is sent in any case, REQUEST, where it is news, or both; REQUEST of those that are missing."""
+        self._followers = [
             [
-                [self._listeners_of(esc, up, events) for events in range(Event.ALL + 1)]
+                [self._followers_of(esc, up, events) for events in range(Event.ALL + 1)]
                 for up in (False, True)
             ]
             for esc in range(len(escs))
         ]
-        """The messages that follow: by ESC, whether its live data is fresh, and combination of events."""
+        """By ESC, whether its live data is fresh, and combination of events."""
         self._stopping = False
 
-    def _listeners_of(self, esc: int, up: bool, events: int) -> list[tuple[int, _Message]]:
-        return [
+    def _followers_of(self, esc: int, up: bool, events: int) -> _Followers:
+        found = [
             (i, m)
             for i, m in enumerate(self._messages)
             if esc in m.plan.escs and m.follows(events, up)
         ]
+        return _Followers(
+            tuple(i for i, m in found if m.is_free),
+            tuple(i for i, m in found if not m.is_free),
+            tuple(m for _, m in found if m.is_paged and m.by_event),
+        )
 
     def own_ids(self) -> dict[int, Owner]:
         """The ids of the messages (29-bit ones with EXTENDED), and what for."""
         return {
-            message.can_id | (EXTENDED if message.extended else 0): Owner(
-                None, f"message {message.plan.name}"
-            )
-            for message in self._messages
+            plan.can_id | (EXTENDED if plan.extended else 0): Owner(None, f"message {plan.name}")
+            for plan in (message.plan for message in self._messages)
         }
 
     # --- what makes messages pending
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: bits of telemetry.Event."""
-        state, pending = self._escs[esc], self._pending
+        state = self._escs[esc]
         up = state.live is not None
-        gone = not up or (events & Event.INFO and state.info is None)
-        for index, message in self._listeners[esc][up][events]:
-            if gone and message.is_paged and message.by_event:
+        at_once, scheduled, paged = self._followers[esc][up][events]
+        if paged and (not up or (events & Event.INFO and state.info is None)):
+            for message in paged:
                 message.add_all_pages()  # no further event brings the others
-            if index not in pending:
-                if message.is_free:
-                    pending[index] = (now, index, REQUEST)
-                else:
-                    self._request(index, now)
+        if at_once:
+            self.pending.setdefault(at_once, now)
+        for index in scheduled:
+            self._request(index, now)
 
     def on_gateway_change(self, now: int, each_second: bool = False) -> None:
         """The gateway's own state changed; ``each_second``: only its counters, which is news for messages that have no cycle."""
@@ -213,86 +199,87 @@ class Messages:
         for index, message in self._of_gateway:
             if message.by_event:
                 message.add_all_pages()
-            self._pending[index] = (now, index, REQUEST)
+            self._let_go(index, now, REQUEST)
 
     def advance(self, now: int) -> None:
         """Let time pass: cycles, and what a minimum distance has put off."""
-        for when, index, why in self._schedule.due(now):
-            since, _, before = self._pending.get(index, (when, index, 0))
-            self._pending[index] = (min(since, when), index, before | why)
-
-    def next_deadline(self) -> int:
-        """When ``advance`` has something to do."""
-        return self._schedule.next_deadline()
-
-    @property
-    def is_pending(self) -> bool:
-        """True while ``take`` has something to do."""
-        return bool(self._pending)
+        for when, index, why in self.schedule.due(now):
+            self._let_go(index, when, why)
 
     def _request(self, index: int, now: int) -> None:
         """Let a message be handed over as soon as its minimum distance allows."""
-        if self._schedule.may_go(index, now):
-            self._pending.setdefault(index, (now, index, REQUEST))
+        if self.schedule.may_go(index, now):
+            self._let_go(index, now, REQUEST)
         elif self._is_news(self._messages[index], now):
-            self._schedule.defer(index)
+            self.schedule.defer(index)
+
+    def _let_go(self, index: int, since: int, why: int) -> None:
+        self.pending[(index,)] = min(since, self.pending.get((index,), since))
+        self._why[index] = self._why.get(index, 0) | why
 
     # --- frames
 
     def take(self, now: int) -> list[CanFrame]:
         """The frames of what is pending, as they are now."""
-        if not self._pending:
+        if not self.pending:
             return []
-        pending, self._pending = sorted(self._pending.values()), {}
+        pending, self.pending = self.pending, {}
+        why, self._why = self._why, {}
+        order: Iterable[int]
+        if len(pending) == 1:
+            (order,) = pending
+        else:
+            by_time: dict[int, set[int]] = {}
+            for group, since in pending.items():
+                by_time.setdefault(since, set()).update(group)
+            order = dict.fromkeys(chain.from_iterable(sorted(by_time[t]) for t in sorted(by_time)))
+        escs, gateway, stateless = self._escs, self._gateway, self._stateless
         frames: list[CanFrame] = []
-        for _, index, why in pending:
+        for index in order:
+            frame = stateless[index]
+            if frame is not None:
+                frames.append(frame(escs, gateway, now, 0, 0))
+                continue
             message = self._messages[index]
-            if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
-                message.pages_to_send.clear()
-            elif (why & REQUEST and self._is_news(message, now)) or why & CYCLE:
-                if why & CYCLE and message.is_paged:
-                    message.turn_page()
+            if self._is_sent(message, why.get(index, REQUEST), now):
                 frames.append(self._frame(index, message, now))
                 while self._stopping and message.pages_to_send:
                     frames.append(self._frame(index, message, now))
         return frames
 
+    def _is_sent(self, message: _Message, why: int, now: int) -> bool:
+        """Whether a pending message is sent; one whose cycle is over turns its page."""
+        if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
+            message.pages_to_send.clear()
+            return False
+        is_news = bool(why & REQUEST) and self._is_news(message, now)
+        if why & CYCLE:
+            message.turn_page()
+        return is_news or bool(why & CYCLE)
+
     def _is_news(self, message: _Message, now: int) -> bool:
         """False for a message that is sent on change and has not changed; of several pages those that have follow."""
         if message.by_event or not message.on_change:
             return True
-        pack, last = message.pack, message.last
         changed = [
             place
-            for place, page in enumerate(message.pages)
-            if pack(self._escs, self._gateway, now, 0, page) != last.get(page)
+            for place in range(len(message.plan.pages))
+            if message.frame(self._escs, self._gateway, now, 0, place) != message.last.get(place)
         ]
         if message.is_paged:
             message.pages_to_send += [p for p in changed if p not in message.pages_to_send]
         return bool(changed or message.pages_to_send)
 
     def _frame(self, index: int, message: _Message, now: int) -> CanFrame:
-        place = message.next_place() if message.is_paged else 0
-        page = message.pages[place]
-        bits = message.pack(self._escs, self._gateway, now, message.alive, page)
-        data = bits.to_bytes(message.length, "little")
-        if not message.is_plain:
-            data = self._finish(message, data, page, now)
-        if not message.is_free:
-            self._schedule.sent(index, now)
-            if message.pages_to_send:
-                self._schedule.wait(index, now)
-        return _new(
-            CanFrame, (message.can_id, data, message.extended, message.fd, place, False, False)
-        )
-
-    def _finish(self, message: _Message, data: bytes, page: int, now: int) -> bytes:
-        """The data with its CRC; the alive counter goes on, and what was sent is noted for a message that is sent on change."""
+        """The frame of the page that is next; what it changes is noted."""
+        place = message.next_place()
+        frame = message.frame(self._escs, self._gateway, now, message.alive, place)
+        if message.on_change:
+            message.last[place] = message.frame(self._escs, self._gateway, now, 0, place)
         if message.alive_modulus:
             message.alive = (message.alive + 1) % message.alive_modulus
-        if message.on_change:
-            message.last[page] = message.pack(self._escs, self._gateway, now, 0, page)
-        if message.crc_at is None:
-            return data
-        at = message.crc_at
-        return data[:at] + bytes((e2e.crc(data, at, message.plan.data_id),)) + data[at + 1 :]
+        if not message.is_free:
+            self.schedule.sent(index, now)
+            if message.pages_to_send:
+                self.schedule.wait(index, now)
+        return frame

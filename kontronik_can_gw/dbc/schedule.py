@@ -1,7 +1,7 @@
 """When each message is sent: cyclic with spread phases, by event, on change, never closer than its minimum distance.
 
 Pure: ``may_go`` says whether a message may be sent now, ``defer`` puts it off until it may, ``due`` returns the messages to send, ``sent``
-reports a sent one, and ``next_deadline`` returns the time of the next call.
+reports a sent one, and ``next_due`` is the time of the next call.
 """
 
 import heapq
@@ -34,6 +34,8 @@ class Schedule:
         ]
         """(when, message, True for a deferred request): at the same time the cycle of a message comes first."""
         heapq.heapify(self._heap)
+        self.next_due = self._heap[0][0] if self._heap else NEVER
+        """When ``due`` will return a message; NEVER for never."""
 
     def may_go(self, index: int, now: int) -> bool:
         """True if the message may be sent now: its minimum distance is over."""
@@ -58,8 +60,6 @@ class Schedule:
         A late call skips missed cycles: it never returns a message twice.
         """
         heap = self._heap
-        if not heap or heap[0][0] > now:
-            return []
         found: dict[int, tuple[int, int, int]] = {}
         while heap and heap[0][0] <= now:
             when, index, is_deferred = heap[0]
@@ -84,16 +84,14 @@ class Schedule:
                 else:
                     self.defer(index)
                     self._cycle_deferred[index] = True
+        self.next_due = heap[0][0] if heap else NEVER
         return list(found.values())
-
-    def next_deadline(self) -> int:
-        """When ``due`` will return a message; NEVER for never."""
-        return self._heap[0][0] if self._heap else NEVER
 
     def _defer(self, index: int, until: int) -> None:
         if not self._deferred[index]:
             self._deferred[index] = True
             heapq.heappush(self._heap, (until, index, True))
+            self.next_due = self._heap[0][0]
 
 
 def phases(cycles: Sequence[int]) -> list[int]:

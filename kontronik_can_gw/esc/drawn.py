@@ -1,7 +1,6 @@
 """What an ESC has drawn and how long its motor has turned: integrals over its live data."""
 
 from collections.abc import Sequence
-from fractions import Fraction
 
 from kontronik_can_gw.esc.decoder import SECOND_NS, EscProtocol
 
@@ -12,51 +11,40 @@ class Drawn:
     Between two readings the power, and whether the motor turns, are those of the first.
     """
 
-    __slots__ = ("_power", "_power_factor", "_rest", "_speed", "_turns", "_unit", "energy", "run_time")  # fmt: skip
+    __slots__ = ("_current", "_speed", "_sum", "_unit", "_voltage", "run_time")
 
     def __init__(self, protocol: EscProtocol) -> None:
-        self.energy = 0
         self.run_time = 0
-        self._rest = 0  # power steps by nanoseconds, less than a milliwatt second
-        self._turns = False
-        self._power = 0  # in steps
-        voltage, current = (
-            protocol.by_name.get(name) for name in ("battery_voltage", "battery_current")
-        )
-        speed = protocol.by_name.get("electrical_speed")
+        self._sum = 0  # steps of voltage by steps of current by nanoseconds
+        self._unit = SECOND_NS  # what of it makes a milliwatt second: a whole number
+        fields = protocol.by_name
+        voltage, current = fields.get("battery_voltage"), fields.get("battery_current")
+        speed = fields.get("electrical_speed")
         self._speed = None if speed is None else speed.word
-        self._power_factor: tuple[int, int, int] | None = None
-        self._unit = SECOND_NS
+        self._voltage: int | None = None
+        self._current = 0
         if voltage is not None and current is not None:
-            # a step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW with KONTRONIK
-            milliwatts = Fraction(1000, voltage.per_unit * current.per_unit)
-            self._power_factor = voltage.word, current.word, milliwatts.numerator
-            self._unit = SECOND_NS * milliwatts.denominator
+            self._voltage, self._current = voltage.word, current.word
+            self._unit = SECOND_NS // 1000 * voltage.per_unit * current.per_unit
+
+    @property
+    def energy(self) -> int:
+        return self._sum // self._unit
 
     @property
     def energy_mw_ns(self) -> int:
         """The energy in milliwatt nanoseconds, as a capture holds it."""
-        return self.energy * SECOND_NS + self._rest * SECOND_NS // self._unit
+        return self._sum * SECOND_NS // self._unit
 
     @energy_mw_ns.setter
     def energy_mw_ns(self, energy: int) -> None:
-        self.energy, rest = divmod(energy, SECOND_NS)
-        self._rest = rest * self._unit // SECOND_NS
+        self._sum = energy * self._unit // SECOND_NS
 
-    def add(self, ns: int) -> None:
-        """Time passed since the last reading, which was fresh all the while."""
-        if self._power > 0:
-            rest = self._rest + self._power * ns
-            if rest >= self._unit:
-                self.energy += rest // self._unit
-                rest %= self._unit
-            self._rest = rest
-        if self._turns:
+    def add(self, live: Sequence[int], ns: int) -> None:
+        """Time passed since a reading, which was fresh all the while."""
+        if self._voltage is not None:
+            power = live[self._voltage] * live[self._current]
+            if power > 0:
+                self._sum += power * ns
+        if self._speed is not None and live[self._speed]:
             self.run_time += ns
-
-    def take(self, live: Sequence[int]) -> None:
-        """The newest live data."""
-        if (power := self._power_factor) is not None:
-            self._power = live[power[0]] * live[power[1]] * power[2]
-        if self._speed is not None:
-            self._turns = live[self._speed] != 0

@@ -80,7 +80,8 @@ class EscTelemetry:
     gear), ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``, ``drawn``, ``live_ns`` and
     ``last_info_ns`` (time of the newest live and info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and
     ``info_bound_ns`` are the earliest that byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or
-    not, of the layout now on the line; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
+    not, of the layout now on the line, ``device`` is the number in the latter; ``line_errors`` (parity, framing, overrun) is written by
+    who owns the port.
     """
 
     def __init__(self, settings: EscSettings, now: int) -> None:
@@ -90,6 +91,7 @@ class EscTelemetry:
         self.info: Data | None = None
         self.last_live: Data | None = None
         self.last_info: Data | None = None
+        self.device: int | None = None
         self.link = LinkState.NEVER_SEEN
         self.layout = 0
         self.apply(settings)
@@ -106,9 +108,8 @@ class EscTelemetry:
         self.base_line_errors = 0
         self.suspect_frames = 0
         self.late_frames = 0
-        self._arrivals: deque[tuple[int, int]] = (
-            deque()
-        )  # (stream position after a chunk, the bound of its last byte) while bytes are pending
+        self._arrivals: deque[tuple[int, int]] = deque()
+        """(stream position after a chunk, the bound of its last byte) while bytes are pending."""
         self._interval_ns = 0  # between live frames, as usual; 0: not known
         self._window_ns = now
         self._window_counters = self.base
@@ -127,7 +128,7 @@ class EscTelemetry:
 
     def supplies(self, not_on: frozenset[int], raw: int) -> bool:
         """False for a value that the device (the last known one) does not have, and at 0 as long as the device is not known."""
-        device = self.protocol.value("device_raw", self.last_info)
+        device = self.device
         return (self.info is not None or raw != 0) and (device is None or device not in not_on)
 
     @property
@@ -157,13 +158,12 @@ class EscTelemetry:
     def receive_each(self, data: bytes, now: int, since: int) -> Iterator[int]:
         """Take bytes that were read at ``now`` and came after ``since``; the events of each frame in turn: iterate to the end.
 
-        An unfinished frame older than the time-out is given up first.
+        What is too old by ``now`` was expired before (``expire``). An unfinished frame older than the time-out is given up first.
         """
-        if events := self._expire(now):
-            yield events
         decoder, arrivals = self.decoder, self._arrivals
         byte_ns = self.protocol.byte_ns
-        if arrivals and now - arrivals[0][1] > self.settings.timeout_ns:
+        timeout = self.settings.timeout_ns
+        if arrivals and now - arrivals[0][1] > timeout:
             self.late_frames += len(decoder.flush())
             arrivals.clear()
         bound = since + (len(data) - 1) * byte_ns
@@ -179,10 +179,9 @@ class EscTelemetry:
             arrivals.clear()
         shown = now if now - bound <= self._interval_ns else bound
         for reading in readings:
-            form = reading.form
-            after = (end - reading.offset - form.length) * byte_ns
-            limit = INFO_TIMEOUT_NS if form.is_info else self.settings.timeout_ns
-            if now - bound + after > limit:
+            form, offset, _ = reading
+            after = (end - offset - form.length) * byte_ns
+            if now - bound + after > (INFO_TIMEOUT_NS if form.is_info else timeout):
                 # the bytes after it in the same read make it old already
                 self.late_frames += 1
             else:
@@ -204,9 +203,20 @@ class EscTelemetry:
 
     def advance(self, now: int) -> int:
         """Let time pass: expire what is old, close the one-second window of rate and quality."""
-        events = self._expire(now)
+        events = self.expire(now)
         if now - self._window_ns >= SECOND:
             events |= self._close_window(now)
+        return events
+
+    def expire(self, now: int) -> int:
+        """What is too old by ``now`` is not available any more."""
+        events = Event.NONE
+        if self.live is not None and now - self.live_bound_ns > self.settings.timeout_ns:
+            self.losses += 1
+            events |= self._lose(LinkState.LOST)
+        if self.info_bound_ns is not None and now - self.info_bound_ns > INFO_TIMEOUT_NS:
+            self._forget_device()
+            events |= Event.INFO
         return events
 
     def next_deadline(self) -> int:
@@ -229,7 +239,7 @@ class EscTelemetry:
         if form.layout_number != self.layout:
             self.layout = form.layout_number
             self._forget_device()
-            self.last_live = self.last_info = None  # of another device
+            self.last_live = self.last_info = self.device = None  # of another device
             self.last_info_ns = None
             events = Event.INFO | Event.LINK
         if form.is_info:
@@ -242,8 +252,7 @@ class EscTelemetry:
             if bound < self.live_bound_ns:
                 bound = self.live_bound_ns
             if self.live is not None:
-                self.drawn.add(when - before)
-        self.drawn.take(data)
+                self.drawn.add(self.live, when - before)
         self.live = self.last_live = data
         self.live_ns, self.live_bound_ns = when, bound
         if self.link is not _OK and self.link is not _DEGRADED:
@@ -262,22 +271,13 @@ class EscTelemetry:
         self.info = self.last_info = data
         self.last_info_ns, self.info_bound_ns = when, bound
         self.cells = self.settings.cell_count or value("cell_count", data) or 0
+        self.device = value("device_raw", data)
         return Event.INFO | Event.LINK if another else Event.INFO
 
     def _forget_device(self) -> None:
         self.info = None
         self.info_bound_ns = None
         self.cells = self.settings.cell_count
-
-    def _expire(self, now: int) -> int:
-        events = Event.NONE
-        if self.live is not None and now - self.live_bound_ns > self.settings.timeout_ns:
-            self.losses += 1
-            events |= self._lose(LinkState.LOST)
-        if self.info_bound_ns is not None and now - self.info_bound_ns > INFO_TIMEOUT_NS:
-            self._forget_device()
-            events |= Event.INFO
-        return events
 
     def _lose(self, state: LinkState) -> int:
         events = self._set_link(state)

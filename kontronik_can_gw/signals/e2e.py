@@ -19,3 +19,8 @@ def crc(data: bytes, at: int, data_id: int) -> int:
     for byte in bytes((data_id & 0xFF, data_id >> 8 & 0xFF)) + data[:at] + data[at + 1 :]:
         value = _CRC[value ^ byte]
     return value
+
+
+def protected(data: bytes, at: int, data_id: int) -> bytes:
+    """The frame with its CRC at ``at``."""
+    return data[:at] + bytes((crc(data, at, data_id),)) + data[at + 1 :]

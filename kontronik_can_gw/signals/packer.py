@@ -1,4 +1,4 @@
-"""Message plans -> one compiled function each: ``pack(escs, gateway, now, alive, page) -> frame bits`` as an integer.
+"""Message plans -> one compiled function each, of ESCs, gateway and time: to the bits of a frame as an integer, or to the frame.
 
 Python source is generated from the plan once, at start. A value that does not fit becomes the signal's Error code, one that is not
 available its NotAvailable code; nothing wraps, nothing is clipped. Bit 0 of the integer is bit 0 of byte 0.
@@ -8,13 +8,19 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import Divisor, Kind, Value
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
+"""ESCs, gateway, time, alive counter and multiplexer value to bits."""
+MakeFrame = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], CanFrame]
+"""ESCs, gateway, time, alive counter and place of the page (``MessagePlan.pages``) to the frame with its CRC."""
 
 
 def place(pieces: Sequence[Piece], raw: int) -> int:
@@ -51,81 +57,94 @@ def quotient(numerator: int, denominator: int) -> float:
         return math.inf if numerator > 0 else -math.inf
 
 
-def not_available_bits(signal: SignalPlan) -> int:
-    """What a signal holds when its value is not available, at its place."""
-    return place(signal.pieces, signal.not_available)
-
-
 def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
     """An alive counter runs 0..modulus-1: to its greatest value, with an E2E profile 1 CRC to 14 of 4 bits."""
     return min(signal.high + 1, 15) if has_crc else signal.high + 1
 
 
-def source_text(plan: MessagePlan) -> str:
-    """The generated function. It names tables and functions of its signals (``compile_pack``)."""
-    lines = ["def pack(escs, gateway, now, alive, page):"]
-    constant = 0
-    has_crc = any(signal.role is Role.CRC for signal in plan.signals)
-    for signal in plan.signals:
-        if signal.role is Role.CONSTANT and signal.page is None:
-            constant |= place(signal.pieces, signal.constant)
-    lines.append(f"    bits = {constant:#x}")
-    lines += [f"    {line}" for line in _body(plan, None, has_crc)]
-    for page in plan.pages:
-        if page is None:
-            continue
-        body = _body(plan, page, has_crc)
-        for signal in plan.signals:
-            if signal.role is Role.MULTIPLEXER:
-                body.append(f"bits |= {place(signal.pieces, page):#x}")
-            elif signal.role is Role.CONSTANT and signal.page == page:
-                body.append(f"bits |= {place(signal.pieces, signal.constant):#x}")
-        lines.append(f"    if page == {page}:")
-        lines += [f"        {line}" for line in body]
-    lines.append("    return bits")
-    return "\n".join(lines) + "\n"
-
-
 def compile_pack(plan: MessagePlan) -> Pack:
-    """The function of ``source_text``, compiled."""
-    names: dict[str, object] = {"float_bits": float_bits, "quotient": quotient, "inf": math.inf}
+    """The function to the bits of a frame, without a CRC."""
+    lines = ["def pack(escs, gateway, now, alive, page):", *_bits(plan), "    return bits"]
+    return _compiled(plan, "pack", lines)  # type: ignore[no-any-return]
+
+
+def compile_frame(plan: MessagePlan) -> MakeFrame:
+    """The function to the frame."""
+    lines = ["def frame(escs, gateway, now, alive, place):"]
+    if plan.pages != (None,):
+        lines.append(f"    page = {plan.pages}[place]")
+    data = f'bits.to_bytes({plan.length}, "little")'
+    crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
+    if crc is not None:
+        data = f"protected({data}, {crc.pieces[0].at // 8}, {plan.data_id})"
+    of_frame = f"({plan.can_id}, {data}, {plan.extended}, {plan.fd}, place, False, False)"
+    lines += [*_bits(plan), f"    return new(CanFrame, {of_frame})"]
+    return _compiled(plan, "frame", lines)  # type: ignore[no-any-return]
+
+
+def _compiled(plan: MessagePlan, name: str, lines: Sequence[str]) -> Any:
+    """The function of this name in generated text, which names tables and functions of the plan's signals."""
+    names: dict[str, object] = {
+        "float_bits": float_bits,
+        "quotient": quotient,
+        "inf": math.inf,
+        "protected": e2e.protected,
+        "new": tuple.__new__,
+        "CanFrame": CanFrame,
+    }
     for signal in plan.signals:
         if signal.numbers:
             names[_name("numbers", signal)] = {int(k): v for k, v in signal.numbers.items()}
         if signal.source is not None:
             names[_name("read", signal)] = signal.source.read
             names[_name("not_on", signal)] = signal.source.not_on
-    exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
-    return names.pop("pack")  # type: ignore[return-value]  # what its own globals hold would be a circle
+    exec(compile("\n".join(lines), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
+    return names.pop(name)  # what its own globals hold would be a circle
 
 
-def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
-    """Lines that add a page's signals to ``bits``."""
+def _bits(plan: MessagePlan) -> list[str]:
+    """Lines of a function that put a frame together in ``bits``."""
     lines: list[str] = []
-    chosen = [signal for signal in plan.signals if signal.page == page]
-    for signal in chosen:
-        if signal.role is Role.ALIVE:
-            lines.append(f"bits |= {_placed(signal, f'alive % {alive_modulus(signal, has_crc)}')}")
+    for page in dict.fromkeys((None, *plan.pages)):
+        indent = "    "
+        if page is not None:
+            lines.append(f"    if page == {page}:")
+            indent = "        "
+        for number, (setup, bits) in enumerate(_parts(plan, page)):
+            lines += [indent + line for line in setup]
+            lines.append(f"{indent}bits {'=' if page is None and number == 0 else '|='} {bits}")
+    return lines
+
+
+def _parts(plan: MessagePlan, page: int | None) -> list[tuple[list[str], str]]:
+    """Python text of what makes up a page's bits: lines in front, and an expression. At least one."""
+    parts: list[tuple[list[str], str]] = []
+    has_crc = any(signal.role is Role.CRC for signal in plan.signals)
     by_reading: dict[tuple[int | None, str | None], list[SignalPlan]] = {}
-    for signal in chosen:
-        if signal.source is not None:
+    constant = 0
+    for signal in plan.signals:
+        if signal.role is Role.MULTIPLEXER and page is not None:
+            constant |= place(signal.pieces, page)
+        if signal.page != page:
+            continue
+        if signal.role is Role.CONSTANT:
+            constant |= place(signal.pieces, signal.constant)
+        elif signal.role is Role.ALIVE:
+            parts.append(([], _placed(signal, f"alive % {alive_modulus(signal, has_crc)}")))
+        elif signal.source is not None:
             key = (signal.esc, _reading(signal.source))
             by_reading.setdefault(key, []).append(signal)
     for (esc, reading), signals in by_reading.items():
-        line = f"bits |= {' | '.join(_terms(signals))}"
-        lines.append("esc = None" if esc is None else f"esc = escs[{esc}]")
-        if reading is None:
-            lines.append(line)
-            continue
-        nothing = 0
-        for signal in signals:
-            nothing |= not_available_bits(signal)
-        lines.append(f"reading = esc.{reading}")
-        lines.append("if reading is None:")
-        lines.append(f"    bits |= {nothing:#x}")
-        lines.append("else:")
-        lines.append(f"    {line}")
-    return lines
+        setup = ["esc = None" if esc is None else f"esc = escs[{esc}]"]
+        bits = " | ".join(_terms(signals))
+        if reading is not None:
+            nothing = sum(place(signal.pieces, signal.not_available) for signal in signals)
+            setup.append(f"reading = esc.{reading}")
+            bits = f"{nothing:#x} if reading is None else {bits}"
+        parts.append((setup, bits))
+    if constant or not parts:
+        parts.append(([], f"{constant:#x}"))
+    return parts
 
 
 def _reading(source: Value) -> str | None:
@@ -152,7 +171,7 @@ def _terms(signals: Sequence[SignalPlan]) -> list[str]:
         steps, condition = _steps(signal, source)
         term = _placed(signal, _value(signal, steps))
         if condition is not None:
-            term = f"({term} if {condition} else {not_available_bits(signal):#x})"
+            term = f"({term} if {condition} else {place(signal.pieces, signal.not_available):#x})"
         terms.append(term)
     for (word, distance), mask in flags.items():
         moved = f" << {distance}" if distance > 0 else f" >> {-distance}" if distance else ""

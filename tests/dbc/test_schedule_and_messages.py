@@ -193,7 +193,7 @@ def test_messages_of_one_step_go_in_the_order_in_which_they_became_due_then_of_t
     bench = Bench(messages)
     bench.until(0)
     bench.forget()
-    due = sorted(bench.gateway.core.messages._schedule._heap)
+    due = sorted(bench.gateway.core.messages.schedule._heap)
     bench.now = 60 * MS  # both cycles were missed
     bench.gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), bench.now, bench.now)
     bench.jump(bench.now)

@@ -4,24 +4,25 @@ import random
 
 from hypothesis import strategies as st
 
+from kontronik_can_gw.esc.kontronik import Form
+from kontronik_can_gw.esc.kontronik.codec import FORMS
+from kontronik_can_gw.esc.kontronik.fields import Data
+
 from . import sheet
 from .reference import ambiguous, random_frame, seal
 from .sheet import FORM_ROWS, FormRow
 
-FRAGMENTS = [
-    b"K",
-    b"KO",
-    b"KOD",
-    b"KODL",
-    b"KODI",
-    b"KODK",
-    b"KODX",
-    b"KOKO",
-    b"KKOD",
-    b"KODKODI",
-    b"\0",
-    b"\xff",
-]
+FRAGMENTS = [*b"K KO KOD KODL KODI KODK KODX KOKO KKOD KODKODI \0 \xff".split(b" ")]
+
+
+def form_of(row: FormRow) -> Form:
+    """The package's form of a row of the sheet."""
+    return next(f for f in FORMS if (f.kind.value, f.layout.value) == (row.kind, row.layout))
+
+
+def decoded(form: Form, buffer: bytes, at: int = 0) -> Data:
+    """The fields of a frame of this form; nothing is checked."""
+    return form.data_type(*form.fields_of(buffer, at))
 
 
 def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: random.Random) -> bytes:

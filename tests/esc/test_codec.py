@@ -19,11 +19,11 @@ from kontronik_can_gw.esc.kontronik import (
     encode,
     rows,
 )
-from kontronik_can_gw.esc.kontronik.codec import FORMS
-from kontronik_can_gw.esc.kontronik.fields import Data, DataType, device_and_variant
+from kontronik_can_gw.esc.kontronik.fields import Data, DataType
 
 from . import reference, sheet
-from .sheet import Field, FormRow
+from .sheet import FORM_ROWS, Field, FormRow
+from .streams import decoded, form_of
 
 PROPERTY = settings(deadline=None, max_examples=150, database=None)
 
@@ -113,12 +113,6 @@ SYNTHETIC_V4_INFO_FRAME = bytes.fromhex(
 )
 
 
-def form_of(row: FormRow) -> Form:
-    return next(
-        form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout)
-    )
-
-
 def fields_of(kind: str) -> list[Field]:
     return sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
 
@@ -137,7 +131,7 @@ def form_in(frame: bytes) -> Form:
 
 
 def decode(frame: bytes) -> Data:
-    return form_in(frame).decode(frame)
+    return decoded(form_in(frame), frame)
 
 
 def physical_values(data: Data) -> dict[str, int | float]:
@@ -152,9 +146,7 @@ def raw_strategy(kind: str) -> st.SearchStrategy[tuple[int, ...]]:
     return st.tuples(*(st.integers(*sheet.TYPE_RANGES[field.code]) for field in fields_of(kind)))
 
 
-form_rows = pytest.mark.parametrize(
-    "row", sheet.FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}"
-)
+form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
 
 
 def test_the_references_crc_is_the_standard_one() -> None:
@@ -178,21 +170,11 @@ def test_a_recorded_frame_is_that_of_the_stated_values(
 ) -> None:
     form = form_in(frame)
     assert (form.kind, form.layout) == (kind, Layout.LEGACY)
-    decoded = physical_values(form.decode(frame))
-    assert {name: repr(value) for name, value in decoded.items()} == {
+    shown = physical_values(decode(frame))
+    assert {name: repr(value) for name, value in shown.items()} == {
         n: repr(value) for n, value in values.items()
     }
     assert encode(raw_values(data_type, values), Layout.LEGACY) == frame
-
-
-def test_the_recorded_info_frame_tells_device_variant_and_firmware() -> None:
-    info = decode(sheet.RECORDED_INFO)
-    assert isinstance(info, InfoData)
-    assert (info.device, info.variant, info.firmware) == (3, 120, "1.14")
-    assert info.max_battery_voltage < info.min_battery_voltage, (
-        "as recorded before the motor has run"
-    )
-    assert info.device_and_variant == device_and_variant(3, 120)
 
 
 @pytest.mark.parametrize(
@@ -220,10 +202,10 @@ def test_every_combination_of_raw_values_survives_the_round_trip(
     assert frame == pack(row, values)
     form = form_in(frame)
     assert form is form_of(row)
-    decoded = form.decode(frame)
-    assert decoded == data
-    assert type(decoded) is data_type
-    assert raw_values(data_type, physical_values(decoded)) == data
+    again = decode(frame)
+    assert again == data
+    assert type(again) is data_type
+    assert raw_values(data_type, physical_values(again)) == data
 
 
 @form_rows
@@ -303,46 +285,11 @@ def test_no_other_frame_is_suspect_whatever_it_holds() -> None:
     assert [frame.suspect for frame in Deframer().feed(b"".join(sent))] == [False] * 258
 
 
-@form_rows
-def test_a_frame_is_found_only_where_it_stands_and_only_whole(row: FormRow) -> None:
-    source = random.Random(11)
-    frame = next(
-        frame
-        for frame in iter(lambda: reference.random_frame(row, source), b"")
-        if frame.endswith(b"\0")
-    )
-    form = form_of(row)
-    buffer = b"\x4b\x4f\x44" + frame + b"\x4b"
-    assert [(found.offset, found.form) for found in Deframer().feed(buffer)] == [(3, form)]
-    assert form.decode(buffer, 3) == form.decode(frame)
-    for size in range(row.length):
-        assert Deframer().feed(frame[:size]) == []
-
-
-@form_rows
-def test_a_frame_without_its_last_byte_is_no_frame_even_where_that_byte_is_zero(
-    row: FormRow,
-) -> None:
-    source = random.Random(12)
-    frame = next(
-        frame
-        for frame in iter(lambda: reference.random_frame(row, source), b"")
-        if frame.endswith(b"\0")
-    )
-    assert form_in(frame) is form_of(row)
-    assert Deframer().feed(frame[:-1]) == []
-
-
 @pytest.mark.parametrize("kind", ["live", "info"])
 def test_where_both_layouts_fit_the_shorter_is_taken(kind: str) -> None:
     frame = reference.ambiguous(kind)
-    fitting = [row for row in sheet.FORM_ROWS if reference.fits(frame, 0, row)]
+    fitting = [row for row in FORM_ROWS if reference.fits(frame, 0, row)]
     assert {(row.kind, row.layout) for row in fitting} == {(kind, "legacy"), (kind, "v4")}
     assert [found.form for found in Deframer().feed(frame)] == [
         form_of(reference.form_row(kind, "legacy"))
     ]
-
-
-def test_the_crc_is_sent_little_endian() -> None:
-    frame = encode(LiveData(), Layout.V4)
-    assert int.from_bytes(frame[36:], "little") == reference.crc32_of_bits(frame[:36])

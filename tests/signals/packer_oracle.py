@@ -19,7 +19,7 @@ from esc import sheet
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 
 # --- bits, counted one by one -------------------------------------------------------------------------------------------
@@ -677,11 +677,8 @@ def random_escs(
     for esc in escs:
         esc.advance(now)
         if rng.random() < 0.3:
-            esc.drawn.energy = (
-                rng.choice((1, -1)) * rng.randrange(10**19)
-                if rng.random() < 0.5
-                else rng.randrange(10**17)
-            )
+            energy = rng.choice((1, -1)) * rng.randrange(10 ** rng.choice((17, 19)))
+            esc.drawn.energy_mw_ns = energy * SECOND
             esc.drawn.run_time = rng.randrange(10**14)
             esc.losses = rng.randrange(10**6)
             esc.frame_rate = rng.choice((None, 0, 5, 999, 1004))

@@ -29,8 +29,9 @@ from kontronik_can_gw.dbc.prepare import compile_layout
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.signals.packer import compile_pack, float_bits, quotient
+from kontronik_can_gw.signals.packer import compile_frame, compile_pack, float_bits, quotient
 from kontronik_can_gw.signals.plan import MessagePlan
 
 ESCS = (
@@ -148,7 +149,7 @@ def test_every_random_layout_is_packed_as_the_oracle_and_cantools_say(seed: int)
     database = read(text)
     plans = compiled(messages, database)
     assert len(plans) == MESSAGES
-    packs = {name: compile_pack(plan) for name, plan in plans.items()}
+    makers = {name: compile_frame(plan) for name, plan in plans.items()}
     for message in messages:
         plan = plans[message.name]
         assert (plan.can_id, plan.extended, plan.length) == (
@@ -161,10 +162,11 @@ def test_every_random_layout_is_packed_as_the_oracle_and_cantools_say(seed: int)
         escs, now = random_escs(rng, ESCS, rng.randrange(10**15))
         gateway = random_gateway(rng, now)
         for message in messages:
-            for page in message.pages:
-                bits = packs[message.name](escs, gateway, now, 0, page or 0)
-                data = bits.to_bytes(message.length, "little")
-                check_frame(message, page, data, database, (escs, gateway, now))
+            for place, page in enumerate(message.pages):
+                frame = makers[message.name](escs, gateway, now, 0, place)
+                plan = plans[message.name]
+                assert frame == CanFrame(plan.can_id, frame.data, plan.extended, plan.fd, place)
+                check_frame(message, page, frame.data, database, (escs, gateway, now))
 
 
 def test_the_oracle_knows_every_source_and_no_other() -> None:

@@ -40,22 +40,6 @@ class Layout(Enum):
 class Form:
     """One of the four frame forms: its length, what its CRC covers, and how its body is packed."""
 
-    __slots__ = (
-        "_data",
-        "_struct",
-        "covered",
-        "crc_at",
-        "data_type",
-        "header",
-        "is_info",
-        "kind",
-        "layout",
-        "layout_number",
-        "length",
-        "name",
-        "partly_protected",
-    )
-
     def __init__(self, kind: Kind, layout: Layout) -> None:
         self.kind = kind
         self.layout = layout
@@ -63,25 +47,21 @@ class Form:
         self.layout_number = list(Layout).index(layout) + 1
         self.partly_protected = layout is Layout.LEGACY
         self.name = f"{kind.value}_{layout.value}"
-        self.header = b"KODL" if kind is Kind.LIVE else b"KODI"
-        self.data_type: DataType = LiveData if kind is Kind.LIVE else InfoData
-        reserved = (
-            0
-            if layout is Layout.LEGACY
-            else -(4 + struct.calcsize("<" + body_format(self.data_type))) % 4
-        )
-        self._struct = struct.Struct(f"<4s{body_format(self.data_type)}{reserved}xI")
+        self.header = b"KODI" if self.is_info else b"KODL"
+        self.data_type: DataType = InfoData if self.is_info else LiveData
+        body = body_format(self.data_type)
+        reserved = 0 if self.partly_protected else -struct.calcsize(f"<4s{body}") % 4
+        self._struct = struct.Struct(f"<4s{body}{reserved}xI")
         self.length = self._struct.size
         self.crc_at = self.length - 4
         self.covered = self.crc_at // 4 * 4
-        self._data = struct.Struct(f"<4x{body_format(self.data_type)}")
+        self.crc_goes_on_over = slice(0, self.covered)
+        """What its CRC covers; of the longer of two forms: beyond what that of the shorter covers."""
+        self.crc_of = struct.Struct(f"<{self.crc_at}xI").unpack_from
+        self.fields_of = struct.Struct(f"<4x{body}").unpack_from
 
     def __repr__(self) -> str:
         return f"Form({self.kind.value}, {self.layout.value}, {self.length} bytes)"
-
-    def decode(self, buffer: bytes, at: int = 0) -> Data:
-        """The fields of a frame of this form; nothing is checked here."""
-        return tuple.__new__(self.data_type, self._data.unpack_from(buffer, at))
 
     def encode(self, data: Data) -> bytes:
         """The frame with reserved bytes 0 and its CRC. ValueError naming the field that does not fit its wire type."""
@@ -100,10 +80,13 @@ class Form:
 FORMS = tuple(Form(kind, layout) for kind in Kind for layout in (Layout.LEGACY, Layout.V4))
 """All four; of one kind the shorter first, which is also the order in which they are tried."""
 
-FORMS_BY_KIND_BYTE = {
-    kind_byte: tuple(form for form in FORMS if form.header[3] == kind_byte)
-    for kind_byte in sorted({form.header[3] for form in FORMS})
+FORMS_BY_HEADER = {
+    header: tuple(form for form in FORMS if form.header == header)
+    for header in sorted({form.header for form in FORMS})
 }
+for _shorter, _longer in FORMS_BY_HEADER.values():
+    _longer.crc_goes_on_over = slice(_shorter.covered, _longer.covered)
+MAX_LENGTH = max(form.length for form in FORMS)
 
 
 def encode(data: Data, layout: Layout) -> bytes:

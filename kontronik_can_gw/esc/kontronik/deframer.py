@@ -6,17 +6,22 @@ comes out with its last byte unless an earlier, still undecided header forbids i
 is counted and dropped. At most 43 bytes are held; work is linear in the bytes fed.
 """
 
-import struct
 from dataclasses import dataclass, fields
 from zlib import crc32
 
 from kontronik_can_gw.esc.decoder import Reading
-from kontronik_can_gw.esc.kontronik.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kind, Layout
+from kontronik_can_gw.esc.kontronik.codec import (
+    FORMS,
+    FORMS_BY_HEADER,
+    MAX_LENGTH,
+    Form,
+    Kind,
+    Layout,
+)
 from kontronik_can_gw.esc.kontronik.fields import Data, LiveData
 from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
 _new = tuple.__new__
-_u32_at = struct.Struct("<I").unpack_from
 _PREFIX = b"KOD"
 # A line that is read at a far higher rate than it is sent shows its bits as long runs: zeros, then ones.
 _LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
@@ -128,36 +133,32 @@ class Counters:
 class Deframer:
     """Finds the frames in one byte stream. Holds no mode: the layout is found from the CRC of each frame."""
 
-    __slots__ = ("_base", "_blame", "_blame_until", "_need", "_pending", "counters")
+    __slots__ = ("_base", "_blame", "_blame_until", "_held", "_need", "counters", "pending")
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self._pending = b""
-        self._base = 0  # stream position of _pending[0]
+        self.pending = 0
+        """How many bytes are held, undecided: 0..43."""
+        self._held = b""
+        self._base = 0  # stream position of _held[0]
         self._need = 1  # how many more bytes before anything can be decided
         self._blame = "dropped_crc"  # why bytes before _blame_until are dropped
         self._blame_until = 0
 
-    @property
-    def pending(self) -> int:
-        """How many bytes are held, undecided: 0..43."""
-        return len(self._pending)
-
     def feed(self, data: bytes, now: int = 0) -> list[Frame]:  # noqa: ARG002  frames have headers
         """Take the next bytes; return the frames that are now certain, in stream order."""
         size = len(data)
-        counters = self.counters
-        counters.bytes += size
+        self.counters.bytes += size
         if size < self._need:
-            self._pending += data
+            self._held += data
             self._need -= size
+            self.pending += size
             return []
-        return self._scan(self._pending + data, ended=False)
+        return self._scan(self._held + data, False)
 
     def flush(self) -> list[Frame]:
         """The stream ended or was interrupted: search what is pending, drop the rest, be ready for a new start."""
-        buffer = self._pending
-        frames = self._scan(buffer, ended=True)
+        frames = self._scan(self._held, True)
         self._blame_until = self._base
         return frames
 
@@ -165,74 +166,70 @@ class Deframer:
         frames: list[Frame] = []
         counters = self.counters
         size = len(buffer)
-        at = 0
-        self._need = 1
+        at = missing = 0
         while at < size:
-            start = buffer.find(_PREFIX, at)
-            if start < 0:
-                keep = 0
-                if not ended:
-                    tail = buffer[max(at, size - 2) :]
-                    keep = 2 if tail == b"KO" else 1 if tail.endswith(b"K") else 0
-                self._drop(buffer, at, size - keep)
-                at = size - keep
-                break
-            if start > at:
-                self._drop(buffer, at, start)
-                at = start
-            have = size - at
-            if have < 4:
-                if ended:
-                    self._drop(buffer, at, size, "dropped_incomplete")
-                    at = size
-                break
-            forms = FORMS_BY_KIND_BYTE.get(buffer[at + 3])
+            frame = buffer[at : at + MAX_LENGTH]
+            forms = FORMS_BY_HEADER.get(frame[:4])
             if forms is None:
-                counters.unknown_kinds += 1
-                self._drop(buffer, at, at + 3, "dropped_unknown_kind")
-                at += 3
+                start = self._skip(buffer, at, ended)
+                if start == at:
+                    break
+                at = start
                 continue
-            missing = crc = covered = 0
+            crc = 0
             for form in forms:
-                if have < form.length:
-                    missing = form.length - have
+                if at + form.length > size:
+                    missing = at + form.length - size
                     break
-                crc = crc32(buffer[at + covered : at + form.covered], crc)
-                covered = form.covered
-                if crc == _u32_at(buffer, at + form.crc_at)[0]:
+                crc = crc32(frame[form.crc_goes_on_over], crc)
+                if crc == form.crc_of(frame)[0]:
+                    setattr(counters, form.name, getattr(counters, form.name) + 1)
+                    data = _new(form.data_type, form.fields_of(frame))
+                    frames.append(_new(Frame, (form, self._base + at, data)))
+                    at += form.length
+                    self._blame_until = 0
                     break
-            else:  # all forms checked, none matches
-                counters.headers += 1
-                counters.crc_errors += 1
-                self._reject(buffer, at, forms[-1].length, "dropped_crc")
-                at += 4
-                continue
-            if not missing:
-                counters.headers += 1
-                name = form.name
-                setattr(counters, name, getattr(counters, name) + 1)
-                frames.append(_new(Frame, (form, self._base + at, form.decode(buffer, at))))
-                at += form.length
-                self._blame_until = 0
-            elif ended:
-                counters.headers += 1
-                self._reject(buffer, at, have, "dropped_incomplete")
-                at += 4
             else:
-                self._need = missing
-                break
-        self._pending = buffer[at:]
+                counters.crc_errors += 1
+                self._reject(buffer, at, form.length, "dropped_crc")
+                at += 4
+            if missing:
+                if not ended:
+                    break
+                missing = 0
+                self._reject(buffer, at, size - at, "dropped_incomplete")
+                at += 4
+        counters.headers += len(frames)
+        self._held = buffer[at:]
+        self.pending = size - at
+        self._need = missing or 1
         self._base += at
         return frames
 
+    def _skip(self, buffer: bytes, at: int, ended: bool) -> int:
+        """Drop what belongs to no header of a known kind; return where one may begin, ``at`` where that is not decided yet."""
+        start, size = buffer.find(_PREFIX, at), len(buffer)
+        if start < 0:
+            tail = b"" if ended else buffer[max(at, size - 2) :]
+            start = size - (2 if tail == b"KO" else 1 if tail.endswith(b"K") else 0)
+        if start > at:
+            self._drop(buffer, at, start)
+        elif size - at >= 4:
+            self.counters.unknown_kinds += 1
+            start += 3
+            self._drop(buffer, at, start, "dropped_unknown_kind")
+        elif ended:
+            start = size
+            self._drop(buffer, at, start, "dropped_incomplete")
+        return start
+
     def _reject(self, buffer: bytes, at: int, length: int, reason: str) -> None:
         """Drop a header (no frame can begin inside it) and blame ``reason`` for what is dropped up to ``length`` from its start."""
+        self.counters.headers += 1
         self._blame, self._blame_until = reason, max(self._blame_until, self._base + at + length)
         self._drop(buffer, at, at + 4)
 
     def _drop(self, buffer: bytes, begin: int, end: int, reason: str = "dropped_noise") -> None:
-        if begin >= end:
-            return
         counters = self.counters
         dropped = buffer[begin:end]
         counters.long_run_bytes += len(dropped) - len(dropped.translate(None, _LONG_RUNS))

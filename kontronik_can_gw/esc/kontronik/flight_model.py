@@ -29,29 +29,6 @@ _LOGGED_FROM_ZERO = frozenset(
 class FlightModel:
     """Battery, motor and heat of one ESC since its power-up, stepped once a period."""
 
-    __slots__ = (
-        "_bec_temperature",
-        "_charge",
-        "_device",
-        "_dt",
-        "_full",
-        "_has_run",
-        "_log",
-        "_measures_battery_peak",
-        "_next_phase",
-        "_options",
-        "_peak",
-        "_phase_s",
-        "_ramp_from",
-        "_random",
-        "_speed",
-        "_stage_temperature",
-        "_strength",
-        "_supplies_bec_current",
-        "_throttle",
-        "phase",
-    )
-
     def __init__(self, options: EscOptions, device: Device, seed: int) -> None:
         self._options = options
         self._device = device

@@ -74,27 +74,6 @@ class Sent(NamedTuple):
 class SimulatedEsc:
     """One ESC. The first frame leaves at ``start_ns``."""
 
-    __slots__ = (
-        "_dropout",
-        "_errors",
-        "_faulty",
-        "_flips",
-        "_frame_number",
-        "_info_due",
-        "_losses",
-        "_model",
-        "_noise_step",
-        "_options",
-        "_random",
-        "_seed",
-        "_start_ns",
-        "_swaps",
-        "_tick_ns",
-        "device",
-        "layout",
-        "next_ns",
-    )
-
     def __init__(
         self, options: EscOptions | None = None, *, seed: int = 0, start_ns: int = 0
     ) -> None:
