@@ -69,7 +69,7 @@ class _Message:
         self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         self.pack = compile_pack(plan)
         self.page = 0
-        self.pages_to_send: list[int] = []
+        self.pages_to_send: set[int] = set()
         self.alive = 0
         crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
         alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
@@ -104,20 +104,23 @@ class _Message:
     def add_all_pages(self) -> None:
         """Let all pages follow, of a message that has several."""
         if self.is_paged:
-            self.pages_to_send = list(range(len(self.pages)))
+            self.pages_to_send.update(range(len(self.pages)))
 
     def turn_page(self) -> None:
-        """Let the page follow whose turn it is, of a message that has several."""
-        if self.is_paged:
-            if self.page not in self.pages_to_send:
-                self.pages_to_send.append(self.page)
-            self.page = (self.page + 1) % len(self.pages)
+        """Let the page follow whose turn it is."""
+        self.pages_to_send.add(self.page)
+        self.page = (self.page + 1) % len(self.pages)
 
-    def next_place(self) -> int:
-        """The place of the page to send: the first of those that are to follow, else that whose turn it is."""
+    def take_place(self) -> int:
+        """The place of the page to send: the first of those that are to follow, from the one on whose turn it is next."""
         if not self.pages_to_send:
             self.turn_page()
-        return self.pages_to_send.pop(0)
+        count = len(self.pages)
+        place = next(
+            n for n in range(self.page, self.page + count) if n % count in self.pages_to_send
+        )
+        self.pages_to_send.remove(place % count)
+        return place % count
 
 
 class Messages:
@@ -268,11 +271,11 @@ class Messages:
             if pack(self._escs, self._gateway, now, 0, page) != last.get(page)
         ]
         if message.is_paged:
-            message.pages_to_send += [p for p in changed if p not in message.pages_to_send]
+            message.pages_to_send.update(changed)
         return bool(changed or message.pages_to_send)
 
     def _frame(self, index: int, message: _Message, now: int) -> CanFrame:
-        place = message.next_place() if message.is_paged else 0
+        place = message.take_place() if message.is_paged else 0
         page = message.pages[place]
         bits = message.pack(self._escs, self._gateway, now, message.alive, page)
         data = bits.to_bytes(message.length, "little")
