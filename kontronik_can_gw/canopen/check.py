@@ -15,7 +15,7 @@ from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAPPING
 from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROFILE
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings, EscStream
 from kontronik_can_gw.gateway_status import GatewayStatus
 
 _WHOLE = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15, 0x1B})  # data types
@@ -132,7 +132,7 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     """Defaults that a download would be refused: of single services, then of the PDOs."""
     setup = CanopenSetup(eds, (NodeSettings(node_id),), (Stored(),))
     (node,) = Nodes(
-        setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda _esc, _settings: None
+        setup, [EscStream(settings, 0)], GatewayStatus(), lambda _esc, _settings: None
     ).nodes
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})

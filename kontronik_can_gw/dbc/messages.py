@@ -10,7 +10,7 @@ from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.gateway_status import CanState, GatewayStatus
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
@@ -123,6 +123,14 @@ class _Message:
         return place % count
 
 
+def own_ids(layout: Layout) -> dict[int, Owner]:
+    """The ids of the messages (29-bit ones with EXTENDED), and what for."""
+    return {
+        plan.can_id | (EXTENDED if plan.extended else 0): Owner(None, f"message {plan.name}")
+        for plan in layout.messages
+    }
+
+
 class Messages:
     """All messages of one layout.
 
@@ -165,15 +173,6 @@ class Messages:
             if esc in m.plan.escs and m.follows(events, up)
         ]
 
-    def own_ids(self) -> dict[int, Owner]:
-        """The ids of the messages (29-bit ones with EXTENDED), and what for."""
-        return {
-            message.can_id | (EXTENDED if message.extended else 0): Owner(
-                None, f"message {message.plan.name}"
-            )
-            for message in self._messages
-        }
-
     # --- what makes messages pending
 
     def on_event(self, esc: int, events: int, now: int) -> None:
@@ -195,12 +194,6 @@ class Messages:
         for index, message in self._of_gateway:
             if not (each_second and message.plan.cycle_ns):
                 self._request(index, now)
-
-    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
-        """The CAN controller's state changed."""
-        self.on_gateway_change(now)
-        if before is CanState.BUS_OFF and state is not CanState.DOWN:
-            self.repeat(now)  # what was handed over meanwhile never reached the bus
 
     def repeat(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""

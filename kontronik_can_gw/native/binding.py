@@ -7,6 +7,7 @@ from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.native.compile import source_number
 from kontronik_can_gw.native.tables import (
     COUNTS,
     GATEWAY,
@@ -19,7 +20,6 @@ from kontronik_can_gw.native.tables import (
     settings_of,
 )
 
-ABI = 1
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
 _ALL_EVENTS = 15
@@ -70,6 +70,7 @@ class Esc(c.Structure):
         ("interval", _i64),
         ("arrival", Arrival * (HELD + 1)),
         ("rate", _i32),
+        ("generation", _u32),
         ("live", _u8 * BODY),
         ("info", _u8 * BODY),
         ("held", _u8 * (HELD + LONGEST)),
@@ -115,12 +116,10 @@ def load(path: Path) -> Any:
             function.restype, function.argtypes = result, arguments
     except (OSError, AttributeError) as error:
         raise WrongObject(f"{path.name}: {error}") from None
-    mine = (ABI, *map(c.sizeof, (Signal, Message, Settings, Plan, Esc, Frame)))
+    mine = (source_number(), *map(c.sizeof, (Signal, Message, Settings, Plan, Esc, Frame)))
     its = tuple(library.kcg_sizes(number) for number in range(len(mine)))
     if its != mine:
-        raise WrongObject(
-            f"{path.name}: made for another version of this program: {its}, not {mine}"
-        )
+        raise WrongObject(f"{path.name}: made of other sources than these")
     return library
 
 
@@ -175,6 +174,10 @@ class Handle:
         """As Core.port."""
         self._follow(self._library.kcg_port(self._core, esc, is_open, now), now)
 
+    def expire(self, now: int) -> None:
+        """As Core.expire."""
+        self._follow(self._library.kcg_expire(self._core, now), now)
+
     def advance(self, now: int) -> None:
         """As Core.advance."""
         self._follow(self._library.kcg_advance(self._core, now), now)
@@ -188,17 +191,22 @@ class Handle:
         """As Core.apply. NotInCore where its gear is out of range."""
         self._library.kcg_apply(self._core, esc, c.byref(settings_of(settings)))
 
-    def gateway_changed(self, now: int, each_second: bool = False) -> None:
-        """As Messages.on_gateway_change."""
-        self._library.kcg_gateway_changed(self._core, each_second, now)
+    def gateway_changed(self, now: int) -> None:
+        """As Core.gateway_changed."""
+        self._library.kcg_gateway_changed(self._core, 0, now)
 
     def repeat(self, now: int) -> None:
-        """As Messages.repeat."""
+        """As Core.repeat."""
         self._library.kcg_repeat(self._core, now)
 
     def stop(self, now: int) -> None:
-        """As Messages.stop."""
+        """As Core.stop."""
         self._library.kcg_stop(self._core, now)
+
+    @property
+    def is_pending(self) -> bool:
+        """As Core.is_pending."""
+        return bool(self._library.kcg_pending(self._core))
 
     def take(self, now: int) -> list[CanFrame]:
         """As Core.take."""

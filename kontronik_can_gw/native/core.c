@@ -262,6 +262,7 @@ static int set_link(kcg_esc *e, int state)
 static void forget_device(kcg_esc *e)
 {
     e->has_info = 0;
+    e->generation++;
     e->cells = e->settings.cells;
 }
 
@@ -269,7 +270,7 @@ static int lose(kcg_esc *e, int state)
 {
     int events = set_link(e, state);
     if (e->has_live)
-        e->has_live = 0, events |= KCG_LIVE;
+        e->has_live = 0, e->generation++, events |= KCG_LIVE;
     if (e->has_info)
         forget_device(e), events |= KCG_INFO;
     e->rate = 0;
@@ -308,6 +309,7 @@ static int close_window(kcg_esc *e, int64_t now)
 static int accept_info(kcg_esc *e, const uint8_t *body, int64_t when, int64_t bound)
 {
     int events = KCG_INFO | (e->has_info && memcmp(body, e->info, 2) ? KCG_LINK : 0);
+    e->generation++;
     memcpy(e->info, body, KCG_BODY);
     e->has_info = e->had_info = 1;
     e->last_info_ns = when, e->info_bound = bound;
@@ -344,6 +346,7 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
                 e->run_time += dt;
         }
     }
+    e->generation++;
     memcpy(e->live, f->body, 30);
     e->power = wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16);
     e->turns = u32(f->body) != 0;
@@ -410,7 +413,7 @@ static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t no
         *x = e->rate;
         return e->rate >= 0;
     case KCG_OF_GATEWAY: *x = g->gateway[s->place]; return 1;
-    default: *x = (now - g->started) / 1000000; return 1;
+    default: *x = (now - g->gateway[KCG_STARTED]) / 1000000; return 1;
     }
     if (s->mask)
         *x = *x >> s->shift & s->mask;
@@ -848,8 +851,8 @@ static void report(kcg *g, int esc, int events, int64_t now)
         sooner(g, esc_deadline(&g->esc[esc]));
         for (int i = 0; i < g->plan->escs; i++)
             ok += g->esc[i].has_live;
-        if (ok != g->gateway[0]) {
-            g->gateway[0] = ok;
+        if (ok != g->gateway[KCG_ESCS_OK]) {
+            g->gateway[KCG_ESCS_OK] = ok;
             kcg_gateway_changed(g, 0, now);
         }
     }
@@ -1030,7 +1033,7 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
     g->last_known = at, at += rounded(plan->pages);
     g->report = at;
     g->plan = plan;
-    g->started = g->second = now;
+    g->gateway[KCG_STARTED] = g->second = now;
     g->read_esc = -1;
     for (int i = 0; i < plan->escs; i++) {
         kcg_esc *e = &g->esc[i];
@@ -1055,7 +1058,7 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
 
 uint32_t kcg_sizes(uint32_t what)
 {
-    static const size_t size[] = {KCG_ABI, sizeof(kcg_signal), sizeof(kcg_message), sizeof(kcg_settings), sizeof(kcg_plan), sizeof(kcg_esc), sizeof(kcg_frame)};
+    static const size_t size[] = {KCG_SOURCE, sizeof(kcg_signal), sizeof(kcg_message), sizeof(kcg_settings), sizeof(kcg_plan), sizeof(kcg_esc), sizeof(kcg_frame)};
     return what < sizeof size / sizeof *size ? (uint32_t)size[what] : 0;
 }
 

@@ -18,10 +18,12 @@
 #ifndef KCG_LEGACY
 #define KCG_LEGACY 1 /* 0: the V4 frame layout only */
 #endif
+#ifndef KCG_SOURCE
+#define KCG_SOURCE 0 /* a number of these sources, for kcg_sizes */
+#endif
 #ifndef KCG_FOUND
 #define KCG_FOUND 2  /* UART frames of one kcg_receive that are counted before the first is taken */
 #endif
-enum { KCG_ABI = 1 };
 enum { KCG_HELD = 43, KCG_BODY = 33, KCG_LONGEST = 44, KCG_PAGES = 64 };
 #define KCG_NEVER INT64_MAX
 
@@ -47,9 +49,10 @@ enum {
     KCG_OF_AGE,
     KCG_OF_RATE,
     KCG_OF_GATEWAY, /* `place`: index into kcg.gateway */
-    KCG_OF_UPTIME,
+    KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED] */
     KCG_OF_ALIVE    /* the message's alive counter, up to `div` */
 };
+enum { KCG_ESCS_OK = 0, KCG_STARTED = 11, KCG_OF_GATEWAY_COUNT = 12 }; /* of kcg.gateway; the others are the owner's */
 enum { KCG_U8, KCG_I8, KCG_U16, KCG_I16, KCG_U32 };
 enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
 /* Counters of a stream, then what is counted like them. Twin: deframer.Counters. */
@@ -103,6 +106,7 @@ typedef struct {
     int64_t live_ns, live_bound, info_ns, info_bound, last_info_ns, window_ns, interval;
     struct { uint64_t end; int64_t bound; } arrival[KCG_HELD + 1];
     int32_t rate;                              /* 0.1 Hz; -1: not known */
+    uint32_t generation;                       /* grows with each change of live and info, and of whether they are there */
     uint8_t live[KCG_BODY], info[KCG_BODY], held[KCG_HELD + KCG_LONGEST];
     uint8_t has_live, has_info, had_live, had_info, has_time, turns, cells, held_count, need, arrivals, blame, reported;
 } kcg_esc;
@@ -124,8 +128,8 @@ typedef struct {
     uint8_t *last_known, *report;              /* report: ESCs with events to be followed, oldest first */
     uint16_t *heap, *pending;                  /* messages by their next deadline; those to be handed over */
     uint32_t pendings, taken, heaped, reports;
-    int64_t gateway[16];                       /* states and counters, written by the owner, in the order of tables.GATEWAY */
-    int64_t started, second, next_expiry;
+    int64_t gateway[KCG_OF_GATEWAY_COUNT];     /* states and counters, written by the owner, in the order of tables.GATEWAY */
+    int64_t second, next_expiry;
     uint32_t mask;                             /* events that end a step and are reported */
     uint8_t stopping;
     /* the read that is being taken */
@@ -155,7 +159,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
 uint64_t kcg_count(const kcg_esc *e, int what);
 uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
-/* For a caller that cannot see structures: 0 the ABI, then the sizes of signal, message, settings, plan, ESC and frame. */
+/* For a caller that cannot see structures: 0 KCG_SOURCE, then the sizes of signal, message, settings, plan, ESC and frame. */
 uint32_t kcg_sizes(uint32_t what);
 kcg_esc *kcg_escs(kcg *g);
 int64_t *kcg_gateway(kcg *g);

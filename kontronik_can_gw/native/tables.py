@@ -33,7 +33,7 @@ COUNTS = (
 """Of kcg_esc.count, in its order; the last three are sums."""
 GATEWAY = (
     "escs_ok", "gateway_state", "can_state", "esc_count", "sent_frames", "replaced_frames", "send_failures", "received_frames",
-    "bus_off_count", "dropped_frames", "id_conflicts",
+    "bus_off_count", "dropped_frames", "id_conflicts", "started_ns",
 )  # fmt: skip
 """Of kcg.gateway, in its order."""
 ROLLS, CODE_AMID, PLAIN, TABLE, REAL = 1, 2, 4, 8, 16
@@ -194,7 +194,7 @@ class Tables:
             row.kind = OF_POWER
         elif value.name == "uptime":
             row.kind = OF_UPTIME
-        elif value.kind is Kind.GATEWAY and value.name in GATEWAY:
+        elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
             row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
         elif value.kind in _KINDS:
             row.kind = _KINDS[value.kind]

@@ -5,7 +5,7 @@ import pytest
 from esc.reference import ambiguous
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscStream, Event
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 
@@ -26,13 +26,13 @@ FLIGHT = [
 ]
 
 
-def read(telemetry: EscTelemetry, data: bytes, now: int) -> list[int]:
+def read(telemetry: EscStream, data: bytes, now: int) -> list[int]:
     """As the gateway gives what it has read; the events of each frame."""
     return list(telemetry.receive_each(data, now, now))
 
 
-def started() -> tuple[EscTelemetry, int]:
-    telemetry = EscTelemetry(EscSettings(), 0)
+def started() -> tuple[EscStream, int]:
+    telemetry = EscStream(EscSettings(), 0)
     read(telemetry, encode(LiveData(), Layout.V4), SECOND)
     return telemetry, SECOND
 

@@ -18,7 +18,7 @@ from packer_oracle import (
     read,
 )
 
-from kontronik_can_gw.core import Core
+from kontronik_can_gw.core import PythonCore
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
@@ -26,9 +26,8 @@ from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.native.binding import Handle
-from kontronik_can_gw.native.tables import COUNTS, GATEWAY, NotInCore, Tables
+from kontronik_can_gw.native.core import NativeCore
+from kontronik_can_gw.native.tables import GATEWAY, NotInCore
 from kontronik_can_gw.signals.plan import Layout
 
 START = 1_000 * SECOND
@@ -108,6 +107,23 @@ def _difference(*sides: Sequence[CanFrame]) -> str:
     return f"frame {place} of {len(texts[0])} and {len(texts[1])}: {pair[0]}, {pair[1]}"
 
 
+STATE = (
+    *(
+        "live",
+        "info",
+        "last_live",
+        "last_info",
+        "link",
+        "layout",
+        "cells",
+        "last_cells",
+        "counters",
+    ),
+    *("frame_rate", "losses", "late_frames", "suspect_frames", "live_ns", "last_info_ns"),
+    *("info_bound_ns", "pole_pairs", "output_divisor", "gear_denominator", "_diagnosis_counters"),
+)
+
+
 class Both:
     """Both cores, given the same calls."""
 
@@ -116,37 +132,32 @@ class Both:
         self.escs = [settings(chance, n) for n in range(chance.randint(1, 3))]
         self.layout = layout(chance, self.escs)
         self.silent = chance.random() < 0.3
-        tables = Tables(self.layout, self.escs, self.silent)
         self.now = START
-        self.status = GatewayStatus(esc_count=len(self.escs), started_ns=self.now)
         self.events: tuple[list[Any], list[Any]] = ([], [])
-        self.python = Core(
-            self.escs,
-            self.layout,
-            self.status,
-            self.now,
-            self.silent,
-            lambda *e: self.events[0].append(e),
+        self.python = PythonCore(
+            *(self.escs, self.layout, self.now, self.silent),
+            lambda *event: self.events[0].append(event),
         )
-        self.native = Handle(library, tables, self.now, lambda *e: self.events[1].append(e))
+        self.status = self.python.status
+        self.native = NativeCore(
+            library,
+            *(self.escs, self.layout, self.now, self.silent),
+            lambda *event: self.events[1].append(event),
+        )
         self.count = 0
         self._tell()
 
     def _tell(self) -> None:
         """What the owner of both knows of the gateway."""
-        for number, name in enumerate(GATEWAY):
+        for name in GATEWAY:
             if name != "escs_ok":
-                self.native.gateway[number] = getattr(self.status, name.removeprefix("gateway_"))
+                name = name.removeprefix("gateway_")
+                setattr(self.native.status, name, getattr(self.status, name))
 
     def call(self, name: str, *arguments: Any) -> None:
         """One call to both."""
-        getattr(
-            self.python.messages
-            if name in ("repeat", "stop", "on_gateway_change")
-            else self.python,
-            name,
-        )(*arguments)
-        getattr(self.native, "gateway_changed" if name == "on_gateway_change" else name)(*arguments)
+        getattr(self.python, name)(*arguments)
+        getattr(self.native, name)(*arguments)
 
     def compare(self) -> None:
         frames, others = self.python.take(self.now), self.native.take(self.now)
@@ -156,26 +167,11 @@ class Both:
         for listed in self.events:
             listed.clear()
         assert self.python.next_deadline() == self.native.next_deadline()
-        for esc, state in zip(self.python.escs, self.native.escs, strict=True):
-            expected = esc.counters.as_dict() | {
-                "link_state": int(esc.link),
-                "layout": esc.layout,
-                "losses": esc.losses,
-                "late_frames": esc.late_frames,
-                "suspect_frames": esc.suspect_frames,
-            }
-            assert [expected[name] for name in COUNTS[:-3]] == list(state.count), esc.settings
-            assert (esc.drawn.energy, esc.drawn._rest, esc.drawn.run_time) == (
-                state.energy,
-                state.energy_rest,
-                state.run_time,
-            )
-            assert (-1 if esc.frame_rate is None else esc.frame_rate) == state.rate
-            assert (esc.live is not None, esc.info is not None, esc.cells) == (
-                bool(state.has_live),
-                bool(state.has_info),
-                state.cells,
-            )
+        for esc, other in zip(self.python.escs, self.native.escs, strict=True):
+            for name in STATE:
+                assert getattr(esc, name) == getattr(other, name), name
+            assert esc.drawn.energy_mw_ns == other.drawn.energy_mw_ns
+            assert esc.drawn.run_time == other.drawn.run_time
 
     def step(self) -> None:
         """Something happens, and time passes."""
@@ -199,7 +195,7 @@ class Both:
                     name = name.removeprefix("gateway_")
                     setattr(self.status, name, getattr(other, name))
             self._tell()
-            self.call("on_gateway_change", self.now)
+            self.call("gateway_changed", self.now)
         else:
             self._receive(esc)
         self.call("advance", self.now)

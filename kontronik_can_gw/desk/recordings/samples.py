@@ -15,7 +15,7 @@ from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.columns import Section, Values
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
 from kontronik_can_gw.esc.decoder import Reading
-from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscStream, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 from kontronik_can_gw.output import Output
@@ -129,7 +129,7 @@ class RowMaker(Output):
             self._in_row.clear()
 
 
-class FoundTelemetry(EscTelemetry):
+class FoundTelemetry(EscStream):
     """Telemetry of bytes whose times are only known when their frames are found."""
 
     def find(self, data: bytes) -> Sequence[Reading]:
