@@ -23,6 +23,9 @@ from kontronik_can_gw.native.tables import (
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
 _ALL_EVENTS = 15
+_AGAIN = 1 << 30
+_END_OF_TIME = 1 << 61
+"""ns: sums of times stay within int64."""
 _u8, _u16, _u32, _u64, _i64, _i32, _p = (
     *(c.c_uint8, c.c_uint16, c.c_uint32, c.c_uint64, c.c_int64, c.c_int32, c.c_void_p),
 )
@@ -153,8 +156,10 @@ class Handle:
         settings = self._array(Settings, tables.settings)
         self._core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
         library.kcg_set_mask(self._core, mask)
-        self.escs = (Esc * len(tables.settings)).from_address(library.kcg_escs(self._core))
-        self.gateway = (_i64 * len(GATEWAY)).from_address(library.kcg_gateway(self._core))
+        begin = c.addressof(self._memory)
+        at = library.kcg_escs(self._core) - begin, library.kcg_gateway(self._core) - begin
+        self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, at[0])
+        self.gateway = (_i64 * len(GATEWAY)).from_buffer(self._memory, at[1])
         self._frames = (Frame * _MAX_FRAMES)()
 
     @staticmethod
@@ -166,20 +171,34 @@ class Handle:
             self._on_event(found >> 8, found & 0xFF, now)
             found = self._library.kcg_next_event(self._core)
 
+    def _check(self, esc: int, now: int) -> None:
+        """What a damaged capture may hold never reaches the core."""
+        if not 0 <= esc < len(self.escs):
+            raise IndexError(f"ESC {esc}")
+        if not 0 <= now < _END_OF_TIME:
+            raise OverflowError(f"time {now}")
+
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         """As Core.receive."""
-        self._follow(self._library.kcg_receive(self._core, esc, data, len(data), now, since), now)
+        self._check(esc, now)
+        receive, core, size = self._library.kcg_receive, self._core, len(data)
+        while (found := receive(core, esc, data, size, now, since)) >= _AGAIN:
+            self._follow(found & ~_AGAIN, now)
+        self._follow(found, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         """As Core.port."""
+        self._check(esc, now)
         self._follow(self._library.kcg_port(self._core, esc, is_open, now), now)
 
     def expire(self, now: int) -> None:
         """As Core.expire."""
+        self._check(0, now)
         self._follow(self._library.kcg_expire(self._core, now), now)
 
     def advance(self, now: int) -> None:
         """As Core.advance."""
+        self._check(0, now)
         self._follow(self._library.kcg_advance(self._core, now), now)
 
     def next_deadline(self) -> int:
@@ -197,6 +216,7 @@ class Handle:
 
     def repeat(self, now: int) -> None:
         """As Core.repeat."""
+        self._check(0, now)
         self._library.kcg_repeat(self._core, now)
 
     def stop(self, now: int) -> None:

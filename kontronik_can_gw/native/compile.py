@@ -40,6 +40,7 @@ def compile_core(target: Path, options: Sequence[str] = ("-O2", *FOR_LINUX)) -> 
     command = [
         program,
         "-std=c99",
+        "-fwrapv",
         "-fPIC",
         "-shared",
         number,

@@ -939,8 +939,14 @@ static void note_arrival(kcg_esc *e, uint64_t end, int64_t bound)
 int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since)
 {
     kcg_esc *e = &g->esc[esc];
-    expire(g, now, esc); /* a message may hold values of several ESCs */
-    report(g, esc, expire_esc(e, now), now);
+    if (!g->again) {
+        expire(g, now, esc); /* a message may hold values of several ESCs */
+        report(g, esc, expire_esc(e, now), now);
+        g->again = g->reports > 0;
+        if (g->again)
+            return kcg_next_event(g) | KCG_AGAIN;
+    }
+    g->again = 0;
     if (e->arrivals && now - e->arrival[0].bound > e->settings.timeout)
         flush(e);
     int64_t bound = since + ((int64_t)size - 1) * BYTE_NS;

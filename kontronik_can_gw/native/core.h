@@ -131,7 +131,7 @@ typedef struct {
     int64_t gateway[KCG_OF_GATEWAY_COUNT];     /* states and counters, written by the owner, in the order of tables.GATEWAY */
     int64_t second, next_expiry;
     uint32_t mask;                             /* events that end a step and are reported */
-    uint8_t stopping;
+    uint8_t stopping, again;
     /* the read that is being taken */
     uint32_t found_count, found_at;
     int read_esc;
@@ -143,7 +143,9 @@ typedef struct {
 size_t kcg_size(const kcg_plan *plan);
 /* memory: kcg_size bytes, aligned for int64_t. */
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now);
-/* Each returns an event to be followed, ESC << 8 | events of `mask`, or -1; then kcg_next_event until that returns -1. */
+/* Each returns an event to be followed, ESC << 8 | events of `mask`, or -1; then kcg_next_event until that returns -1. Where
+   kcg_receive returns KCG_AGAIN besides, what has expired is to be followed first, and it is called again with the same bytes. */
+enum { KCG_AGAIN = 1 << 30 };
 int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since);
 int kcg_expire(kcg *g, int64_t now);
 int kcg_advance(kcg *g, int64_t now);
