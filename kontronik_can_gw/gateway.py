@@ -36,13 +36,13 @@ class Gateway:
         packs_at_once: bool = False,
     ) -> None:
         self.core: Core
+        self.why_python = "to replay a capture of 0.5.0"
+        """Why the core is the one in Python; empty where it is the one in C."""
         if packs_at_once:
             self.core = PythonCore(escs, layout, now, silent_on_loss, self._follow)
             self.core.packs_at_once = True
         else:
-            self.core, self.python_core_because = make_core(
-                escs, layout, now, silent_on_loss, self._follow
-            )
+            self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, self._follow)
         self.escs, self.status = self.core.escs, self.core.status
         self.nodes: Nodes | None = None
         if canopen is not None:

@@ -8,7 +8,13 @@ from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
+from kontronik_can_gw.esc.telemetry import (
+    MAX_GEAR_PART,
+    EscSettings,
+    EscTelemetry,
+    Event,
+    LinkState,
+)
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
 RESET = int.from_bytes(b"rset", "little")
@@ -42,6 +48,8 @@ class EscObjects:
         dictionary.bind(at.INFO, 7, read=self._firmware)
         for variable in dictionary.subs(at.SETTINGS):
             variable.written = self._settings_written
+        for part in (2, 3):
+            dictionary.bind(at.SETTINGS, part, check=_check_gear)
         dictionary.bind(at.RESET_STATISTICS, 1, check=_check_reset, written=self._reset_statistics)
 
     def apply_settings(self, now: int) -> None:
@@ -111,6 +119,12 @@ class EscObjects:
     def _reset_statistics(self, _now: int) -> bool:
         self._esc.reset_statistics()
         return True
+
+
+def _check_gear(value: int) -> None:
+    """A new 2100h:2 or :3, whatever limit the EDS has: larger parts leave the whole numbers of the core."""
+    if value > MAX_GEAR_PART:
+        raise SdoAbort(Abort.TOO_HIGH)
 
 
 def _check_reset(value: int) -> None:

@@ -23,6 +23,8 @@ from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 
 MS = 1_000_000
 SECOND = 1000 * MS
+MAX_GEAR_PART = 0xFFFF
+"""Of numerator and denominator of a gear, as a master can set it."""
 INFO_TIMEOUT_NS = 10 * SECOND
 """Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
 _DEGRADED_DROPPED_SHARE = 10  # one byte dropped in ten received

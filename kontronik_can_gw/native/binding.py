@@ -12,6 +12,7 @@ from kontronik_can_gw.native.tables import (
     COUNTS,
     GATEWAY,
     Message,
+    NotInCore,
     Pair,
     Piece,
     Settings,
@@ -85,6 +86,7 @@ class Esc(c.Structure):
 
 _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "kcg_sizes": (_u32, _u32),
+    "kcg_wire": (c.c_char_p,),
     "kcg_size": (c.c_size_t, _p),
     "kcg_init": (_p, _p, _p, _p, _i64),
     "kcg_receive": (c.c_int, _p, c.c_int, c.c_char_p, c.c_size_t, _i64, _i64),
@@ -137,6 +139,8 @@ class Handle:
         on_event: Callable[[int, int, int], None],
         mask: int = _ALL_EVENTS,
     ) -> None:
+        if tables.wire not in ("", library.kcg_wire().decode()):
+            raise NotInCore(f"fields on the wire: {tables.wire}")
         self._library = library
         self._on_event = on_event
         self._kept = [

@@ -1068,6 +1068,11 @@ uint32_t kcg_sizes(uint32_t what)
     return what < sizeof size / sizeof *size ? (uint32_t)size[what] : 0;
 }
 
+const char *kcg_wire(void)
+{
+    return "IHhhhHHHHbBbbIBB HHIBIHHhhhHHbBbbbb";
+}
+
 kcg_esc *kcg_escs(kcg *g)
 {
     return g->esc;

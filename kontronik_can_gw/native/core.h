@@ -163,6 +163,7 @@ uint64_t kcg_count(const kcg_esc *e, int what);
 uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
 /* For a caller that cannot see structures: 0 KCG_SOURCE, then the sizes of signal, message, settings, plan, ESC and frame. */
 uint32_t kcg_sizes(uint32_t what);
+const char *kcg_wire(void); /* the fields of live data and of info on the wire, as codes of Python's struct */
 kcg_esc *kcg_escs(kcg *g);
 int64_t *kcg_gateway(kcg *g);
 void kcg_set_mask(kcg *g, uint32_t mask);

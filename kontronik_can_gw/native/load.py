@@ -3,18 +3,22 @@
 import os
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from kontronik_can_gw.core import Core, OnEvent, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.native.binding import WrongObject, load
 from kontronik_can_gw.native.compile import shared_object
-from kontronik_can_gw.native.core import NativeCore
-from kontronik_can_gw.native.tables import NotInCore
 from kontronik_can_gw.signals.plan import Layout
 
 PURE = "KONTRONIK_PURE"
 """Environment variable: 1 for the core in Python in any case."""
+
+
+class Made(NamedTuple):
+    """A core, and in words why it is not the one in C; empty where it is."""
+
+    core: Core
+    why: str
 
 
 @cache
@@ -24,7 +28,12 @@ def library() -> tuple[Any, str]:
         return None, f"{PURE} is set"
     path = shared_object()
     if not path.exists():
-        return None, "there was no C compiler at the installation"
+        return None, f"no {path.name}: there was no C compiler at the installation"
+    try:
+        # where memory must not be executed, ctypes itself may not load
+        from kontronik_can_gw.native.binding import WrongObject, load
+    except (ImportError, MemoryError, OSError) as error:
+        return None, f"ctypes cannot be used here: {error}"
     try:
         return load(path), ""
     except WrongObject as error:
@@ -37,12 +46,15 @@ def make_core(
     now: int,
     silent: bool,
     on_event: OnEvent,
-) -> tuple[Core, str]:
-    """The core for a layout; and why it is the one in Python, empty where it is not."""
+) -> Made:
+    """The core for these ESCs and this layout."""
     found, why = library()
     if found is not None:
+        from kontronik_can_gw.native.core import NativeCore
+        from kontronik_can_gw.native.tables import NotInCore
+
         try:
-            return NativeCore(found, escs, layout, now, silent, on_event), ""
+            return Made(NativeCore(found, escs, layout, now, silent, on_event), "")
         except NotInCore as error:
             why = str(error)
-    return PythonCore(escs, layout, now, silent, on_event), why
+    return Made(PythonCore(escs, layout, now, silent, on_event), why)

@@ -52,9 +52,8 @@ class NativeEsc(EscTelemetry):
     def __init__(self, settings: EscSettings, state: Any) -> None:
         self._state = state
         self.protocol = protocol_named(settings.protocol)
-        codes = self.protocol.wire
-        assert codes is not None
-        self._live, self._info = (struct.Struct("<" + each) for each in codes)
+        assert self.protocol.wire is not None
+        self._forms = [(struct.Struct("<" + codes), kind) for codes, kind in self.protocol.wire]
         self._generation = -1
         self._link_before = LinkState.NEVER_SEEN
         self._readings: tuple[Data | None, ...] = (None,) * 4
@@ -99,7 +98,10 @@ class NativeEsc(EscTelemetry):
         state = self._state
         if state.generation != self._generation:
             self._generation = state.generation
-            live, info = self._live.unpack_from(state.live), self._info.unpack_from(state.info)
+            live, info = (
+                tuple.__new__(kind, form.unpack_from(body))
+                for (form, kind), body in zip(self._forms, (state.live, state.info), strict=True)
+            )
             self._readings = (
                 live if state.has_live else None,
                 info if state.has_info else None,

@@ -14,7 +14,7 @@ from typing import Any
 from kontronik_can_gw.dbc.schedule import phases
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import EscSettings, Event
+from kontronik_can_gw.esc.telemetry import MAX_GEAR_PART, EscSettings, Event
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.packer import alive_modulus, place
@@ -42,8 +42,8 @@ ALL_PAGES = 64
 ALL_ESCS = 255
 MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""
-MAX_POLES = MAX_GEAR = 0xFFFF
-"""Of pole pairs and of both parts of a gear, as 2100h has them."""
+MAX_GEAR = MAX_GEAR_PART
+MAX_POLES = 0xFFFF
 _DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
@@ -102,6 +102,11 @@ class Tables:
         self.esc_of: list[int] = []
         self.pages = 0
         self.settings = [settings_of(esc) for esc in escs]
+        self.wire = ""
+        """The fields that the tables were made for."""
+        for settings in escs:
+            if (wire := protocol_named(settings.protocol).wire) is not None:
+                self.wire = " ".join(codes for codes, _ in wire)
         self._wire = [_places(protocol_named(esc.protocol)) for esc in escs]
         listeners: list[list[int]] = [[] for _ in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
@@ -256,7 +261,7 @@ def _places(protocol: EscProtocol) -> tuple[list[tuple[int, int]], list[tuple[in
     if protocol.wire is None:
         raise NotInCore(f"ESC protocol {protocol.name}")
     found: tuple[list[tuple[int, int]], list[tuple[int, int]]] = ([], [])
-    for places, codes in zip(found, protocol.wire, strict=True):
+    for places, (codes, _) in zip(found, protocol.wire, strict=True):
         at = 0
         for code in codes:
             places.append((at, WIRE[code]))

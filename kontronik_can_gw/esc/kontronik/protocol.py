@@ -67,7 +67,7 @@ KONTRONIK = EscProtocol(
     errors={"operating_errors": tuple(OperatingError), "selftest_errors": tuple(SelfTestError)},
     states=_STATES,
     devices=_DEVICES,
-    wire=(body_format(LiveData), body_format(InfoData)),
+    wire=((body_format(LiveData), LiveData), (body_format(InfoData), InfoData)),
     peak_current_of={
         int(device): whose for device in Device if (whose := peak_current_of(device)) is not None
     },
