@@ -39,6 +39,9 @@ class Core(Protocol):
     packs_at_once: bool
     """As 0.5.0 did, to replay its captures: with each event, so that one step may make several frames of a message."""
 
+    def report_only(self, events: int) -> None:
+        """Others need not be reported to ``on_event``: bits of telemetry.Event."""
+
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
 
@@ -108,6 +111,9 @@ class PythonCore:
             self.expire(now, but=esc)  # a message may hold values of several ESCs
         for events in self.escs[esc].receive_each(data, now, since):
             self._report(esc, events, now)
+
+    def report_only(self, events: int) -> None:
+        pass
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         state = self.escs[esc]

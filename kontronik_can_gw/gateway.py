@@ -51,6 +51,8 @@ class Gateway:
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
         )
+        if not self._outputs:
+            self.core.report_only(Event.LINK)
         self.conflicts = IdConflicts(self.core.own_ids, self._outputs)
         self._being_saved: list[tuple[int, Output]] = []
         self._link_changes: list[int] = []

@@ -1,6 +1,7 @@
 """The core in C by ctypes, call by call: a plain shared object, no Python headers, no callbacks."""
 
 import ctypes as c
+import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,9 @@ class Esc(c.Structure):
     )
 
 
+_FRAME_SIZE = c.sizeof(Frame)
+_head = struct.Struct("=IBBB").unpack_from
+_new = tuple.__new__
 _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "kcg_sizes": (_u32, _u32),
     "kcg_wire": (c.c_char_p,),
@@ -137,7 +141,6 @@ class Handle:
         tables: Tables,
         now: int,
         on_event: Callable[[int, int, int], None],
-        mask: int = _ALL_EVENTS,
     ) -> None:
         if tables.wire not in ("", library.kcg_wire().decode()):
             raise NotInCore(f"fields on the wire: {tables.wire}")
@@ -159,12 +162,13 @@ class Handle:
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)
         self._core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
-        library.kcg_set_mask(self._core, mask)
+        self.report_only(_ALL_EVENTS)
         begin = c.addressof(self._memory)
         at = library.kcg_escs(self._core) - begin, library.kcg_gateway(self._core) - begin
         self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, at[0])
         self.gateway = (_i64 * len(GATEWAY)).from_buffer(self._memory, at[1])
         self._frames = (Frame * _MAX_FRAMES)()
+        self._raw = memoryview(self._frames).cast("B")
 
     @staticmethod
     def _array(kind: Any, rows: Sequence[Any]) -> Any:
@@ -174,6 +178,10 @@ class Handle:
         while found >= 0:
             self._on_event(found >> 8, found & 0xFF, now)
             found = self._library.kcg_next_event(self._core)
+
+    def report_only(self, events: int) -> None:
+        """As Core.report_only."""
+        self._library.kcg_set_mask(self._core, events)
 
     def _check(self, esc: int, now: int) -> None:
         """What a damaged capture may hold never reaches the core."""
@@ -235,17 +243,19 @@ class Handle:
     def take(self, now: int) -> list[CanFrame]:
         """As Core.take."""
         frames: list[CanFrame] = []
-        while count := self._library.kcg_take(self._core, now, self._frames, _MAX_FRAMES):
-            frames += [_frame_of(frame) for frame in self._frames[:count]]
-            self._library.kcg_sent(self._core, now, count)
+        library, core, raw = self._library, self._core, self._raw
+        while count := library.kcg_take(core, now, self._frames, _MAX_FRAMES):
+            for at in range(0, count * _FRAME_SIZE, _FRAME_SIZE):
+                number, length, flags, page = _head(raw, at)
+                begin = at + 8
+                frames.append(
+                    _new(
+                        CanFrame,
+                        (
+                            *(number & ~EXTENDED, bytes(raw[begin : begin + length])),
+                            *(number >= EXTENDED, flags != 0, page, False, False),
+                        ),
+                    )
+                )
+            library.kcg_sent(core, now, count)
         return frames
-
-
-def _frame_of(frame: Any) -> CanFrame:
-    return CanFrame(
-        frame.id & ~EXTENDED,
-        bytes(frame.data[: frame.length]),
-        bool(frame.id & EXTENDED),
-        bool(frame.flags),
-        frame.page,
-    )

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 from kontronik_can_gw.core import OnEvent
 from kontronik_can_gw.dbc.messages import own_ids
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
@@ -40,6 +40,9 @@ class NativeCore:
         self.expire, self.next_deadline = handle.expire, handle.next_deadline
         self.gateway_changed, self.repeat = handle.gateway_changed, handle.repeat
         self.stop, self.take = handle.stop, handle.take
+
+    def report_only(self, events: int) -> None:
+        self._handle.report_only(events | Event.SECOND | Event.LINK)  # which NativeEsc follows
 
     @property
     def is_pending(self) -> bool:
