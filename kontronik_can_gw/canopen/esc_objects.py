@@ -49,7 +49,7 @@ class EscObjects:
         for variable in dictionary.subs(at.SETTINGS):
             variable.written = self._settings_written
         for part in (2, 3):
-            dictionary.bind(at.SETTINGS, part, check=_check_gear)
+            dictionary.bind(at.SETTINGS, part, check=_check_gear, written=self._settings_written)
         dictionary.bind(at.RESET_STATISTICS, 1, check=_check_reset, written=self._reset_statistics)
 
     def apply_settings(self, now: int) -> None:
