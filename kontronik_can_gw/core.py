@@ -4,46 +4,109 @@ Pure, and the way of every value: ``receive`` decodes and marks messages as pend
 ``take`` packs what is pending. What happens besides is reported to ``followers``. ``now`` is integer nanoseconds of one monotonic clock.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
-from kontronik_can_gw.dbc.messages import Messages
-from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.dbc.messages import Messages, own_ids
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscStream, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
 
 OnEvent = Callable[[int, int, int], None]
 """ESC, bits of telemetry.Event, time."""
 
 
-class Core:
-    """``escs`` are the ESCs' states; ``followers`` are given what happens, as it happens. ``silent``: see Messages."""
+class Core(Protocol):
+    """The seam of the core: what the gateway asks of it. In Python it is PythonCore, in C native.core.NativeCore."""
+
+    @property
+    def escs(self) -> Sequence[EscTelemetry]:
+        """The state of each ESC."""
+
+    @property
+    def status(self) -> GatewayStatus:
+        """The gateway's own values; the runtime writes the CAN side, then ``gateway_changed`` where that cannot wait."""
+
+    @property
+    def own_ids(self) -> Mapping[int, Owner]:
+        """The ids of the messages (29-bit ones with EXTENDED), and what for."""
+
+    followers: Sequence[OnEvent]
+    """They are given what happens, as it happens."""
+    link_changes: list[int]
+    """ESCs whose link state, layout or device changed; the owner empties it."""
+    shortest_timeout_ns: int
+    """Of all ESCs: live data of one is not available after this."""
+    packs_at_once: bool
+    """As 0.5.0 did, to replay its captures: with each event, so that one step may make several frames of a message."""
+
+    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
+        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
+
+    def port(self, esc: int, is_open: bool, now: int) -> None:
+        """An ESC's port was opened (again), or cannot be used: its values are not available from now on."""
+
+    def apply(self, esc: int, settings: EscSettings) -> None:
+        """Other settings of an ESC from now on."""
+
+    def expire(self, now: int) -> None:
+        """What is too old by now goes."""
+
+    def advance(self, now: int) -> None:
+        """Let time pass: time-outs, cyclic messages."""
+
+    def next_deadline(self) -> int:
+        """When ``advance`` is to be called at the latest."""
+
+    def gateway_changed(self, now: int) -> None:
+        """``status`` has changed: messages that hold it follow."""
+
+    def repeat(self, now: int) -> None:
+        """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
+
+    def stop(self, now: int) -> None:
+        """What the gateway says of itself goes out once more, all pages at once, without regard to minimum distances."""
+
+    @property
+    def is_pending(self) -> bool:
+        """True while ``take`` has something to do."""
+
+    def take(self, now: int) -> list[CanFrame]:
+        """The frames of the messages that are due, with the values of now, in the order in which they became due."""
+
+    def pack(self, now: int) -> None:
+        """Make the frames of what is pending, before ``take`` asks for them."""
+
+
+class PythonCore:
+    """The core in plain Python: reference and fallback. ``silent``: see Messages."""
 
     def __init__(
         self,
         escs: Sequence[EscSettings],
         layout: Layout,
-        status: GatewayStatus,
         now: int,
         silent: bool,
     ) -> None:
-        self.escs = [EscTelemetry(settings, now) for settings in escs]
-        self.messages = Messages(layout, self.escs, status, now, silent)
+        self.escs: list[EscStream] = [EscStream(settings, now) for settings in escs]
+        self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
+        self.messages = Messages(layout, self.escs, self.status, now, silent)
+        self.own_ids = own_ids(layout)
+        self.gateway_changed = self.messages.on_gateway_change
+        self.repeat = self.messages.repeat
+        self.stop = self.messages.stop
         self.shortest_timeout_ns = self._shortest_timeout()
-        """Of all ESCs: live data of one is not available after this."""
         self.packs_at_once = False
-        """As 0.5.0 did, to replay its captures: with each event, so that one step may make several frames of a message."""
         self._packed: list[CanFrame] = []
-        self._status = status
         self.followers: Sequence[OnEvent] = ()
         self.link_changes: list[int] = []
-        """ESCs whose link state, layout or device changed; the owner empties it."""
         self._second_ns = now
         self._next_expiry = 0
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
-        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
         state = self.escs[esc]
         if now >= self._next_expiry:
             self.expire(now, but=esc)  # a message may hold values of several ESCs
@@ -53,13 +116,11 @@ class Core:
             self._report(esc, events, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
-        """An ESC's port was opened (again), or cannot be used: its values are not available from now on."""
         state = self.escs[esc]
         if events := state.port_opened() if is_open else state.port_lost():
             self._report(esc, events, now)
 
     def apply(self, esc: int, settings: EscSettings) -> None:
-        """Other settings of an ESC from now on."""
         self.escs[esc].apply(settings)
         self.shortest_timeout_ns = self._shortest_timeout()
         self._next_expiry = 0
@@ -77,26 +138,26 @@ class Core:
             self.messages.on_gateway_change(now, each_second=True)
 
     def advance(self, now: int) -> None:
-        """Let time pass: time-outs, cyclic messages."""
         if now >= self._next_expiry:
             self.expire(now)
         if now >= self.messages.schedule.next_due:
             self.messages.advance(now)
 
     def next_deadline(self) -> int:
-        """When ``advance`` is to be called at the latest."""
         due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
         return min(due, self.messages.schedule.next_due)
 
     def take(self, now: int) -> list[CanFrame]:
-        """The frames of the messages that are due, with the values of now, in the order in which they became due."""
         frames = self.messages.take(now)
         if self._packed:
             frames, self._packed = self._packed + frames, []
         return frames
 
+    @property
+    def is_pending(self) -> bool:
+        return bool(self.messages.pending)
+
     def pack(self, now: int) -> None:
-        """Make the frames of what is pending, before ``take`` asks for them: ``packs_at_once``."""
         self._packed += self.messages.take(now)
 
     def _report(self, esc: int, events: int, now: int) -> None:
@@ -106,8 +167,8 @@ class Core:
                 self.link_changes.append(esc)
             self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
             escs_ok = sum([e.live is not None for e in self.escs])
-            if escs_ok != self._status.escs_ok:
-                self._status.escs_ok = escs_ok
+            if escs_ok != self.status.escs_ok:
+                self.status.escs_ok = escs_ok
                 self.messages.on_gateway_change(now)
         if self.packs_at_once:
             self.pack(now)

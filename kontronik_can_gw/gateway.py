@@ -6,11 +6,12 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.core import Core
+from kontronik_can_gw.core import Core, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.id_conflicts import IdConflicts
+from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals.plan import Layout
 
@@ -32,10 +33,17 @@ class Gateway:
         silent_on_loss: bool = False,
         canopen: "CanopenSetup | None" = None,
         further: Sequence[MakeOutput] = (),
+        packs_at_once: bool = False,
     ) -> None:
-        self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
-        self.core = Core(escs, layout, self.status, now, silent_on_loss)
-        self.escs = self.core.escs
+        self.core: Core
+        self.why_python = "to replay a capture of 0.5.0"
+        """Why the core is the one in Python; empty where it is the one in C."""
+        if packs_at_once:
+            self.core = PythonCore(escs, layout, now, silent_on_loss)
+            self.core.packs_at_once = True
+        else:
+            self.core, self.why_python = make_core(escs, layout, now, silent_on_loss)
+        self.escs, self.status = self.core.escs, self.core.status
         self.nodes: Nodes | None = None
         if canopen is not None:
             self.nodes = _nodes(canopen, layout, self.core, self.status)
@@ -44,21 +52,21 @@ class Gateway:
             *(make(self.escs, self.status, now) for make in further),
         )
         self.core.followers = [output.on_event for output in self._outputs]
-        self.conflicts = IdConflicts(self.core.messages.own_ids(), self._outputs)
+        self.conflicts = IdConflicts(self.core.own_ids, self._outputs)
         self._being_saved: list[tuple[int, Output]] = []
         self._dropped = False
 
     def start(self, now: int, can_open: bool = True) -> None:
         """The runtime has opened what it could: run. Nodes boot when there is a bus that can hear it."""
         self.status.state = GatewayState.RUNNING
-        self.core.messages.repeat(now)
+        self.core.repeat(now)
         for output in self._outputs:
             output.start(now, can_open)
 
     def stop(self, now: int) -> None:
         """The last word: a status that says the gateway is going."""
         self.status.state = GatewayState.STOPPING
-        self.core.messages.stop(now)
+        self.core.stop(now)
         for output in self._outputs:
             output.stop(now)
 
@@ -132,7 +140,7 @@ class Gateway:
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost: say everything that has no cycle once more."""
         self.core.expire(now)
-        self.core.messages.repeat(now)
+        self.core.repeat(now)
         for output in self._outputs:
             output.can_returned(now)
 
@@ -151,7 +159,9 @@ class Gateway:
         self.core.expire(now)
         before, self.status.can_state = self.status.can_state, state
         if state is not before:
-            self.core.messages.on_can_state(before, state, now)
+            self.core.gateway_changed(now)
+            if before is CanState.BUS_OFF and state is not CanState.DOWN:
+                self.core.repeat(now)  # what was handed over meanwhile never reached the bus
         for output in self._outputs:
             output.on_can_state(before, state, now)
 
@@ -161,7 +171,7 @@ class Gateway:
         self.conflicts.advance(now)
         if self._dropped:
             self._dropped = False
-            self.core.messages.repeat(now)
+            self.core.repeat(now)
             for output in self._outputs:
                 output.make_anew(now)
         for output in self._outputs:
@@ -177,7 +187,7 @@ class Gateway:
     @property
     def frames_wait(self) -> bool:
         """True while ``take_frames`` has something to do."""
-        return bool(self.core.messages.pending) or any(o.frames for o in self._outputs)
+        return self.core.is_pending or any(output.frames for output in self._outputs)
 
     def take_frames(self, now: int) -> list[CanFrame]:
         """The frames to send: those of the outputs, oldest first, then those of the messages that are due, with the values of now."""

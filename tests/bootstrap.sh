@@ -62,7 +62,7 @@ make_venv() {
 
 install_project() { # $1: demo or test, $2: what pip installs
     stamp=.venv/.installed-$1
-    key="$(cksum <pyproject.toml) $PWD"
+    key="$(cat pyproject.toml hatch_build.py kontronik_can_gw/native/*.[ch] | cksum) $PWD"
     for done in "$stamp" .venv/.installed-test; do
         [ -e "$done" ] && [ "$(cat "$done")" = "$key" ] && return
     done
@@ -135,7 +135,7 @@ install_programs() {
 }
 
 install_small_tools() {
-    install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl gcc=gcc,libc6-dev
+    install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl
 }
 
 install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }
@@ -153,12 +153,16 @@ install_vm() { # $1: uml or qemu
     tests/vm/setup.sh "$1" || say "failed; by hand:  sudo tests/vm/setup.sh $1"
 }
 
+# With a C compiler the core in C is built when the project is installed; without one the core in Python runs.
+install_compiler() { command -v cc >/dev/null || command -v gcc >/dev/null || install_programs "a C compiler" gcc=gcc,libc6-dev; }
+
 [ -x "$venv" ] && "$venv" -c "$new_enough" 2>/dev/null || make_venv
 case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;
-    test) install_project test '.[test]'; install_vcan; install_small_tools ;;
+    test) install_compiler; install_project test '.[test]'; install_vcan; install_small_tools ;;
     test-all)
+        install_compiler
         install_project test '.[test]'
         install_vcan
         install_small_tools
@@ -167,6 +171,6 @@ case $what in
         install_programs "systemd and a broker" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients
         tests/foreign/install.sh || say "tests with the masters named above are left out"
         ;;
-    release) install_project test '.[test]'; install_vcan; install_vm uml; install_vm qemu ;;
+    release) install_compiler; install_project test '.[test]'; install_vcan; install_vm uml; install_vm qemu ;;
     *) die "$what: demo, lint, test, test-all or release" ;;
 esac

@@ -5,6 +5,9 @@ On a vcan neither is wanted so early.
 
 import gc
 import os
+from pathlib import Path
+
+import pytest
 
 if not os.environ.get("KCG_VCAN"):
     import can  # noqa: F401
@@ -21,3 +24,32 @@ def pytest_collection_finish() -> None:
     """What was imported stays: a collection that walks through pandas and its like holds a gateway in this process up for long."""
     gc.collect()
     gc.freeze()
+
+
+TESTS = Path(__file__).parent
+ON_BOTH_CORES = (
+    *("gateway", "golden", "dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
+    *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
+)
+"""Files and folders of tests of what the core does: they run on the core in C and on the one in Python."""
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run the tests of the core on both."""
+    path = Path(str(metafunc.module.__file__)).relative_to(TESTS)
+    if any(path.is_relative_to(each) for each in ON_BOTH_CORES):
+        metafunc.fixturenames.append("core_language")
+        metafunc.parametrize("core_language", ["C", "Python"], indirect=True)
+
+
+@pytest.fixture
+def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Which core every gateway of the test gets."""
+    from kontronik_can_gw.native import load
+
+    found, why = load.library()
+    if request.param == "Python":
+        monkeypatch.setattr(load, "library", lambda: (None, "a test"))
+    elif found is None:
+        pytest.skip(f"the core in C: {why}; sudo apt-get install gcc libc6-dev, and install again")
+    return str(request.param)

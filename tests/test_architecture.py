@@ -27,6 +27,7 @@ ORDER = (
     ("signals",),
     ("dbc",),
     ("core",),
+    ("native",),
     ("canopen",),
     ("id_conflicts",),
     ("gateway",),

@@ -16,7 +16,7 @@ from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAPPING
 from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROFILE
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings, EscStream
 from kontronik_can_gw.gateway_status import GatewayStatus
 
 _UNSIGNED = {
@@ -116,7 +116,7 @@ def _settings(
 def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     """Defaults that a download would be refused: of single services, then of the PDOs."""
     setup = CanopenSetup(eds, (NodeSettings(node_id),), (Stored(),))
-    node = Nodes(setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda *_: None).nodes[0]
+    node = Nodes(setup, [EscStream(settings, 0)], GatewayStatus(), lambda *_: None).nodes[0]
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():

@@ -20,7 +20,7 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
 from kontronik_can_gw.canopen.reception import FrameTaker, routes
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings, EscStream, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
@@ -53,7 +53,7 @@ class CanopenSetup:
         self, escs: Sequence[EscSettings], foreign_ids: Mapping[int, str] | None = None
     ) -> "Nodes":
         """The nodes as they are after power-on, without a gateway around them: to see their COB-IDs and objects."""
-        telemetry = [EscTelemetry(settings, 0) for settings in escs]
+        telemetry = [EscStream(settings, 0) for settings in escs]
         nodes = Nodes(self, telemetry, GatewayStatus(), lambda _esc, _settings: None, foreign_ids)
         nodes.start(0, can_open=True)
         return nodes

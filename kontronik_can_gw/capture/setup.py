@@ -126,9 +126,10 @@ class CaptureSetup:
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """The gateway in its state before the start."""
-        made = Gateway(self.escs, layout, now, self.silent_on_loss, self.canopen)
-        made.core.packs_at_once = self.version == 1
-        return made
+        return Gateway(
+            *(self.escs, layout, now, self.silent_on_loss, self.canopen),
+            packs_at_once=self.version == 1,
+        )
 
 
 def _canopen_json(setup: "CanopenSetup") -> dict[str, Any]:

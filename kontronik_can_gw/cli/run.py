@@ -125,6 +125,7 @@ class _Run:
             if loaded.store is not None:
                 loaded.store.close(0)
             raise
+        log.info("core: %s", f"Python ({gateway.why_python})" if gateway.why_python else "C")
         loop = Loop(
             gateway,
             [esc.port for esc in config.esc],

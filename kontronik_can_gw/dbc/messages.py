@@ -12,7 +12,7 @@ from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.gateway_status import CanState, GatewayStatus
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
@@ -37,7 +37,7 @@ class _Message:
         self.frame = compile_frame(plan)
         self.is_paged = len(plan.pages) > 1
         self.place = 0
-        self.pages_to_send: list[int] = []
+        self.pages_to_send: set[int] = set()
         self.alive = 0
         roles = {signal.role: signal for signal in plan.signals}
         alive = roles.get(Role.ALIVE)
@@ -75,22 +75,33 @@ class _Message:
     def add_all_pages(self) -> None:
         """Let all pages follow, of a message that has several."""
         if self.is_paged:
-            self.pages_to_send = list(range(len(self.plan.pages)))
+            self.pages_to_send.update(range(len(self.plan.pages)))
 
     def turn_page(self) -> None:
         """Let the page follow whose turn it is, of a message that has several."""
         if self.is_paged:
-            if self.place not in self.pages_to_send:
-                self.pages_to_send.append(self.place)
+            self.pages_to_send.add(self.place)
             self.place = (self.place + 1) % len(self.plan.pages)
 
-    def next_place(self) -> int:
-        """The place of the page to send: the first of those that are to follow, else that whose turn it is."""
+    def take_place(self) -> int:
+        """The place of the page to send: the first of those that are to follow, from the one on whose turn it is next."""
         if not self.is_paged:
             return 0
         if not self.pages_to_send:
             self.turn_page()
-        return self.pages_to_send.pop(0)
+        count = len(self.plan.pages)
+        places = ((self.place + n) % count for n in range(count))
+        place = next(place for place in places if place in self.pages_to_send)
+        self.pages_to_send.remove(place)
+        return place
+
+
+def own_ids(layout: Layout) -> dict[int, Owner]:
+    """The ids of the messages (29-bit ones with EXTENDED), and what for."""
+    return {
+        plan.can_id | (EXTENDED if plan.extended else 0): Owner(None, f"message {plan.name}")
+        for plan in layout.messages
+    }
 
 
 class _Followers(NamedTuple):
@@ -151,13 +162,6 @@ class Messages:
             tuple(m for _, m in found if m.is_paged and m.by_event),
         )
 
-    def own_ids(self) -> dict[int, Owner]:
-        """The ids of the messages (29-bit ones with EXTENDED), and what for."""
-        return {
-            plan.can_id | (EXTENDED if plan.extended else 0): Owner(None, f"message {plan.name}")
-            for plan in (message.plan for message in self._messages)
-        }
-
     # --- what makes messages pending
 
     def on_event(self, esc: int, events: int, now: int) -> None:
@@ -178,12 +182,6 @@ class Messages:
         for index, message in self._of_gateway:
             if not (each_second and message.plan.cycle_ns):
                 self._request(index, now)
-
-    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
-        """The CAN controller's state changed."""
-        self.on_gateway_change(now)
-        if before is CanState.BUS_OFF and state is not CanState.DOWN:
-            self.repeat(now)  # what was handed over meanwhile never reached the bus
 
     def repeat(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
@@ -267,12 +265,12 @@ class Messages:
             if message.frame(self._escs, self._gateway, now, 0, place) != message.last.get(place)
         ]
         if message.is_paged:
-            message.pages_to_send += [p for p in changed if p not in message.pages_to_send]
+            message.pages_to_send.update(changed)
         return bool(changed or message.pages_to_send)
 
     def _frame(self, index: int, message: _Message, now: int) -> CanFrame:
         """The frame of the page that is next; what it changes is noted."""
-        place = message.next_place()
+        place = message.take_place()
         frame = message.frame(self._escs, self._gateway, now, message.alive, place)
         if message.on_change:
             message.last[place] = message.frame(self._escs, self._gateway, now, 0, place)

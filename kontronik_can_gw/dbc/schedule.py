@@ -25,7 +25,7 @@ class Schedule:
         self._cycle = [plan.cycle_ns for plan in plans]
         self._delay = [plan.delay_ns for plan in plans]
         self._last = [_LONG_AGO] * len(plans)
-        self._deferred = [False] * len(plans)
+        self._deferred_until = [NEVER] * len(plans)
         self._cycle_deferred = [False] * len(plans)
         self._heap = [
             (now + phase, index, False)
@@ -52,7 +52,13 @@ class Schedule:
     def sent(self, index: int, now: int) -> None:
         """Note that a frame of the message was sent; a deferred request is done."""
         self._last[index] = now
-        self._deferred[index] = self._cycle_deferred[index] = False
+        self._cycle_deferred[index] = False
+        if self._deferred_until[index] != NEVER:
+            self._deferred_until[index] = NEVER
+            heap = self._heap
+            while heap and heap[0][2] and heap[0][0] != self._deferred_until[heap[0][1]]:
+                heapq.heappop(heap)
+            self.next_due = heap[0][0] if heap else NEVER
 
     def due(self, now: int) -> list[tuple[int, int, int]]:
         """(deadline, message, CYCLE, REQUEST or both), each message once.
@@ -65,12 +71,9 @@ class Schedule:
             when, index, is_deferred = heap[0]
             if is_deferred:
                 heapq.heappop(heap)
-                if not self._deferred[index]:
+                if when != self._deferred_until[index]:
                     continue  # a frame has gone out since
-                if now < self._last[index] + self._delay[index]:
-                    heapq.heappush(heap, (self._last[index] + self._delay[index], index, True))
-                    continue
-                self._deferred[index] = False
+                self._deferred_until[index] = NEVER
                 first, _, why = found.get(index, (when, index, 0))
                 why |= CYCLE | REQUEST if self._cycle_deferred[index] else REQUEST
                 found[index] = (first, index, why)
@@ -88,8 +91,8 @@ class Schedule:
         return list(found.values())
 
     def _defer(self, index: int, until: int) -> None:
-        if not self._deferred[index]:
-            self._deferred[index] = True
+        if self._deferred_until[index] == NEVER:
+            self._deferred_until[index] = until
             heapq.heappush(self._heap, (until, index, True))
             self.next_due = self._heap[0][0]
 

@@ -220,6 +220,8 @@ class EscProtocol:
     devices: Mapping[int, str] = field(default_factory=dict)
     peak_current_of: Mapping[int, str] = field(default_factory=dict)
     """Number of a device to whose peak current it reports: ``motor`` or ``battery``."""
+    wire: tuple[tuple[str, type[tuple[int, ...]]], ...] | None = None
+    """struct codes, as they are sent, and type of live data and of information; None where the core in C does not decode it."""
 
     def __post_init__(self) -> None:
         """ValueError for a field without a range, and for one with bits where whole words are needed."""

@@ -15,13 +15,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
+from typing import Any
 
-from kontronik_can_gw.esc.decoder import Counters, Data, Decoder, Reading
+from kontronik_can_gw.esc.decoder import Counters, Data, Decoder, EscProtocol, Reading
 from kontronik_can_gw.esc.drawn import Drawn
 from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 
 MS = 1_000_000
 SECOND = 1000 * MS
+MAX_GEAR_PART = 0xFFFF
+"""Of numerator and denominator of a gear, as a master can set it."""
 INFO_TIMEOUT_NS = 10 * SECOND
 """Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
 _DEGRADED_DROPPED_SHARE = 10  # one byte dropped in ten received
@@ -73,16 +76,82 @@ class EscSettings:
 
 
 class EscTelemetry:
-    """One ESC's stream and what is known from it.
+    """What is known of one ESC, for all that read it: the packers, nodes, the status document.
 
-    Attributes read by the packers: ``live``, ``info`` (data of a reading, None where not available), ``link``, ``layout`` (0 unknown,
-    else as the protocol lists them), ``cells`` (0 unknown), ``pole_pairs``, ``output_divisor`` / ``gear_denominator`` (pole pairs x
-    gear), ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``, ``drawn``, ``live_ns`` and
-    ``last_info_ns`` (time of the newest live and info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and
-    ``info_bound_ns`` are the earliest that byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or
-    not, of the layout now on the line, ``device`` is the number in the latter; ``line_errors`` (parity, framing, overrun) is written by
-    who owns the port.
+    ``live``, ``info`` (data of a reading, None where not available), ``link``, ``layout`` (0 unknown, else as the protocol lists them),
+    ``cells`` (0 unknown), ``pole_pairs``, ``output_divisor`` / ``gear_denominator`` (pole pairs x gear), ``frame_rate`` (live frames of
+    the last full second in 0.1 Hz, None before it), ``losses``, ``drawn``, ``live_ns`` and ``last_info_ns`` (time of the newest live and
+    info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and ``info_bound_ns`` are the earliest that
+    byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or not, of the layout now on the line,
+    ``device`` is the number in the latter; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
     """
+
+    protocol: EscProtocol
+    settings: EscSettings
+    live: Data | None
+    info: Data | None
+    last_live: Data | None
+    last_info: Data | None
+    device: int | None
+    link: LinkState
+    layout: int
+    cells: int
+    pole_pairs: int
+    output_divisor: int
+    gear_denominator: int
+    frame_rate: int | None
+    losses: int
+    suspect_frames: int
+    late_frames: int
+    drawn: Any
+    live_ns: int | None
+    last_info_ns: int | None
+    live_bound_ns: int
+    info_bound_ns: int | None
+    line_errors: int
+    base: Counters
+    base_losses: int
+    base_line_errors: int
+    _diagnosis_counters: Counters
+
+    @property
+    def counters(self) -> Counters:
+        """Counters of the whole stream so far."""
+        raise NotImplementedError
+
+    @property
+    def up(self) -> bool:
+        """True while live telemetry is fresh."""
+        return self.live is not None
+
+    def supplies(self, not_on: frozenset[int], raw: int) -> bool:
+        """False for a value that the device (the last known one) does not have, and at 0 as long as the device is not known."""
+        device = self.device
+        return (self.info is not None or raw != 0) and (device is None or device not in not_on)
+
+    @property
+    def last_cells(self) -> int:
+        """Number of cells, 0: unknown. While telemetry is lost that of the last value."""
+        if self.cells or self.live is not None or self.last_info is None:
+            return self.cells
+        return self.protocol.value("cell_count", self.last_info) or 0
+
+    def age_ms(self, now: int) -> int | None:
+        """Age of the newest live frame, None before the first."""
+        return None if self.live_ns is None else max(0, now - self.live_ns) // MS
+
+    def reset_statistics(self) -> None:
+        """Let the counters that are shown relative to ``base`` begin anew; the stream's own go on."""
+        self.base = self.counters.copy()
+        self.base_losses, self.base_line_errors = self.losses, self.line_errors
+
+    def diagnosis(self) -> str | None:
+        """Why no frame comes, in words, from the bytes of one to two seconds; None while frames come."""
+        return None if self.up else self.counters.diagnosis(self._diagnosis_counters)
+
+
+class EscStream(EscTelemetry):
+    """One ESC's stream and what is known from it."""
 
     def __init__(self, settings: EscSettings, now: int) -> None:
         self.protocol = protocol_named(settings.protocol)
@@ -121,27 +190,6 @@ class EscTelemetry:
         found: Counters = self.decoder.counters
         return found
 
-    @property
-    def up(self) -> bool:
-        """True while live telemetry is fresh."""
-        return self.live is not None
-
-    def supplies(self, not_on: frozenset[int], raw: int) -> bool:
-        """False for a value that the device (the last known one) does not have, and at 0 as long as the device is not known."""
-        device = self.device
-        return (self.info is not None or raw != 0) and (device is None or device not in not_on)
-
-    @property
-    def last_cells(self) -> int:
-        """Number of cells, 0: unknown. While telemetry is lost that of the last value."""
-        if self.cells or self.live is not None or self.last_info is None:
-            return self.cells
-        return self.protocol.value("cell_count", self.last_info) or 0
-
-    def age_ms(self, now: int) -> int | None:
-        """Age of the newest live frame, None before the first."""
-        return None if self.live_ns is None else max(0, now - self.live_ns) // MS
-
     def apply(self, settings: EscSettings) -> None:
         """Other settings from now on."""
         self.settings = settings
@@ -149,11 +197,6 @@ class EscTelemetry:
         self.output_divisor = settings.pole_pairs * settings.gear.numerator
         self.gear_denominator = settings.gear.denominator
         self.cells = settings.cell_count or self.protocol.value("cell_count", self.info) or 0
-
-    def reset_statistics(self) -> None:
-        """Let the counters that are shown relative to ``base`` begin anew; the stream's own go on."""
-        self.base = self.counters.copy()
-        self.base_losses, self.base_line_errors = self.losses, self.line_errors
 
     def receive_each(self, data: bytes, now: int, since: int) -> Iterator[int]:
         """Take bytes that were read at ``now`` and came after ``since``; the events of each frame in turn: iterate to the end.
@@ -227,10 +270,6 @@ class EscTelemetry:
         if self.info_bound_ns is not None:
             deadline = min(deadline, self.info_bound_ns + INFO_TIMEOUT_NS + 1)
         return deadline
-
-    def diagnosis(self) -> str | None:
-        """Why no frame comes, in words, from the bytes of one to two seconds; None while frames come."""
-        return None if self.up else self.counters.diagnosis(self._diagnosis_counters)
 
     def accept(self, reading: Reading, when: int, bound: int) -> int:
         """Take a reading that came at ``when``, at ``bound`` at the earliest (see Arrival); its events."""

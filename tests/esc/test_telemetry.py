@@ -1,4 +1,4 @@
-"""EscTelemetry with time handed in: link, freshness, derived values, device swaps, deadlines. All frames here are synthetic."""
+"""EscStream with time handed in: link, freshness, derived values, device swaps, deadlines. All frames here are synthetic."""
 
 import random
 from bisect import bisect_right
@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.telemetry import (
     MS,
     SECOND,
     EscSettings,
-    EscTelemetry,
+    EscStream,
     Event,
     LinkState,
 )
@@ -53,17 +53,17 @@ def info(
     )
 
 
-def esc(**known: int) -> EscTelemetry:
-    return EscTelemetry(EscSettings(timeout_ns=known.pop("timeout_ns", TIMEOUT), **known), 0)  # type: ignore[arg-type]
+def esc(**known: int) -> EscStream:
+    return EscStream(EscSettings(timeout_ns=known.pop("timeout_ns", TIMEOUT), **known), 0)  # type: ignore[arg-type]
 
 
-def read(telemetry: EscTelemetry, data: bytes, now: int, since: int | None = None) -> int:
+def read(telemetry: EscStream, data: bytes, now: int, since: int | None = None) -> int:
     """Bytes that came after ``since``, or just now: the port was empty a moment ago. The events of all frames."""
     events = telemetry.expire(now)
     return reduce(or_, telemetry.receive_each(data, now, now if since is None else since), events)
 
 
-def alive(now: int = SECOND) -> EscTelemetry:
+def alive(now: int = SECOND) -> EscStream:
     """An ESC whose first live frame was read at ``now``."""
     telemetry = esc()
     read(telemetry, live(), now)
@@ -71,16 +71,16 @@ def alive(now: int = SECOND) -> EscTelemetry:
     return telemetry
 
 
-def link_of(telemetry: EscTelemetry) -> LinkState:
+def link_of(telemetry: EscStream) -> LinkState:
     return telemetry.link
 
 
-def info_of(telemetry: EscTelemetry) -> InfoData | None:
+def info_of(telemetry: EscStream) -> InfoData | None:
     return telemetry.info
 
 
 def stream(
-    telemetry: EscTelemetry,
+    telemetry: EscStream,
     begin: int,
     seconds: float,
     period: int = 10 * MS,
@@ -97,7 +97,7 @@ def stream(
     return now - period
 
 
-def value(source: Value, telemetry: EscTelemetry, now: int = 0) -> float:
+def value(source: Value, telemetry: EscStream, now: int = 0) -> float:
     """A value in its unit."""
     found, parts = steps(source, telemetry, GatewayStatus(), now), divisor(source, telemetry)
     assert found is not None
@@ -635,7 +635,7 @@ def test_what_is_shown_was_received_within_the_time_out_whatever_comes(
 def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_deadlines(
     seed: int,
 ) -> None:
-    """An EscTelemetry that is advanced at its deadlines only shows, at any time, what one advanced all the time shows."""
+    """An EscStream that is advanced at its deadlines only shows, at any time, what one advanced all the time shows."""
     seldom, often = esc(), esc()
     source = random.Random(seed)
     for piece, now in chunks_of(seed):

@@ -35,7 +35,7 @@ from kontronik_can_gw.desk.recordings.tables.rows import Choice, Row, thinned
 from kontronik_can_gw.desk.recordings.tables.writers import open_table
 from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import Layout
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscStream
 from kontronik_can_gw.gateway_status import GatewayStatus
 
 Cells = list[dict[str, Any]]
@@ -402,7 +402,7 @@ def test_names_of_a_value_that_a_message_has_twice_are_those_of_its_signals() ->
 
 
 def test_the_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None:
-    escs = [EscTelemetry(EscSettings(name), 0) for name in ("a", "b")]
+    escs = [EscStream(EscSettings(name), 0) for name in ("a", "b")]
     fields = fields_of_values([esc.settings for esc in escs])
     ages = [index for index, one in enumerate(fields) if one.source == "data_age"]
     maker = RowMaker(

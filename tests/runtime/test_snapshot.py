@@ -54,7 +54,7 @@ def test_pole_pairs_that_come_over_the_bus_hold_from_the_next_document_on() -> N
     bench.run(6)
     before = bench.document()["escs"][0]["values"]
     esc = bench.gateway.escs[0]
-    esc.apply(replace(esc.settings, pole_pairs=14, gear=Fraction(1)))
+    bench.gateway.core.apply(0, replace(esc.settings, pole_pairs=14, gear=Fraction(1)))
     after = bench.document()["escs"][0]["values"]
     assert after["motor_speed"] == pytest.approx(before["motor_speed"] / 2, abs=1e-5)
     assert after["output_speed"] == after["motor_speed"] > 0

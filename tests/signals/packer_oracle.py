@@ -19,7 +19,7 @@ from esc import sheet
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscStream, EscTelemetry
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 
 # --- bits, counted one by one -------------------------------------------------------------------------------------------
@@ -658,9 +658,9 @@ def random_info(rng: random.Random) -> InfoData:
 
 def random_escs(
     rng: random.Random, settings: Sequence[EscSettings], now: int
-) -> tuple[list[EscTelemetry], int]:
+) -> tuple[list[EscStream], int]:
     """ESCs that were fed random frames: some up, some stale, some with info, some never seen. And the time after that."""
-    escs = [EscTelemetry(each, now) for each in settings]
+    escs = [EscStream(each, now) for each in settings]
     for _ in range(rng.randint(0, 3)):
         for esc in escs:
             layout = rng.choice((Layout.V4, Layout.LEGACY))

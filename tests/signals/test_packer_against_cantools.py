@@ -4,6 +4,7 @@ import math
 import os
 import random
 import struct
+from collections.abc import Sequence
 from fractions import Fraction
 from functools import cache
 from typing import Any
@@ -53,7 +54,7 @@ def compiled(
     return {plan.name: plan for plan in layout.messages}
 
 
-State = tuple[list[EscTelemetry], GatewayStatus, int]
+State = tuple[Sequence[EscTelemetry], GatewayStatus, int]
 
 
 def check_frame(

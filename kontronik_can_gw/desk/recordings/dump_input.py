@@ -16,7 +16,7 @@ from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.decoder import Reading
-from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import SECOND, EscStream, Event
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
 LIVE_RATE = 100.0
@@ -58,7 +58,7 @@ class DumpInput(Input):
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         """A gateway runs from the first frame on; it knows no more than the telemetry."""
-        esc = EscTelemetry(self.setup.escs[0], 0)
+        esc = EscStream(self.setup.escs[0], 0)
         status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
         columns = sections(self.fields, self._chosen(chosen), self.bus.escs)
         maker = RowMaker(columns, [esc], status, 0)
@@ -78,7 +78,7 @@ class DumpInput(Input):
 
     def chunks(self) -> Iterator[tuple[int, bytes]]:
         """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period after it."""
-        for time_ns, data, _ in self._found(EscTelemetry(self.setup.escs[0], 0)):
+        for time_ns, data, _ in self._found(EscStream(self.setup.escs[0], 0)):
             if data:
                 yield time_ns, data
 
@@ -97,7 +97,7 @@ class DumpInput(Input):
     def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
         return None
 
-    def _found(self, esc: EscTelemetry) -> Iterator[tuple[int, bytes, Reading | None]]:
+    def _found(self, esc: EscStream) -> Iterator[tuple[int, bytes, Reading | None]]:
         """Bytes up to the end of a frame, its time, and the frame; without a frame at the time of the one before.
 
         The decoder of ``esc`` finds them. It is given the bytes up to the next header with each, so that its counters are of that time.

@@ -2,7 +2,7 @@
 
 from kontronik_can_gw.esc.decoder import EscProtocol, Field, State
 from kontronik_can_gw.esc.kontronik.deframer import Deframer
-from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, body_format, rows
 from kontronik_can_gw.esc.kontronik.states import (
     KIND_OF_STATE,
     PHASE_OF_STATE,
@@ -68,6 +68,7 @@ KONTRONIK = EscProtocol(
     errors={"operating_errors": tuple(OperatingError), "selftest_errors": tuple(SelfTestError)},
     states=_STATES,
     devices=_DEVICES,
+    wire=((body_format(LiveData), LiveData), (body_format(InfoData), InfoData)),
     peak_current_of={
         int(device): whose for device in Device if (whose := peak_current_of(device)) is not None
     },

@@ -1,0 +1,261 @@
+"""The core in C by ctypes, call by call: a plain shared object, no Python headers, no callbacks."""
+
+import ctypes as c
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.native.compile import source_number
+from kontronik_can_gw.native.tables import (
+    COUNTS,
+    GATEWAY,
+    Message,
+    NotInCore,
+    Pair,
+    Piece,
+    Settings,
+    Signal,
+    Tables,
+    settings_of,
+)
+
+HELD, BODY, LONGEST = 43, 33, 44
+_MAX_FRAMES = 256
+_ALL_EVENTS = 15
+_AGAIN = 1 << 30
+_END_OF_TIME = 1 << 61
+"""ns: sums of times stay within int64."""
+_u8, _u16, _u32, _u64, _i64, _i32, _p = (
+    *(c.c_uint8, c.c_uint16, c.c_uint32, c.c_uint64, c.c_int64, c.c_int32, c.c_void_p),
+)
+
+
+class Frame(c.Structure):
+    """kcg_frame of a core with 64 data bytes: struct canfd_frame."""
+
+    _fields_ = (
+        ("id", _u32),
+        ("length", _u8),
+        ("flags", _u8),
+        ("page", _u8),
+        ("reserved", _u8),
+        ("data", _u8 * 64),
+    )
+
+
+class Plan(c.Structure):
+    """kcg_plan."""
+
+    _fields_ = (
+        *((name, _p) for name in ("message", "signal", "piece", "pair", "constant")),
+        *((name, _p) for name in ("esc_of", "listener", "first_listener")),
+        ("words", _u32),
+        *((name, _u16) for name in ("messages", "escs", "pages")),
+    )
+
+
+class Arrival(c.Structure):
+    _fields_ = (("end", _u64), ("bound", _i64))
+
+
+class Esc(c.Structure):
+    """kcg_esc: the state of an ESC."""
+
+    _fields_ = (
+        ("settings", Settings),
+        ("count", _u64 * (len(COUNTS) - 3)),
+        ("window", _u64 * 4),
+        ("before", _u64 * 4),
+        *((name, _u64) for name in ("base", "blame_until", "energy")),
+        *((name, _i64) for name in ("energy_rest", "run_time", "power", "live_ns", "live_bound")),
+        *((name, _i64) for name in ("info_ns", "info_bound", "last_info_ns", "window_ns")),
+        ("interval", _i64),
+        ("arrival", Arrival * (HELD + 1)),
+        ("rate", _i32),
+        ("generation", _u32),
+        ("live", _u8 * BODY),
+        ("info", _u8 * BODY),
+        ("held", _u8 * (HELD + LONGEST)),
+        *((name, _u8) for name in ("has_live", "has_info", "had_live", "had_info", "has_time")),
+        *((name, _u8) for name in ("turns", "cells", "held_count", "need", "arrivals")),
+        *((name, _u8) for name in ("blame", "reported")),
+    )
+
+
+_FRAME_SIZE = c.sizeof(Frame)
+_head = struct.Struct("=IBBB").unpack_from
+_new = tuple.__new__
+_FUNCTIONS: dict[str, tuple[Any, ...]] = {
+    "kcg_sizes": (_u32, _u32),
+    "kcg_wire": (c.c_char_p,),
+    "kcg_size": (c.c_size_t, _p),
+    "kcg_init": (_p, _p, _p, _p, _i64),
+    "kcg_receive": (c.c_int, _p, c.c_int, c.c_char_p, c.c_size_t, _i64, _i64),
+    "kcg_expire": (c.c_int, _p, _i64),
+    "kcg_advance": (c.c_int, _p, _i64),
+    "kcg_port": (c.c_int, _p, c.c_int, c.c_int, _i64),
+    "kcg_next_event": (c.c_int, _p),
+    "kcg_next_deadline": (_i64, _p),
+    "kcg_apply": (None, _p, c.c_int, _p),
+    "kcg_gateway_changed": (None, _p, c.c_int, _i64),
+    "kcg_repeat": (None, _p, _i64),
+    "kcg_stop": (None, _p, _i64),
+    "kcg_take": (_u32, _p, _i64, _p, _u32),
+    "kcg_sent": (None, _p, _i64, _u32),
+    "kcg_escs": (_p, _p),
+    "kcg_gateway": (_p, _p),
+    "kcg_set_mask": (None, _p, _u32),
+    "kcg_pending": (_u32, _p),
+}
+
+
+class WrongObject(RuntimeError):
+    """A shared object that is not of this version, or not for this machine: the message says which."""
+
+
+def load(path: Path) -> Any:
+    """The shared object with its functions declared. WrongObject where it cannot be used."""
+    try:
+        library = c.CDLL(str(path))
+        for name, (result, *arguments) in _FUNCTIONS.items():
+            function = getattr(library, name)
+            function.restype, function.argtypes = result, arguments
+    except (OSError, AttributeError) as error:
+        raise WrongObject(f"{path.name}: {error}") from None
+    mine = (source_number(), *map(c.sizeof, (Signal, Message, Settings, Plan, Esc, Frame)))
+    its = tuple(library.kcg_sizes(number) for number in range(len(mine)))
+    if its != mine:
+        raise WrongObject(f"{path.name}: made of other sources than these")
+    return library
+
+
+class Handle:
+    """A core at work. ``on_event``: ESC, events, time; called between two readings, as the core in Python does."""
+
+    def __init__(
+        self,
+        library: Any,
+        tables: Tables,
+        now: int,
+        on_event: Callable[[int, int, int], None],
+    ) -> None:
+        if tables.wire not in ("", library.kcg_wire().decode()):
+            raise NotInCore(f"fields on the wire: {tables.wire}")
+        self._library = library
+        self._on_event = on_event
+        self._kept = [
+            self._array(Message, tables.messages),
+            self._array(Signal, tables.signals),
+            self._array(Piece, tables.pieces),
+            self._array(Pair, tables.pairs),
+            self._array(_u64, tables.constants),
+            self._array(_u16, tables.esc_of),
+            self._array(_u16, tables.listeners),
+            self._array(_u16, tables.first_listeners),
+        ]
+        counts = (len(tables.constants), len(tables.messages), len(tables.settings), tables.pages)
+        self._plan = Plan(*(c.addressof(table) for table in self._kept), *counts)
+        size = library.kcg_size(c.byref(self._plan))
+        self._memory = (_u64 * (size // 8 + 1))()
+        settings = self._array(Settings, tables.settings)
+        self._core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
+        self.report_only(_ALL_EVENTS)
+        begin = c.addressof(self._memory)
+        at = library.kcg_escs(self._core) - begin, library.kcg_gateway(self._core) - begin
+        self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, at[0])
+        self.gateway = (_i64 * len(GATEWAY)).from_buffer(self._memory, at[1])
+        self._frames = (Frame * _MAX_FRAMES)()
+        self._raw = memoryview(self._frames).cast("B")
+
+    @staticmethod
+    def _array(kind: Any, rows: Sequence[Any]) -> Any:
+        return (kind * max(1, len(rows)))(*rows)
+
+    def _follow(self, found: int, now: int) -> None:
+        while found >= 0:
+            self._on_event(found >> 8, found & 0xFF, now)
+            found = self._library.kcg_next_event(self._core)
+
+    def report_only(self, events: int) -> None:
+        """As Core.report_only."""
+        self._library.kcg_set_mask(self._core, events)
+
+    def _check(self, esc: int, now: int) -> None:
+        """What a damaged capture may hold never reaches the core."""
+        if not 0 <= esc < len(self.escs):
+            raise IndexError(f"ESC {esc}")
+        if not 0 <= now < _END_OF_TIME:
+            raise OverflowError(f"time {now}")
+
+    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
+        """As Core.receive."""
+        self._check(esc, now)
+        receive, core, size = self._library.kcg_receive, self._core, len(data)
+        while (found := receive(core, esc, data, size, now, since)) >= _AGAIN:
+            self._follow(found & ~_AGAIN, now)
+        self._follow(found, now)
+
+    def port(self, esc: int, is_open: bool, now: int) -> None:
+        """As Core.port."""
+        self._check(esc, now)
+        self._follow(self._library.kcg_port(self._core, esc, is_open, now), now)
+
+    def expire(self, now: int) -> None:
+        """As Core.expire."""
+        self._check(0, now)
+        self._follow(self._library.kcg_expire(self._core, now), now)
+
+    def advance(self, now: int) -> None:
+        """As Core.advance."""
+        self._check(0, now)
+        self._follow(self._library.kcg_advance(self._core, now), now)
+
+    def next_deadline(self) -> int:
+        """As Core.next_deadline."""
+        found: int = self._library.kcg_next_deadline(self._core)
+        return found
+
+    def apply(self, esc: int, settings: EscSettings) -> None:
+        """As Core.apply. NotInCore where its gear is out of range."""
+        self._library.kcg_apply(self._core, esc, c.byref(settings_of(settings)))
+
+    def gateway_changed(self, now: int) -> None:
+        """As Core.gateway_changed."""
+        self._library.kcg_gateway_changed(self._core, 0, now)
+
+    def repeat(self, now: int) -> None:
+        """As Core.repeat."""
+        self._check(0, now)
+        self._library.kcg_repeat(self._core, now)
+
+    def stop(self, now: int) -> None:
+        """As Core.stop."""
+        self._library.kcg_stop(self._core, now)
+
+    @property
+    def is_pending(self) -> bool:
+        """As Core.is_pending."""
+        return bool(self._library.kcg_pending(self._core))
+
+    def take(self, now: int) -> list[CanFrame]:
+        """As Core.take."""
+        frames: list[CanFrame] = []
+        library, core, raw = self._library, self._core, self._raw
+        while count := library.kcg_take(core, now, self._frames, _MAX_FRAMES):
+            for at in range(0, count * _FRAME_SIZE, _FRAME_SIZE):
+                number, length, flags, page = _head(raw, at)
+                begin = at + 8
+                frames.append(
+                    _new(
+                        CanFrame,
+                        (
+                            *(number & ~EXTENDED, bytes(raw[begin : begin + length])),
+                            *(number >= EXTENDED, flags != 0, page, False, False),
+                        ),
+                    )
+                )
+            library.kcg_sent(core, now, count)
+        return frames

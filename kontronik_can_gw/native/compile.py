@@ -1,0 +1,55 @@
+"""Compiles the core in C. At the installation hatch_build.py calls it; it imports nothing that is not in the standard library."""
+
+import platform
+import shutil
+import subprocess
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+SOURCES = (FOLDER / "core.h", FOLDER / "core.c")
+FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_FOUND=512")
+"""With CAN FD and floats, for reads of 16 KiB."""
+
+
+def shared_object() -> Path:
+    """Where the one for this machine is, or would be."""
+    return FOLDER / f"core-{platform.machine()}.so"
+
+
+def source_number() -> int:
+    """A number of the sources, which an object made of them carries."""
+    found = 0
+    for source in SOURCES:
+        found = zlib.crc32(source.read_bytes(), found)
+    return found & 0x7FFF_FFFF
+
+
+def compiler() -> str | None:
+    """The machine's C compiler."""
+    return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+
+
+def compile_core(target: Path, options: Sequence[str] = ("-O2", *FOR_LINUX)) -> str | None:
+    """Make the shared object; None, or why it could not be made, in one line."""
+    program = compiler()
+    if program is None:
+        return "no C compiler"
+    number = f"-DKCG_SOURCE={source_number()}"
+    command = [
+        program,
+        "-std=c99",
+        "-fwrapv",
+        "-fPIC",
+        "-shared",
+        number,
+        *options,
+        "-o",
+        str(target),
+        str(SOURCES[1]),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        return f"{program}: {next(iter(done.stderr.strip().splitlines()), 'failed')}"
+    return None

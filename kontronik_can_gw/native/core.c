@@ -1,0 +1,1091 @@
+#include "core.h"
+
+#include <string.h>
+
+#ifndef KCG_SLICES
+#define KCG_SLICES 8 /* tables of the CRC-32: 8 kB for 8, 1 kB for 1, 64 bytes for 0 */
+#endif
+#define SECOND INT64_C(1000000000)
+#define BYTE_NS (11 * SECOND / 115200)
+#define INFO_TIMEOUT (10 * SECOND)
+#define MIN_DISTANCE INT64_C(1000000)
+#define LONG_AGO (-(INT64_C(1) << 61))
+enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
+enum { VOLTAGE_AT = 4, CURRENT_AT = 6, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
+
+/* --- CRC-32 ---------------------------------------------------------------------------------------------------------- */
+
+static uint32_t u32(const uint8_t *p)
+{
+    return p[0] | (uint32_t)p[1] << 8 | (uint32_t)p[2] << 16 | (uint32_t)p[3] << 24;
+}
+
+#if KCG_SLICES
+static uint32_t crc_table[KCG_SLICES][256];
+
+static void crc_init(void)
+{
+    for (uint32_t i = 0; i < 256; i++) {
+        uint32_t c = i;
+        for (int k = 0; k < 8; k++)
+            c = c & 1 ? c >> 1 ^ 0xEDB88320u : c >> 1;
+        crc_table[0][i] = c;
+    }
+    for (int k = 1; k < KCG_SLICES; k++)
+        for (int i = 0; i < 256; i++)
+            crc_table[k][i] = crc_table[k - 1][i] >> 8 ^ crc_table[0][crc_table[k - 1][i] & 255];
+}
+#else
+static const uint32_t nibble[16] = {0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4, 0x4db26158, 0x5005713c,
+                                    0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c, 0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c};
+static void crc_init(void) {}
+#endif
+
+uint32_t kcg_crc32(uint32_t crc, const uint8_t *p, size_t n)
+{
+    uint32_t c = ~crc;
+#if KCG_SLICES == 8
+    for (; n >= 8; p += 8, n -= 8) {
+        uint32_t a = c ^ u32(p), b = u32(p + 4);
+        c = crc_table[7][a & 255] ^ crc_table[6][a >> 8 & 255] ^ crc_table[5][a >> 16 & 255] ^ crc_table[4][a >> 24] ^
+            crc_table[3][b & 255] ^ crc_table[2][b >> 8 & 255] ^ crc_table[1][b >> 16 & 255] ^ crc_table[0][b >> 24];
+    }
+#endif
+    for (; n; p++, n--)
+#if KCG_SLICES
+        c = c >> 8 ^ crc_table[0][(c ^ *p) & 255];
+#else
+        c ^= *p, c = c >> 4 ^ nibble[c & 15], c = c >> 4 ^ nibble[c & 15];
+#endif
+    return ~c;
+}
+
+/* --- bytes to UART frames (twin: deframer.py) ------------------------------------------------------------------------ */
+
+static const struct { uint8_t length, covered; } forms[2][2] = {{{38, 32}, {40, 36}}, {{41, 36}, {44, 40}}}; /* [is info][V4] */
+
+static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reason)
+{
+    if (from >= to)
+        return;
+    for (size_t i = from; i < to; i++) {
+        uint8_t run = (uint8_t)(0x100 - b[i]); /* 0, FF, FE, FC ... 80: long runs of equal bits */
+        e->count[KCG_N_LONG_RUN] += !(run & (run - 1));
+    }
+    uint64_t begin = e->base + from, size = to - from, blamed = e->blame_until > begin ? e->blame_until - begin : 0;
+    if (blamed > size)
+        blamed = size;
+    e->count[e->blame] += blamed;
+    e->count[reason] += size - blamed;
+}
+
+static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int reason)
+{
+    e->blame = (uint8_t)reason;
+    if (e->blame_until < e->base + at + length)
+        e->blame_until = e->base + at + length;
+    drop(e, b, at, at + 4, KCG_N_NOISE);
+}
+
+static int accept_next(kcg *g);
+
+/* A frame was found; where no further one can be kept, those found are taken first. */
+static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, uint64_t end)
+{
+    if (!g) { /* of a flush: too late for use */
+        e->count[KCG_N_LATE]++;
+        return;
+    }
+    if (g->found_count == KCG_FOUND) {
+        while (g->found_at < g->found_count)
+            accept_next(g);
+        g->found_count = g->found_at = 0;
+    }
+    kcg_found *f = &g->found[g->found_count++];
+    f->end = end, f->is_info = (uint8_t)is_info, f->layout = v4 ? 1 : 2;
+    memcpy(f->body, body, is_info ? KCG_BODY : 30);
+}
+
+/* The next K that may begin a header: KO, KOD as far as there are bytes; `size` where there is none. */
+static size_t header_at(const uint8_t *b, size_t from, size_t size)
+{
+    while (from < size) {
+        const uint8_t *p = memchr(b + from, 'K', size - from);
+        if (!p)
+            return size;
+        size_t at = (size_t)(p - b), left = size - at;
+        if ((left < 2 || p[1] == 'O') && (left < 3 || p[2] == 'D'))
+            return at;
+        from = at + 1;
+    }
+    return size;
+}
+
+/* Frames in b[0..size); e->base is the stream position of b[0]. Returns how many bytes are decided; e->need: how many are missing. */
+static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
+{
+    size_t at = 0;
+    e->need = 1;
+    while (at < size) {
+        size_t start = header_at(b, at, size);
+        if (ended && size - start < 3)
+            start = size;
+        drop(e, b, at, start, KCG_N_NOISE);
+        at = start;
+        size_t have = size - at;
+        if (have < 4) {
+            if (ended && have)
+                drop(e, b, at, size, KCG_N_INCOMPLETE), at = size;
+            break;
+        }
+        const uint8_t *f = b + at;
+        if (f[3] != 'L' && f[3] != 'I') {
+            e->count[KCG_N_UNKNOWN_KINDS]++;
+            drop(e, b, at, at + 3, KCG_N_UNKNOWN_KIND);
+            at += 3;
+            continue;
+        }
+        int is_info = f[3] == 'I', v4 = !KCG_LEGACY;
+        uint32_t crc = 0;
+        size_t missing = 0, covered = 0;
+        for (; v4 < 2; v4++) {
+            size_t n = forms[is_info][v4].length;
+            if (have < n) {
+                missing = n - have;
+                break;
+            }
+            crc = kcg_crc32(crc, f + covered, forms[is_info][v4].covered - covered);
+            covered = forms[is_info][v4].covered;
+            if (crc == u32(f + n - 4))
+                break;
+        }
+        if (v4 == 2) {
+            e->count[KCG_N_HEADERS]++, e->count[KCG_N_CRC_ERRORS]++;
+            reject(e, b, at, forms[is_info][1].length, KCG_N_BAD_CRC);
+            at += 4;
+        } else if (!missing) {
+            e->count[KCG_N_HEADERS]++;
+            e->count[(is_info ? KCG_N_INFO_V4 : KCG_N_LIVE_V4) + !v4]++;
+            at += forms[is_info][v4].length;
+            e->blame_until = 0;
+            found(g, e, is_info, v4, f + 4, e->base + at);
+        } else if (ended) {
+            e->count[KCG_N_HEADERS]++;
+            reject(e, b, at, have, KCG_N_INCOMPLETE);
+            at += 4;
+        } else {
+            e->need = (uint8_t)missing;
+            break;
+        }
+    }
+    e->base += at;
+    return at;
+}
+
+static void hold(kcg_esc *e, const uint8_t *data, size_t size)
+{
+    memmove(e->held, data, size);
+    e->held_count = (uint8_t)size;
+}
+
+static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
+{
+    e->count[KCG_N_BYTES] += size;
+    if (!size)
+        return;
+    if (e->held_count) {
+        size_t old = e->held_count, more = size < KCG_LONGEST ? size : KCG_LONGEST; /* so many decide whatever is held */
+        memcpy(e->held + old, data, more);
+        if (size < e->need) {
+            e->held_count = (uint8_t)(old + size), e->need = (uint8_t)(e->need - size);
+            return;
+        }
+        size_t at = scan(g, e, e->held, old + more, 0);
+        if (size == more) {
+            hold(e, e->held + at, old + more - at);
+            return;
+        }
+        /* what is left begins in `data` again: 43 bytes are held at most */
+        data += at - old, size -= at - old;
+        e->held_count = 0;
+    }
+    size_t at = scan(g, e, data, size, 0);
+    hold(e, data + at, size - at);
+}
+
+static void flush(kcg_esc *e)
+{
+    scan(NULL, e, e->held, e->held_count, 1);
+    e->held_count = 0;
+    e->need = 1;
+    e->blame_until = e->base;
+    e->arrivals = 0;
+}
+
+/* --- the state of an ESC (twin: telemetry.py) ------------------------------------------------------------------------ */
+
+static int64_t wire(const uint8_t *p, int type)
+{
+    switch (type) {
+    case KCG_U8: return p[0];
+    case KCG_I8: return (int8_t)p[0];
+    case KCG_U16: return (uint16_t)(p[0] | p[1] << 8);
+    case KCG_I16: return (int16_t)(p[0] | p[1] << 8);
+    default: return u32(p);
+    }
+}
+
+uint64_t kcg_count(const kcg_esc *e, int what)
+{
+    const uint64_t *n = e->count;
+    switch (what) {
+    case KCG_N_LIVE: return n[KCG_N_LIVE_V4] + n[KCG_N_LIVE_LEGACY];
+    case KCG_N_INFO: return n[KCG_N_INFO_V4] + n[KCG_N_INFO_LEGACY];
+    case KCG_N_DROPPED: return n[KCG_N_NOISE] + n[KCG_N_BAD_CRC] + n[KCG_N_UNKNOWN_KIND] + n[KCG_N_INCOMPLETE];
+    default: return n[what];
+    }
+}
+
+static void note_window(const kcg_esc *e, uint64_t *w)
+{
+    w[0] = kcg_count(e, KCG_N_LIVE), w[1] = kcg_count(e, KCG_N_DROPPED), w[2] = e->count[KCG_N_BYTES], w[3] = e->count[KCG_N_CRC_ERRORS];
+}
+
+static int set_link(kcg_esc *e, int state)
+{
+    if (e->count[KCG_N_LINK] == (uint64_t)state)
+        return 0;
+    e->count[KCG_N_LINK] = (uint64_t)state;
+    return KCG_LINK;
+}
+
+static void forget_device(kcg_esc *e)
+{
+    e->has_info = 0;
+    e->generation++;
+    e->cells = e->settings.cells;
+}
+
+static int lose(kcg_esc *e, int state)
+{
+    int events = set_link(e, state);
+    if (e->has_live)
+        e->has_live = 0, e->generation++, events |= KCG_LIVE;
+    if (e->has_info)
+        forget_device(e), events |= KCG_INFO;
+    e->rate = 0;
+    return events;
+}
+
+static int expire_esc(kcg_esc *e, int64_t now)
+{
+    int events = 0;
+    if (e->has_live && now - e->live_bound > e->settings.timeout) {
+        e->count[KCG_N_LOSSES]++;
+        events = lose(e, KCG_LOST);
+    }
+    if (e->has_info && now - e->info_bound > INFO_TIMEOUT) {
+        forget_device(e);
+        events |= KCG_INFO;
+    }
+    return events;
+}
+
+static int close_window(kcg_esc *e, int64_t now)
+{
+    uint64_t new[4], *old = e->window;
+    note_window(e, new);
+    int64_t length = now - e->window_ns, frames = (int64_t)(new[0] - old[0]), tenths = frames * 10 * SECOND;
+    int64_t q = tenths / length, r = tenths % length;
+    e->rate = e->has_live ? (int32_t)(q + (2 * r > length || (2 * r == length && q & 1))) : 0;
+    e->interval = e->has_live && frames ? length / frames : 0;
+    int bad = new[3] - old[3] >= e->settings.crc_errors || (new[1] - old[1]) * 10 > new[2] - old[2];
+    e->window_ns = now;
+    memcpy(e->before, old, sizeof e->before);
+    memcpy(e->window, new, sizeof new);
+    return KCG_SECOND | (e->has_live ? set_link(e, bad ? KCG_DEGRADED : KCG_OK) : 0);
+}
+
+static int accept_info(kcg_esc *e, const uint8_t *body, int64_t when, int64_t bound)
+{
+    int events = KCG_INFO | (e->has_info && memcmp(body, e->info, 2) ? KCG_LINK : 0);
+    e->generation++;
+    memcpy(e->info, body, KCG_BODY);
+    e->has_info = e->had_info = 1;
+    e->last_info_ns = when, e->info_bound = bound;
+    e->cells = e->settings.cells ? e->settings.cells : body[CELLS_AT];
+    return events;
+}
+
+/* A reading of which the last byte came at `when`, at `bound` at the earliest. */
+static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
+{
+    int events = 0;
+    if (e->count[KCG_N_LAYOUT] != f->layout) {
+        e->count[KCG_N_LAYOUT] = f->layout;
+        forget_device(e);
+        e->had_live = e->had_info = 0;
+        events = KCG_INFO | KCG_LINK;
+    }
+    if (f->is_info)
+        return events | accept_info(e, f->body, when, bound);
+    e->count[KCG_N_SUSPECT] += f->layout == 2 && f->body[STATE_AT] > LARGEST_STATE;
+    if (e->has_time) {
+        if (when < e->live_ns)
+            when = e->live_ns;
+        if (bound < e->live_bound)
+            bound = e->live_bound;
+        if (e->has_live) {
+            int64_t dt = when - e->live_ns;
+            if (e->power > 0) { /* 2^31 mW at most: seconds and the rest by themselves */
+                int64_t rest = e->energy_rest + e->power * (dt % SECOND);
+                e->energy += (uint64_t)(e->power * (dt / SECOND) + rest / SECOND);
+                e->energy_rest = rest % SECOND;
+            }
+            if (e->turns)
+                e->run_time += dt;
+        }
+    }
+    e->generation++;
+    memcpy(e->live, f->body, 30);
+    e->power = wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16);
+    e->turns = u32(f->body) != 0;
+    e->has_live = e->had_live = e->has_time = 1;
+    e->live_ns = when, e->live_bound = bound;
+    if (e->count[KCG_N_LINK] != KCG_OK && e->count[KCG_N_LINK] != KCG_DEGRADED) {
+        events |= set_link(e, KCG_OK);
+        e->rate = -1;
+        e->interval = 0;
+        e->window_ns = when;
+        note_window(e, e->window);
+        memcpy(e->before, e->window, sizeof e->before);
+    }
+    return events | KCG_LIVE;
+}
+
+static int64_t esc_deadline(const kcg_esc *e)
+{
+    int64_t due = e->window_ns + SECOND;
+    if (e->has_live && e->live_bound + e->settings.timeout + 1 < due)
+        due = e->live_bound + e->settings.timeout + 1;
+    if (e->has_info && e->info_bound + INFO_TIMEOUT + 1 < due)
+        due = e->info_bound + INFO_TIMEOUT + 1;
+    return due;
+}
+
+/* --- values to bits (twin: packer.py, values.py) --------------------------------------------------------------------- */
+
+static int64_t floor_div(int64_t a, int64_t b)
+{
+    return a / b - (a % b < 0);
+}
+
+static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
+{
+    return (e->has_info || x) && !(e->had_info && not_on >> (e->info[1] >> 2) & 1);
+}
+
+/* The steps of a value; 0 where it is not available. */
+static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
+{
+    switch (s->kind) {
+    case KCG_OF_LIVE:
+        if (!e->has_live)
+            return 0;
+        *x = wire(e->live + s->place, s->wire);
+        break;
+    case KCG_OF_INFO:
+    case KCG_OF_LAST:
+        if (!(s->kind == KCG_OF_LAST ? e->had_info : e->has_info))
+            return 0;
+        *x = wire(e->info + s->place, s->wire);
+        break;
+    case KCG_OF_POWER:
+        *x = e->power;
+        return e->has_live;
+    case KCG_OF_COUNT: *x = (int64_t)kcg_count(e, s->place); return 1;
+    case KCG_OF_ENERGY: *x = (int64_t)e->energy; return 1;
+    case KCG_OF_RUN_TIME: *x = e->run_time; return 1;
+    case KCG_OF_AGE:
+        *x = now > e->live_ns ? (now - e->live_ns) / 1000000 : 0;
+        return e->has_time;
+    case KCG_OF_RATE:
+        *x = e->rate;
+        return e->rate >= 0;
+    case KCG_OF_GATEWAY: *x = g->gateway[s->place]; return 1;
+    default: *x = (now - g->gateway[KCG_STARTED]) / 1000000; return 1;
+    }
+    if (s->mask)
+        *x = *x >> s->shift & s->mask;
+    return !s->not_on || supplied(e, s->not_on, *x);
+}
+
+#if KCG_FLOATS
+static uint64_t float_bits(const kcg_signal *s, double v)
+{
+    double low, high;
+    uint64_t bits = 0;
+    memcpy(&low, &s->low, sizeof low);
+    memcpy(&high, &s->high, sizeof high);
+    if (!(low <= v && v <= high))
+        return s->error;
+    if (s->length == 32) {
+        float f = (float)v;
+        uint32_t word;
+        memcpy(&word, &f, sizeof word);
+        if ((word & 0x7F800000u) == 0x7F800000u && v - v == 0.0)
+            return s->error; /* finite, but too large for 32 bits */
+        bits = word;
+    } else {
+        memcpy(&bits, &v, sizeof bits);
+    }
+    return bits == s->not_available ? s->error : bits;
+}
+#endif
+
+static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive)
+{
+    const kcg_esc *e = s->esc == 255 ? NULL : &g->esc[s->esc];
+    int64_t x, v, by = 1, over = 1;
+    if (s->kind == KCG_OF_ALIVE)
+        return (uint64_t)(alive % s->div);
+    if (!steps(g, s, e, now, &x))
+        return s->not_available;
+    if (s->divisor == KCG_BY_CELLS) {
+        if (!e->cells)
+            return s->not_available;
+        by = e->cells;
+    } else if (s->divisor == KCG_BY_POLES) {
+        by = e->settings.poles;
+    } else if (s->divisor == KCG_BY_OUTPUT) {
+        by = (int64_t)e->settings.poles * e->settings.gear_numerator, over = e->settings.gear_denominator;
+    }
+    if (s->flags & KCG_TABLE) {
+        const kcg_pair *p = g->plan->pair + s->first_pair, *end = p + s->pairs;
+        while (p < end && p->number != x)
+            p++;
+        if (p == end)
+            return s->error;
+#if KCG_FLOATS
+        if (s->flags & KCG_REAL)
+            return float_bits(s, (double)(int64_t)p->raw);
+#endif
+        return p->raw;
+    }
+#if KCG_FLOATS
+    if (s->flags & KCG_REAL) {
+        double offset;
+        memcpy(&offset, &s->add, sizeof offset);
+        double q = (double)(x * s->mul * over) / (double)(s->div * by);
+        return float_bits(s, s->flags & KCG_PLAIN ? q : q + offset);
+    }
+#endif
+    if (s->flags & KCG_PLAIN)
+        v = x;
+    else if (x > s->most)
+        return s->error;
+    else
+        v = floor_div(x * s->mul * over + s->add * by, s->div * by);
+    if (s->flags & KCG_ROLLS)
+        return (uint64_t)v % ((uint64_t)s->high + 1);
+    if (v > s->high || v < s->low || (s->flags & KCG_CODE_AMID && (uint64_t)v == s->not_available))
+        return s->error;
+    return (uint64_t)v;
+}
+
+static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int alive, uint64_t *bits)
+{
+    const kcg_plan *plan = g->plan;
+    const kcg_signal *s = plan->signal + m->first_signal, *end = s + m->signals;
+    memcpy(bits, plan->constant + m->first_word + (size_t)place * m->words, m->words * sizeof *bits);
+    for (; s < end; s++) {
+        if (s->page != KCG_PAGES && s->page != place)
+            continue;
+        uint64_t raw = raw_of(g, s, now, alive);
+        const kcg_piece *p = plan->piece + s->first_piece;
+        for (int i = 0; i < s->pieces; i++, p++)
+            bits[p->at / 64] |= (raw >> p->shift & (~UINT64_C(0) >> (64 - p->width))) << p->at % 64;
+    }
+}
+
+/* --- when (twin: schedule.py) ---------------------------------------------------------------------------------------- */
+
+static int64_t due_of(const kcg *g, int i)
+{
+    const kcg_sending *s = &g->sending[i];
+    return s->cycle_due < s->deferred ? s->cycle_due : s->deferred;
+}
+
+static void put_in_heap(kcg *g, uint32_t place, uint16_t i)
+{
+    g->heap[place] = i;
+    g->sending[i].place_in_heap = (uint16_t)place;
+}
+
+/* Restore the order of the heap after a change of one message's deadline. */
+static void moved(kcg *g, uint16_t i)
+{
+    uint32_t at = g->sending[i].place_in_heap;
+    int64_t due = due_of(g, i);
+    while (at && due < due_of(g, g->heap[(at - 1) / 2])) {
+        put_in_heap(g, at, g->heap[(at - 1) / 2]);
+        at = (at - 1) / 2;
+    }
+    for (;;) {
+        uint32_t child = 2 * at + 1;
+        if (child >= g->heaped)
+            break;
+        if (child + 1 < g->heaped && due_of(g, g->heap[child + 1]) < due_of(g, g->heap[child]))
+            child++;
+        if (due_of(g, g->heap[child]) >= due)
+            break;
+        put_in_heap(g, at, g->heap[child]);
+        at = child;
+    }
+    put_in_heap(g, at, i);
+}
+
+static void defer(kcg *g, uint16_t i, int64_t until)
+{
+    if (g->sending[i].deferred == KCG_NEVER) {
+        g->sending[i].deferred = until;
+        moved(g, i);
+    }
+}
+
+static int may_go(const kcg *g, uint16_t i, int64_t now)
+{
+    return now >= g->sending[i].last + g->plan->message[i].delay;
+}
+
+/* --- messages (twin: messages.py) ------------------------------------------------------------------------------------ */
+
+static uint64_t all_pages(const kcg_message *m)
+{
+    return m->pages > 1 ? ~UINT64_C(0) >> (KCG_PAGES - m->pages) : 0;
+}
+
+static void turn_page(kcg_sending *s, const kcg_message *m)
+{
+    s->pages_to_send |= UINT64_C(1) << s->page;
+    s->page = (uint8_t)((s->page + 1) % m->pages);
+}
+
+/* The first page that is to follow, from the one on whose turn it is next. */
+static int next_place(kcg_sending *s, const kcg_message *m)
+{
+    if (m->pages <= 1)
+        return 0;
+    if (!s->pages_to_send)
+        turn_page(s, m);
+    int place = s->page;
+    while (!(s->pages_to_send >> place & 1))
+        place = (place + 1) % m->pages;
+    return place;
+}
+
+static void mark(kcg *g, uint16_t i, int64_t since, int why)
+{
+    kcg_sending *s = &g->sending[i];
+    if (!s->why) {
+        g->pending[g->pendings++] = i;
+        s->since = since;
+    } else if (since < s->since) {
+        s->since = since;
+    }
+    s->why = (uint8_t)(s->why | why);
+}
+
+/* False for a message that is sent on change and has not changed; of several pages those that have follow. */
+static int is_news(kcg *g, uint16_t i, int64_t now)
+{
+    const kcg_message *m = &g->plan->message[i];
+    uint64_t bits[WORDS], changed = 0;
+    if (m->flags & KCG_EVENT || !(m->flags & KCG_ON_CHANGE))
+        return 1;
+    for (int place = 0; place < m->pages; place++) {
+        pack(g, m, place, now, 0, bits);
+        if (!g->last_known[m->first_page + place] ||
+            memcmp(bits, g->last + m->first_word + (size_t)place * m->words, m->words * sizeof *bits))
+            changed |= UINT64_C(1) << place;
+    }
+    if (m->pages > 1)
+        g->sending[i].pages_to_send |= changed;
+    return changed || g->sending[i].pages_to_send;
+}
+
+/* Let a message be handed over as soon as its minimum distance allows. */
+static void request(kcg *g, uint16_t i, int64_t now)
+{
+    if (may_go(g, i, now)) {
+        if (!g->sending[i].why)
+            mark(g, i, now, REQUEST);
+    } else if (is_news(g, i, now)) {
+        defer(g, i, g->sending[i].last + g->plan->message[i].delay);
+    }
+}
+
+static void on_event(kcg *g, int esc, int events, int64_t now)
+{
+    const kcg_plan *plan = g->plan;
+    const kcg_esc *e = &g->esc[esc];
+    int gone = !e->has_live || (events & KCG_INFO && !e->has_info);
+    for (int k = plan->first_listener[esc]; k < plan->first_listener[esc + 1]; k++) {
+        uint16_t i = plan->listener[k];
+        const kcg_message *m = &plan->message[i];
+        int hit = m->triggers & events;
+        if (e->has_live && m->flags & KCG_EVENT && m->triggers & KCG_LIVE)
+            hit &= ~KCG_LINK; /* live frames set the pace */
+        if (!hit)
+            continue;
+        if (gone && m->flags & KCG_EVENT)
+            g->sending[i].pages_to_send |= all_pages(m);
+        if (g->sending[i].why)
+            continue;
+        if (m->flags & KCG_FREE)
+            mark(g, i, now, REQUEST);
+        else
+            request(g, i, now);
+    }
+}
+
+void kcg_gateway_changed(kcg *g, int each_second, int64_t now)
+{
+    for (uint16_t i = 0; i < g->plan->messages; i++) {
+        const kcg_message *m = &g->plan->message[i];
+        if (m->flags & KCG_OF_THE_GATEWAY && !(each_second && m->cycle))
+            request(g, i, now);
+    }
+}
+
+void kcg_repeat(kcg *g, int64_t now)
+{
+    for (uint16_t i = 0; i < g->plan->messages; i++) {
+        const kcg_message *m = &g->plan->message[i];
+        memset(g->last_known + m->first_page, 0, m->pages);
+        if (!m->cycle) {
+            g->sending[i].pages_to_send |= all_pages(m);
+            request(g, i, now);
+        }
+    }
+}
+
+void kcg_stop(kcg *g, int64_t now)
+{
+    g->stopping = 1;
+    for (uint16_t i = 0; i < g->plan->messages; i++) {
+        const kcg_message *m = &g->plan->message[i];
+        if (!(m->flags & KCG_OF_THE_GATEWAY))
+            continue;
+        if (m->flags & KCG_EVENT)
+            g->sending[i].pages_to_send |= all_pages(m);
+        mark(g, i, now, REQUEST);
+    }
+}
+
+static void advance_messages(kcg *g, int64_t now)
+{
+    while (g->heaped) {
+        uint16_t i = g->heap[0];
+        const kcg_message *m = &g->plan->message[i];
+        kcg_sending *s = &g->sending[i];
+        int64_t when = due_of(g, i);
+        if (when > now)
+            break;
+        if (s->cycle_due == when) {
+            s->cycle_due += m->cycle * ((now - when) / m->cycle + 1);
+            moved(g, i);
+            if (may_go(g, i, now)) {
+                mark(g, i, when, CYCLE);
+            } else {
+                defer(g, i, s->last + m->delay);
+                s->cycle_deferred = 1;
+            }
+        } else {
+            s->deferred = KCG_NEVER;
+            moved(g, i);
+            mark(g, i, when, s->cycle_deferred ? CYCLE | REQUEST : REQUEST);
+            s->cycle_deferred = 0;
+        }
+    }
+}
+
+static int is_silent(const kcg *g, const kcg_message *m)
+{
+    if (!(m->flags & KCG_SILENT))
+        return 0;
+    for (uint32_t k = 0; k < m->escs; k++)
+        if (g->esc[g->plan->esc_of[m->first_esc + k]].has_live)
+            return 0;
+    return 1;
+}
+
+static uint8_t e2e_crc(const kcg_frame *f, int at, int data_id) /* AUTOSAR E2E profile 1: CRC-8 SAE J1850, 0 at both ends */
+{
+    uint8_t c = 0;
+    for (int i = -2; i < f->length; i++) {
+        if (i == at)
+            continue;
+        c ^= (uint8_t)(i == -2 ? data_id : i == -1 ? data_id >> 8 : f->data[i]);
+        for (int k = 0; k < 8; k++)
+            c = (uint8_t)(c & 0x80 ? c << 1 ^ 0x1D : c << 1);
+    }
+    return c;
+}
+
+static void make_frame(kcg *g, uint16_t i, int64_t now, kcg_frame *f)
+{
+    const kcg_message *m = &g->plan->message[i];
+    kcg_sending *s = &g->sending[i];
+    uint64_t bits[WORDS];
+    if (s->why & CYCLE && m->pages > 1) {
+        s->why = REQUEST | TURNED; /* once, however often it is taken before it is sent */
+        turn_page(s, m);
+    }
+    int place = next_place(s, m);
+    pack(g, m, place, now, s->alive, bits);
+    memset(f, 0, sizeof *f);
+    f->page = (uint8_t)place;
+    f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
+    for (int k = 0; k < m->length; k++)
+        f->data[k] = (uint8_t)(bits[k / 8] >> k % 8 * 8);
+    if (m->flags & KCG_HAS_CRC)
+        f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
+}
+
+/* By the time since when they are pending, then by their index: as a rule they are in that order. */
+static void sort_pending(kcg *g)
+{
+    for (uint32_t k = 1; k < g->pendings; k++) {
+        uint16_t i = g->pending[k];
+        int64_t since = g->sending[i].since;
+        uint32_t at = k;
+        for (; at && (g->sending[g->pending[at - 1]].since > since || (g->sending[g->pending[at - 1]].since == since && g->pending[at - 1] > i)); at--)
+            g->pending[at] = g->pending[at - 1];
+        g->pending[at] = i;
+    }
+}
+
+uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
+{
+    uint32_t kept = 0, k = 0;
+    g->taken = 0;
+    sort_pending(g);
+    for (; k < g->pendings && g->taken < max; k++) {
+        uint16_t i = g->pending[k];
+        const kcg_message *m = &g->plan->message[i];
+        kcg_sending *s = &g->sending[i];
+        int why = s->why;
+        if (is_silent(g, m)) {
+            s->pages_to_send = 0;
+            s->why = 0;
+            continue;
+        }
+        int news = why & REQUEST && is_news(g, i, now);
+        if (!news && !(why & (CYCLE | TURNED))) {
+            s->why = 0;
+            continue;
+        }
+        make_frame(g, i, now, &frames[g->taken++]);
+        g->pending[kept++] = i;
+        if (g->stopping && s->pages_to_send & (s->pages_to_send - 1)) {
+            k++; /* its other pages go next */
+            break;
+        }
+    }
+    memmove(g->pending + kept, g->pending + k, (g->pendings - k) * sizeof *g->pending);
+    g->pendings -= k - kept;
+    return g->taken;
+}
+
+void kcg_sent(kcg *g, int64_t now, uint32_t count)
+{
+    uint32_t kept = 0;
+    for (uint32_t k = 0; k < count; k++) {
+        uint16_t i = g->pending[k];
+        const kcg_message *m = &g->plan->message[i];
+        kcg_sending *s = &g->sending[i];
+        int place = next_place(s, m);
+        if (m->flags & KCG_ON_CHANGE) {
+            pack(g, m, place, now, 0, g->last + m->first_word + (size_t)place * m->words);
+            g->last_known[m->first_page + place] = 1;
+        }
+        if (m->alive_modulus)
+            s->alive = (uint8_t)((s->alive + 1) % m->alive_modulus);
+        s->pages_to_send &= ~(UINT64_C(1) << place);
+        s->why = 0;
+        if (!(m->flags & KCG_FREE)) {
+            s->last = now;
+            s->cycle_deferred = 0;
+            if (s->deferred != KCG_NEVER)
+                s->deferred = KCG_NEVER, moved(g, i);
+            if (g->stopping && s->pages_to_send)
+                s->why = REQUEST, g->pending[kept++] = i;
+            else if (s->pages_to_send)
+                defer(g, i, now + (m->delay > MIN_DISTANCE ? m->delay : MIN_DISTANCE));
+        }
+    }
+    memmove(g->pending + kept, g->pending + count, (g->pendings - count) * sizeof *g->pending);
+    g->pendings -= count - kept;
+    g->taken = 0;
+}
+
+/* --- together (twin: core.py) ---------------------------------------------------------------------------------------- */
+
+static void sooner(kcg *g, int64_t due)
+{
+    if (due < g->next_expiry)
+        g->next_expiry = due;
+}
+
+static void report(kcg *g, int esc, int events, int64_t now)
+{
+    if (!events)
+        return;
+    on_event(g, esc, events, now);
+    if (events & (KCG_LINK | KCG_INFO)) {
+        int64_t ok = 0;
+        sooner(g, esc_deadline(&g->esc[esc]));
+        for (int i = 0; i < g->plan->escs; i++)
+            ok += g->esc[i].has_live;
+        if (ok != g->gateway[KCG_ESCS_OK]) {
+            g->gateway[KCG_ESCS_OK] = ok;
+            kcg_gateway_changed(g, 0, now);
+        }
+    }
+    if ((unsigned)events & g->mask) {
+        if (!g->esc[esc].reported)
+            g->report[g->reports++] = (uint8_t)esc;
+        g->esc[esc].reported = (uint8_t)(g->esc[esc].reported | events);
+    }
+}
+
+static void expire(kcg *g, int64_t now, int but)
+{
+    if (now < g->next_expiry)
+        return;
+    for (int i = 0; i < g->plan->escs; i++) {
+        kcg_esc *e = &g->esc[i];
+        if (i != but && now >= esc_deadline(e)) {
+            int events = expire_esc(e, now);
+            if (now - e->window_ns >= SECOND)
+                events |= close_window(e, now);
+            report(g, i, events, now);
+        }
+    }
+    g->next_expiry = KCG_NEVER;
+    for (int i = 0; i < g->plan->escs; i++)
+        sooner(g, esc_deadline(&g->esc[i]));
+    if (now - g->second >= SECOND) {
+        g->second = now;
+        kcg_gateway_changed(g, 1, now);
+    }
+}
+
+/* Take the next frame of the read; 0 where there is none. */
+static int accept_next(kcg *g)
+{
+    if (g->found_at >= g->found_count)
+        return 0;
+    const kcg_found *f = &g->found[g->found_at++];
+    kcg_esc *e = &g->esc[g->read_esc];
+    int64_t after = (int64_t)(g->read_end - f->end) * BYTE_NS, limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
+    if (g->read_now - g->read_bound + after > limit) /* the bytes after it in the same read make it old already */
+        e->count[KCG_N_LATE]++;
+    else
+        report(g, g->read_esc, accept(e, f, g->read_shown - after, g->read_bound - after), g->read_now);
+    return 1;
+}
+
+int kcg_next_event(kcg *g)
+{
+    for (;;) {
+        if (g->reports) {
+            int esc = g->report[0], events = g->esc[esc].reported;
+            g->esc[esc].reported = 0;
+            memmove(g->report, g->report + 1, --g->reports);
+            return esc << 8 | events;
+        }
+        if (accept_next(g))
+            continue;
+        if (g->read_esc < 0)
+            return -1;
+        kcg_esc *e = &g->esc[g->read_esc];
+        if (e->count[KCG_N_LINK] == KCG_NEVER_SEEN)
+            report(g, g->read_esc, set_link(e, KCG_SEARCHING), g->read_now);
+        g->read_esc = -1;
+    }
+}
+
+static void note_arrival(kcg_esc *e, uint64_t end, int64_t bound)
+{
+    int gone = 0;
+    if (!e->held_count) {
+        e->arrivals = 0;
+        return;
+    }
+    uint64_t begin = end - e->held_count;
+    while (gone < e->arrivals && e->arrival[gone].end <= begin)
+        gone++;
+    e->arrivals = (uint8_t)(e->arrivals - gone);
+    memmove(e->arrival, e->arrival + gone, e->arrivals * sizeof *e->arrival);
+    e->arrival[e->arrivals].end = end;
+    e->arrival[e->arrivals++].bound = bound;
+}
+
+int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since)
+{
+    kcg_esc *e = &g->esc[esc];
+    if (!g->again) {
+        expire(g, now, esc); /* a message may hold values of several ESCs */
+        report(g, esc, expire_esc(e, now), now);
+        g->again = g->reports > 0;
+        if (g->again)
+            return kcg_next_event(g) | KCG_AGAIN;
+    }
+    g->again = 0;
+    if (e->arrivals && now - e->arrival[0].bound > e->settings.timeout)
+        flush(e);
+    int64_t bound = since + ((int64_t)size - 1) * BYTE_NS;
+    if (bound > now) /* a pseudo terminal is faster than the wire */
+        bound = now;
+    g->read_esc = esc;
+    g->read_now = now;
+    g->read_bound = bound;
+    g->read_shown = now - bound <= e->interval ? now : bound;
+    g->read_end = e->count[KCG_N_BYTES] + size;
+    g->found_count = g->found_at = 0;
+    feed(g, e, data, size);
+    if (size)
+        note_arrival(e, g->read_end, bound);
+    return kcg_next_event(g);
+}
+
+int kcg_expire(kcg *g, int64_t now)
+{
+    expire(g, now, -1);
+    return kcg_next_event(g);
+}
+
+int kcg_advance(kcg *g, int64_t now)
+{
+    expire(g, now, -1);
+    advance_messages(g, now);
+    return kcg_next_event(g);
+}
+
+int kcg_port(kcg *g, int esc, int is_open, int64_t now)
+{
+    kcg_esc *e = &g->esc[esc];
+    if (!is_open) {
+        uint64_t late = e->count[KCG_N_LATE];
+        flush(e);
+        e->count[KCG_N_LATE] = late; /* that it was dropped is said by the link */
+        report(g, esc, lose(e, KCG_PORT_ERROR), now);
+    } else if (e->count[KCG_N_LINK] == KCG_PORT_ERROR) {
+        report(g, esc, set_link(e, e->has_time ? KCG_LOST : KCG_NEVER_SEEN), now);
+    }
+    return kcg_next_event(g);
+}
+
+int64_t kcg_next_deadline(kcg *g)
+{
+    int64_t due = g->next_expiry;
+    if (!due) {
+        due = KCG_NEVER;
+        for (int i = 0; i < g->plan->escs; i++)
+            if (esc_deadline(&g->esc[i]) < due)
+                due = esc_deadline(&g->esc[i]);
+    }
+    if (g->heaped && due_of(g, g->heap[0]) < due)
+        due = due_of(g, g->heap[0]);
+    return due;
+}
+
+void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
+{
+    kcg_esc *e = &g->esc[esc];
+    e->settings = *settings;
+    e->cells = settings->cells ? settings->cells : e->has_info ? e->info[CELLS_AT] : 0;
+    g->next_expiry = 0;
+}
+
+static size_t rounded(size_t n)
+{
+    return (n + 7) / 8 * 8;
+}
+
+size_t kcg_size(const kcg_plan *p)
+{
+    return rounded(sizeof(kcg)) + rounded(p->escs * sizeof(kcg_esc)) + rounded(p->messages * sizeof(kcg_sending)) + p->words * sizeof(uint64_t) +
+           rounded(p->pages) + rounded(p->escs) + 2 * rounded(p->messages * sizeof(uint16_t));
+}
+
+kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now)
+{
+    uint8_t *at = memory;
+    kcg *g = memory;
+    memset(memory, 0, kcg_size(plan));
+    crc_init();
+    at += rounded(sizeof *g);
+    g->esc = (void *)at, at += rounded(plan->escs * sizeof(kcg_esc));
+    g->sending = (void *)at, at += rounded(plan->messages * sizeof(kcg_sending));
+    g->last = (void *)at, at += plan->words * sizeof(uint64_t);
+    g->heap = (void *)at, at += rounded(plan->messages * sizeof(uint16_t));
+    g->pending = (void *)at, at += rounded(plan->messages * sizeof(uint16_t));
+    g->last_known = at, at += rounded(plan->pages);
+    g->report = at;
+    g->plan = plan;
+    g->gateway[KCG_STARTED] = g->second = now;
+    g->read_esc = -1;
+    for (int i = 0; i < plan->escs; i++) {
+        kcg_esc *e = &g->esc[i];
+        e->settings = settings[i];
+        e->need = 1;
+        e->blame = KCG_N_BAD_CRC;
+        e->window_ns = now;
+        e->cells = e->settings.cells;
+    }
+    for (uint16_t i = 0; i < plan->messages; i++) {
+        kcg_sending *s = &g->sending[i];
+        s->last = LONG_AGO;
+        s->deferred = KCG_NEVER;
+        s->cycle_due = plan->message[i].cycle ? now + plan->message[i].phase : KCG_NEVER;
+        put_in_heap(g, g->heaped++, i);
+        moved(g, i);
+    }
+    return g;
+}
+
+/* --- for a caller that cannot see structures ------------------------------------------------------------------------- */
+
+uint32_t kcg_sizes(uint32_t what)
+{
+    static const size_t size[] = {KCG_SOURCE, sizeof(kcg_signal), sizeof(kcg_message), sizeof(kcg_settings), sizeof(kcg_plan), sizeof(kcg_esc), sizeof(kcg_frame)};
+    return what < sizeof size / sizeof *size ? (uint32_t)size[what] : 0;
+}
+
+const char *kcg_wire(void)
+{
+    return "IHhhhHHHHbBbbIBB HHIBIHHhhhHHbBbbbb";
+}
+
+kcg_esc *kcg_escs(kcg *g)
+{
+    return g->esc;
+}
+
+int64_t *kcg_gateway(kcg *g)
+{
+    return g->gateway;
+}
+
+void kcg_set_mask(kcg *g, uint32_t mask)
+{
+    g->mask = mask;
+}
+
+uint32_t kcg_pending(const kcg *g)
+{
+    return g->pendings;
+}

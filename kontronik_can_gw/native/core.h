@@ -1,0 +1,171 @@
+/* KONTRONIK ESC telemetry to CAN: the core. Bytes and time in, CAN frames and deadlines out.
+
+   C99; no allocation, no operating system, no floating point but for float signals (KCG_FLOATS). Which messages there are is in tables
+   (kcg_plan), made from a DBC by tables.py; state lives in memory that the caller gives. Time is nanoseconds of one monotonic clock.
+   The Python modules core.py, esc/telemetry.py, esc/kontronik/deframer.py, dbc/messages.py and dbc/schedule.py are its twin: the same
+   calls give the same frames, counters and deadlines, and they say in words what is done here. */
+#ifndef KCG_CORE_H
+#define KCG_CORE_H
+#include <stddef.h>
+#include <stdint.h>
+
+#ifndef KCG_DATA
+#define KCG_DATA 8   /* bytes that a frame can hold; with CAN FD 64 */
+#endif
+#ifndef KCG_FLOATS
+#define KCG_FLOATS 0 /* 1: signals that are IEEE 754 floats */
+#endif
+#ifndef KCG_LEGACY
+#define KCG_LEGACY 1 /* 0: the V4 frame layout only */
+#endif
+#ifndef KCG_SOURCE
+#define KCG_SOURCE 0 /* a number of these sources, for kcg_sizes */
+#endif
+#ifndef KCG_FOUND
+#define KCG_FOUND 2  /* UART frames of one kcg_receive that are counted before the first is taken */
+#endif
+enum { KCG_HELD = 43, KCG_BODY = 33, KCG_LONGEST = 44, KCG_PAGES = 64 };
+#define KCG_NEVER INT64_MAX
+
+/* Events of an ESC (telemetry.Event), and states of its link (telemetry.LinkState). */
+enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8 };
+enum { KCG_NEVER_SEEN, KCG_SEARCHING, KCG_OK, KCG_DEGRADED, KCG_LOST, KCG_PORT_ERROR };
+
+typedef struct { /* as SocketCAN's struct can_frame and canfd_frame */
+    uint32_t id; /* bit 31: 29 bits */
+    uint8_t length, flags, page, reserved; /* page: place of a multiplexer's page; the kernel ignores it */
+    uint8_t data[KCG_DATA];
+} kcg_frame;
+
+/* Where the steps of a value come from. */
+enum {
+    KCG_OF_LIVE,    /* a field of live data: `place` its offset after the header, `wire` its type */
+    KCG_OF_INFO,    /* of info that is fresh */
+    KCG_OF_LAST,    /* of the last known info */
+    KCG_OF_POWER,   /* voltage by current */
+    KCG_OF_COUNT,   /* `place`: one of KCG_N_... */
+    KCG_OF_ENERGY,
+    KCG_OF_RUN_TIME,
+    KCG_OF_AGE,
+    KCG_OF_RATE,
+    KCG_OF_GATEWAY, /* `place`: index into kcg.gateway */
+    KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED] */
+    KCG_OF_ALIVE    /* the message's alive counter, up to `div` */
+};
+enum { KCG_ESCS_OK = 0, KCG_STARTED = 11, KCG_OF_GATEWAY_COUNT = 12 }; /* of kcg.gateway; the others are the owner's */
+enum { KCG_U8, KCG_I8, KCG_U16, KCG_I16, KCG_U32 };
+enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
+/* Counters of a stream, then what is counted like them. Twin: deframer.Counters. */
+enum {
+    KCG_N_BYTES, KCG_N_LIVE_V4, KCG_N_LIVE_LEGACY, KCG_N_INFO_V4, KCG_N_INFO_LEGACY, KCG_N_HEADERS, KCG_N_CRC_ERRORS, KCG_N_UNKNOWN_KINDS,
+    KCG_N_NOISE, KCG_N_BAD_CRC, KCG_N_UNKNOWN_KIND, KCG_N_INCOMPLETE, KCG_N_LONG_RUN, KCG_N_LINK, KCG_N_LAYOUT, KCG_N_LOSSES, KCG_N_LATE,
+    KCG_N_SUSPECT, KCG_COUNTS,
+    KCG_N_LIVE = KCG_COUNTS, KCG_N_INFO, KCG_N_DROPPED /* sums */
+};
+enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16 };                             /* of a signal */
+enum { KCG_EVENT = 1, KCG_ON_CHANGE = 2, KCG_SILENT = 4, KCG_HAS_CRC = 8, KCG_OF_THE_GATEWAY = 16, KCG_FREE = 32 }; /* of a message */
+
+typedef struct { uint8_t shift, width; uint16_t at; } kcg_piece; /* (raw >> shift & mask of width) << at; within 64 bits of the frame */
+typedef struct { int64_t number; uint64_t raw; } kcg_pair;       /* of an enumeration */
+typedef struct {
+    uint8_t kind, wire, place, shift, flags, pieces, page, esc;  /* page: KCG_PAGES: on all; shift and mask: a part of the word */
+    uint32_t mask, first_piece, first_pair, pairs;
+    uint8_t divisor, length, reserved[6];
+    uint64_t not_on;                                             /* set of devices that do not supply it */
+    int64_t mul, add, div, most;                                 /* floor((x * mul * over + add * by) / (div * by)); x above most: Error */
+    int64_t low, high;                                           /* of a float: double */
+    uint64_t error, not_available;
+} kcg_signal;
+typedef struct {
+    uint32_t id;
+    uint8_t length, words, flags, triggers, pages, crc_at, alive_modulus, fd_flags;
+    uint16_t first_signal, signals, data_id, first_page;         /* first_page: of all pages of all messages */
+    uint32_t first_word;                                         /* of the constants: `words` for each page */
+    uint32_t first_esc, escs;                                    /* whose values it holds: kcg_plan.esc_of */
+    int64_t cycle, delay, phase;
+} kcg_message;
+typedef struct { int64_t timeout; uint32_t crc_errors, poles, gear_numerator, gear_denominator; uint8_t cells, reserved[7]; } kcg_settings;
+typedef struct {
+    const kcg_message *message;
+    const kcg_signal *signal;
+    const kcg_piece *piece;
+    const kcg_pair *pair;
+    const uint64_t *constant;
+    const uint16_t *esc_of;
+    const uint16_t *listener, *first_listener; /* of ESC i: listener[first_listener[i]] up to the next one's */
+    uint32_t words;                            /* of all constants */
+    uint16_t messages, escs, pages;
+} kcg_plan;
+
+typedef struct {
+    kcg_settings settings;
+    uint64_t count[KCG_COUNTS];
+    uint64_t window[4], before[4];             /* live frames, dropped bytes, bytes, CRC errors at the begin of this second, the last */
+    uint64_t base, blame_until, energy;        /* energy: mW s, and the rest in mW ns */
+    int64_t energy_rest, run_time, power;
+    int64_t live_ns, live_bound, info_ns, info_bound, last_info_ns, window_ns, interval;
+    struct { uint64_t end; int64_t bound; } arrival[KCG_HELD + 1];
+    int32_t rate;                              /* 0.1 Hz; -1: not known */
+    uint32_t generation;                       /* grows with each change of live and info, and of whether they are there */
+    uint8_t live[KCG_BODY], info[KCG_BODY], held[KCG_HELD + KCG_LONGEST];
+    uint8_t has_live, has_info, had_live, had_info, has_time, turns, cells, held_count, need, arrivals, blame, reported;
+} kcg_esc;
+
+typedef struct {
+    int64_t last, cycle_due, deferred, since;  /* KCG_NEVER: no cycle, nothing deferred */
+    uint64_t pages_to_send;
+    uint16_t place_in_heap;
+    uint8_t alive, page, cycle_deferred, why, placed;
+} kcg_sending;
+
+typedef struct { uint64_t end; uint8_t is_info, layout, length, body[KCG_BODY]; } kcg_found;
+
+typedef struct {
+    const kcg_plan *plan;
+    kcg_esc *esc;
+    kcg_sending *sending;
+    uint64_t *last;                            /* bits of the last frame of each page, of messages that are sent on change */
+    uint8_t *last_known, *report;              /* report: ESCs with events to be followed, oldest first */
+    uint16_t *heap, *pending;                  /* messages by their next deadline; those to be handed over */
+    uint32_t pendings, taken, heaped, reports;
+    int64_t gateway[KCG_OF_GATEWAY_COUNT];     /* states and counters, written by the owner, in the order of tables.GATEWAY */
+    int64_t second, next_expiry;
+    uint32_t mask;                             /* events that end a step and are reported */
+    uint8_t stopping, again;
+    /* the read that is being taken */
+    uint32_t found_count, found_at;
+    int read_esc;
+    uint64_t read_end;
+    int64_t read_now, read_shown, read_bound;
+    kcg_found found[KCG_FOUND];
+} kcg;
+
+size_t kcg_size(const kcg_plan *plan);
+/* memory: kcg_size bytes, aligned for int64_t. */
+kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now);
+/* Each returns an event to be followed, ESC << 8 | events of `mask`, or -1; then kcg_next_event until that returns -1. Where
+   kcg_receive returns KCG_AGAIN besides, what has expired is to be followed first, and it is called again with the same bytes. */
+enum { KCG_AGAIN = 1 << 30 };
+int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since);
+int kcg_expire(kcg *g, int64_t now);
+int kcg_advance(kcg *g, int64_t now);
+int kcg_port(kcg *g, int esc, int is_open, int64_t now);
+int kcg_next_event(kcg *g);
+int64_t kcg_next_deadline(kcg *g);
+void kcg_apply(kcg *g, int esc, const kcg_settings *settings);
+void kcg_gateway_changed(kcg *g, int each_second, int64_t now);
+void kcg_repeat(kcg *g, int64_t now);
+void kcg_stop(kcg *g, int64_t now);
+/* Frames of what is pending, in their order, `max` at most; they stay pending until kcg_sent says how many of them were taken. */
+uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
+void kcg_sent(kcg *g, int64_t now, uint32_t count);
+uint64_t kcg_count(const kcg_esc *e, int what);
+uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
+/* For a caller that cannot see structures: 0 KCG_SOURCE, then the sizes of signal, message, settings, plan, ESC and frame. */
+uint32_t kcg_sizes(uint32_t what);
+const char *kcg_wire(void); /* the fields of live data and of info on the wire, as codes of Python's struct */
+kcg_esc *kcg_escs(kcg *g);
+int64_t *kcg_gateway(kcg *g);
+void kcg_set_mask(kcg *g, uint32_t mask);
+uint32_t kcg_pending(const kcg *g);
+#endif

@@ -1,0 +1,152 @@
+"""What others read of the core in C: the state of an ESC and of the gateway, straight from its memory."""
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from kontronik_can_gw.esc.decoder import SECOND_NS, Counters, Data
+from kontronik_can_gw.esc.protocols import protocol_named
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
+from kontronik_can_gw.gateway_status import CanState, GatewayState
+from kontronik_can_gw.native.tables import COUNTS, GATEWAY
+
+_STREAM = COUNTS.index("long_run_bytes") + 1
+"""So many counters of kcg_esc.count are those of the stream."""
+_COUNT = {name: COUNTS.index(name) for name in ("losses", "late_frames", "suspect_frames")}
+_LINK, _LAYOUT = COUNTS.index("link_state"), COUNTS.index("layout")
+
+
+class NativeDrawn:
+    """As Drawn: ``energy`` in whole milliwatt seconds, ``run_time`` in ns."""
+
+    def __init__(self, state: Any) -> None:
+        self._state = state
+
+    @property
+    def energy(self) -> int:
+        found: int = self._state.energy
+        return found
+
+    @property
+    def run_time(self) -> int:
+        found: int = self._state.run_time
+        return found
+
+    @run_time.setter
+    def run_time(self, ns: int) -> None:
+        self._state.run_time = ns
+
+    @property
+    def energy_mw_ns(self) -> int:
+        """The energy in milliwatt nanoseconds, as a capture holds it."""
+        return self.energy * SECOND_NS + int(self._state.energy_rest)
+
+    @energy_mw_ns.setter
+    def energy_mw_ns(self, energy: int) -> None:
+        self._state.energy, self._state.energy_rest = divmod(energy, SECOND_NS)
+
+
+class NativeEsc(EscTelemetry):
+    """The state of an ESC. What the core holds is read when somebody asks."""
+
+    def __init__(self, settings: EscSettings, state: Any) -> None:
+        self._state = state
+        self.protocol = protocol_named(settings.protocol)
+        assert self.protocol.wire is not None
+        self._forms = [(struct.Struct("<" + codes), kind) for codes, kind in self.protocol.wire]
+        self._generation = -1
+        self._link_before = LinkState.NEVER_SEEN
+        self._readings: tuple[Data | None, ...] = (None,) * 4
+        self._counters_of = type(self.protocol.make().counters)
+        self.drawn = NativeDrawn(state)
+        self.line_errors = self.base_losses = self.base_line_errors = 0
+        self.apply(settings)
+        self.base = self._window_counters = self._diagnosis_counters = self.counters
+
+    def apply(self, settings: EscSettings) -> None:
+        """Other settings from now on; the core is told by its owner."""
+        self.settings = settings
+        self.pole_pairs = settings.pole_pairs
+        self.output_divisor = settings.pole_pairs * settings.gear.numerator
+        self.gear_denominator = settings.gear.denominator
+
+    def follow(self, events: int) -> None:
+        """Keep the counters of the begin of the second before, for ``diagnosis``."""
+        came_up = False
+        if events & Event.LINK:
+            before, self._link_before = self._link_before, self.link
+            came_up = self.link is LinkState.OK and before not in (LinkState.OK, LinkState.DEGRADED)
+        if came_up or events & Event.SECOND:
+            counters = self.counters
+            self._diagnosis_counters = counters if came_up else self._window_counters
+            self._window_counters = counters
+
+    @property
+    def counters(self) -> Counters:
+        found: Counters = self._counters_of(*self._state.count[:_STREAM])
+        return found
+
+    def __getattr__(self, name: str) -> Any:
+        if (place := _COUNT.get(name)) is not None:
+            return self._state.count[place]
+        if (read := _READ.get(name)) is None:
+            raise AttributeError(name)
+        return read(self)
+
+    def reading(self, place: int) -> Data | None:
+        """Live data, info, and the newest ever of both; None where there is none."""
+        state = self._state
+        if state.generation != self._generation:
+            self._generation = state.generation
+            live, info = (
+                tuple.__new__(kind, form.unpack_from(body))
+                for (form, kind), body in zip(self._forms, (state.live, state.info), strict=True)
+            )
+            self._readings = (
+                live if state.has_live else None,
+                info if state.has_info else None,
+                live if state.had_live else None,
+                info if state.had_info else None,
+            )
+        return self._readings[place]
+
+
+_READ: dict[str, Callable[[NativeEsc], Any]] = {
+    "live": lambda esc: esc.reading(0),
+    "info": lambda esc: esc.reading(1),
+    "last_live": lambda esc: esc.reading(2),
+    "last_info": lambda esc: esc.reading(3),
+    "device": lambda esc: esc.protocol.value("device_raw", esc.reading(3)),
+    "link": lambda esc: LinkState(esc._state.count[_LINK]),
+    "layout": lambda esc: esc._state.count[_LAYOUT],
+    "cells": lambda esc: esc._state.cells,
+    "frame_rate": lambda esc: None if esc._state.rate < 0 else esc._state.rate,
+    "live_ns": lambda esc: esc._state.live_ns if esc._state.has_time else None,
+    "live_bound_ns": lambda esc: esc._state.live_bound,
+    "last_info_ns": lambda esc: esc._state.last_info_ns if esc._state.had_info else None,
+    "info_bound_ns": lambda esc: esc._state.info_bound if esc._state.has_info else None,
+}
+
+
+def _member(name: str, place: int, kind: Callable[[int], Any] | None) -> property:
+    def read(self: "NativeStatus") -> Any:
+        found = self._gateway[place]
+        return found if kind is None else kind(found)
+
+    def write(self: "NativeStatus", value: int) -> None:
+        self._gateway[place] = value
+
+    return property(read, write, doc=f"GatewayStatus.{name}")
+
+
+class NativeStatus:
+    """As GatewayStatus, in the core's memory: its attributes are those of GATEWAY."""
+
+    def __init__(self, gateway: Any) -> None:
+        self._gateway = gateway
+
+
+_KINDS: dict[str, Callable[[int], Any]] = {"state": GatewayState, "can_state": CanState}
+for _place, _name in enumerate(GATEWAY):
+    _name = _name.removeprefix("gateway_")
+    setattr(NativeStatus, _name, _member(_name, _place, _KINDS.get(_name)))

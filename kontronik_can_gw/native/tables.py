@@ -1,0 +1,339 @@
+"""Compiled messages -> the tables of the core in C (core.h, kcg_plan), in this machine's layout. NotInCore for what it cannot express.
+
+The proofs are here: no product leaves int64, whatever value comes and whatever a master writes to 2100h. What cannot be proven runs on
+the Python core.
+"""
+
+import ctypes as c
+import math
+import struct
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any
+
+from kontronik_can_gw.dbc.schedule import phases
+from kontronik_can_gw.esc.decoder import EscProtocol
+from kontronik_can_gw.esc.protocols import protocol_named
+from kontronik_can_gw.esc.telemetry import MAX_GEAR_PART, EscSettings, Event
+from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
+from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.signals.packer import alive_modulus, place
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
+
+(
+    OF_LIVE, OF_INFO, OF_LAST, OF_POWER, OF_COUNT, OF_ENERGY, OF_RUN_TIME, OF_AGE, OF_RATE, OF_GATEWAY, OF_UPTIME, OF_ALIVE
+) = range(12)  # fmt: skip
+WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
+_TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
+COUNTS = (
+    "bytes", "live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds", "dropped_noise", "dropped_crc",
+    "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes", "link_state", "layout", "losses", "late_frames", "suspect_frames",
+    "live_frames", "info_frames", "dropped_bytes",
+)  # fmt: skip
+"""Of kcg_esc.count, in its order; the last three are sums."""
+GATEWAY = (
+    "escs_ok", "gateway_state", "can_state", "esc_count", "sent_frames", "replaced_frames", "send_failures", "received_frames",
+    "bus_off_count", "dropped_frames", "id_conflicts", "started_ns",
+)  # fmt: skip
+"""Of kcg.gateway, in its order."""
+ROLLS, CODE_AMID, PLAIN, TABLE, REAL = 1, 2, 4, 8, 16
+EVENT, ON_CHANGE, SILENT, HAS_CRC, OF_THE_GATEWAY, FREE = 1, 2, 4, 8, 16, 32
+ALL_PAGES = 64
+ALL_ESCS = 255
+MAX_COUNT = 1 << 48
+"""Of a counter or an integral: at 1 Mbit/s more than a human life."""
+MAX_GEAR = MAX_GEAR_PART
+MAX_POLES = 0xFFFF
+_DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
+_LARGEST_DIVISOR = {
+    Divisor.ONE: (1, 1),
+    Divisor.POLE_PAIRS: (MAX_POLES, 1),
+    Divisor.OUTPUT: (MAX_POLES * MAX_GEAR, MAX_GEAR),
+    Divisor.CELLS: (255, 1),
+}
+_M64 = (1 << 64) - 1
+_LIMIT = 1 << 63
+
+
+class NotInCore(ValueError):
+    """The core in C does not have this: the message in words."""
+
+
+def _structure(name: str, **types: Any) -> Any:
+    return type(name, (c.Structure,), {"_fields_": list(types.items())})
+
+
+_u8, _u16, _u32, _u64, _i64 = c.c_uint8, c.c_uint16, c.c_uint32, c.c_uint64, c.c_int64
+Piece = _structure("Piece", shift=_u8, width=_u8, at=_u16)
+Pair = _structure("Pair", number=_i64, raw=_u64)
+Signal = _structure(
+    "Signal", kind=_u8, wire=_u8, place=_u8, shift=_u8, flags=_u8, pieces=_u8, page=_u8, esc=_u8, mask=_u32, first_piece=_u32,
+    first_pair=_u32, pairs=_u32, divisor=_u8, length=_u8, reserved=_u8 * 6, not_on=_u64, mul=_i64, add=_i64, div=_i64, most=_i64, low=_i64,
+    high=_i64, error=_u64, not_available=_u64,
+)  # fmt: skip
+Message = _structure(
+    "Message", id=_u32, length=_u8, words=_u8, flags=_u8, triggers=_u8, pages=_u8, crc_at=_u8, alive_modulus=_u8, fd_flags=_u8,
+    first_signal=_u16, signals=_u16, data_id=_u16, first_page=_u16, first_word=_u32, first_esc=_u32, escs=_u32, cycle=_i64, delay=_i64,
+    phase=_i64,
+)  # fmt: skip
+Settings = _structure(
+    "Settings", timeout=_i64, crc_errors=_u32, poles=_u32, gear_numerator=_u32, gear_denominator=_u32, cells=_u8, reserved=_u8 * 7
+)  # fmt: skip
+_EVENT_OF_PACE = {
+    Group.LIVE: Event.LIVE,
+    Group.INFO: Event.INFO,
+    Group.LINK: Event.LINK,
+    Group.GATEWAY: Event.NONE,
+}
+
+
+class Tables:
+    """Rows of each table, in the order of their fields. ``longest``: data bytes that the core is built for."""
+
+    def __init__(
+        self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False, longest: int = 64
+    ) -> None:
+        self.names = [plan.name for plan in layout.messages]
+        self.signals: list[Any] = []
+        self.messages: list[Any] = []
+        self.pieces: list[Any] = []
+        self.pairs: list[Any] = []
+        self.constants: list[int] = []
+        self.esc_of: list[int] = []
+        self.pages = 0
+        self.settings = [settings_of(esc) for esc in escs]
+        self.wire = ""
+        """The fields that the tables were made for."""
+        for settings in escs:
+            if (wire := protocol_named(settings.protocol).wire) is not None:
+                self.wire = " ".join(codes for codes, _ in wire)
+        self._wire = [_places(protocol_named(esc.protocol)) for esc in escs]
+        listeners: list[list[int]] = [[] for _ in escs]
+        starts = phases([plan.cycle_ns for plan in layout.messages])
+        if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
+            raise NotInCore(f"{len(escs)} ESCs, {len(layout.messages)} messages")
+        for index, plan in enumerate(layout.messages):
+            if plan.length > longest or len(plan.pages) > ALL_PAGES:
+                raise NotInCore(f"{plan.name}: {plan.length} bytes, {len(plan.pages)} pages")
+            self._add(plan, silent, starts[index])
+            for esc in plan.escs:
+                if self.messages[-1].triggers:
+                    listeners[esc].append(index)
+        self.listeners = [index for each in listeners for index in each]
+        self.first_listeners = [sum(map(len, listeners[:n])) for n in range(len(escs) + 1)]
+
+    def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
+        crc = next((s for s in plan.signals if s.role is Role.CRC), None)
+        alive = next((s for s in plan.signals if s.role is Role.ALIVE), None)
+        by_event, on_change = SendType.EVENT in plan.send_type, SendType.ON_CHANGE in plan.send_type
+        flags = EVENT * by_event | ON_CHANGE * on_change | HAS_CRC * (crc is not None)
+        if silent and plan.paces & {Group.LIVE, Group.INFO} and Group.LINK not in plan.paces:
+            flags |= SILENT
+        if Group.GATEWAY in plan.paces and (by_event or on_change):
+            flags |= OF_THE_GATEWAY
+        if not (plan.cycle_ns or plan.delay_ns or len(plan.pages) > 1):
+            flags |= FREE
+        first, words = len(self.signals), max(1, -(-plan.length // 8))
+        first_word = len(self.constants)
+        for page in plan.pages:
+            self.constants += _constants(plan, page, words)
+        for signal in plan.signals:
+            if signal.role in (Role.SOURCE, Role.ALIVE):
+                self._add_signal(signal, plan, crc is not None)
+        first_esc = len(self.esc_of)
+        self.esc_of += sorted(plan.escs)
+        self.messages.append(
+            Message(
+                plan.can_id | (EXTENDED if plan.extended else 0),
+                *(plan.length, words, flags, _triggers(plan), len(plan.pages)),
+                crc.pieces[0].at // 8 if crc else 0,
+                alive_modulus(alive, crc is not None) & 0xFF if alive else 0,
+                *(int(plan.fd), first, len(self.signals) - first, plan.data_id & 0xFFFF),
+                *(self.pages, first_word, first_esc, len(plan.escs)),
+                *(plan.cycle_ns, plan.delay_ns, phase),
+            )
+        )
+        self.pages += len(plan.pages)
+
+    def _add_signal(self, signal: SignalPlan, plan: MessagePlan, has_crc: bool) -> None:
+        first_piece = len(self.pieces)
+        for piece in signal.pieces:  # never across 64 bits
+            width = min(piece.width, 64 - piece.at % 64)
+            self.pieces.append(Piece(piece.shift, width, piece.at))
+            if width < piece.width:
+                self.pieces.append(
+                    Piece(piece.shift + width, piece.width - width, piece.at + width)
+                )
+        row = Signal(first_piece=first_piece, pieces=len(self.pieces) - first_piece)
+        row.page = ALL_PAGES if signal.page is None else plan.pages.index(signal.page)
+        row.esc = ALL_ESCS if signal.esc is None else signal.esc
+        row.length = signal.length
+        row.error, row.not_available = signal.error & _M64, signal.not_available & _M64
+        if signal.role is Role.ALIVE:
+            row.kind, row.div = OF_ALIVE, alive_modulus(signal, has_crc)
+            if row.div > 255:
+                raise NotInCore(
+                    f"{plan.name}.{signal.name}: an alive counter of {signal.length} bits"
+                )
+        else:
+            assert signal.source is not None
+            try:
+                self._source(row, signal.source, signal.esc)
+                self._scale(row, signal, signal.source)
+            except NotInCore as error:
+                raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
+        self.signals.append(row)
+
+    def _source(self, row: Any, value: Value, esc: int | None) -> None:
+        row.divisor = _DIVISORS[value.divisor]
+        if value.kind in (Kind.WIRE, Kind.BITS):
+            if not value.supplied or esc is None:
+                raise NotInCore("not supplied by this ESC's protocol")
+            is_info = value.group is Group.INFO
+            row.kind = OF_LAST if value.last else OF_INFO if is_info else OF_LIVE
+            row.place, row.wire = self._wire[esc][is_info][value.words[0]]
+            row.not_on = sum(1 << device for device in value.not_on)
+            if value.mask != -1:
+                row.shift, row.mask = value.shift, value.mask
+        elif value.kind is Kind.PRODUCT:
+            row.kind = OF_POWER
+        elif value.name == "uptime":
+            row.kind = OF_UPTIME
+        elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
+            row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
+        elif value.kind in _KINDS:
+            row.kind = _KINDS[value.kind]
+        elif _COUNT_OF.get(value.name, value.name) in COUNTS:
+            row.kind, row.place = OF_COUNT, COUNTS.index(_COUNT_OF.get(value.name, value.name))
+        else:
+            raise NotInCore(f"no source {value.name}")
+
+    def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
+        flags = 0
+        if signal.numbers is not None:
+            row.first_pair, row.pairs = len(self.pairs), len(signal.numbers)
+            self.pairs += [Pair(int(number), raw & _M64) for number, raw in signal.numbers.items()]
+            flags |= TABLE
+        if signal.is_float:
+            row.flags = flags | REAL
+            _scale_float(row, signal, value)
+            return
+        if value.rolls:
+            flags |= ROLLS
+        if (
+            signal.low <= signal.not_available <= signal.high
+            and signal.error != signal.not_available
+        ):
+            flags |= CODE_AMID
+        row.low, row.high = max(signal.low, -_LIMIT), min(signal.high, _LIMIT - 1)
+        if value.divisor is Divisor.ONE and signal.slope == 1 and signal.intercept == 0:
+            flags |= PLAIN
+        elif signal.numbers is None:
+            common = signal.slope.denominator * signal.intercept.denominator
+            mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
+            row.mul, row.add, row.div = _reduced(mul, add, 2 * common)
+            row.most = _most(row, signal, value)
+        row.flags = flags
+
+
+_KINDS = {
+    Kind.INTEGRAL: OF_ENERGY,
+    Kind.RUN_TIME: OF_RUN_TIME,
+    Kind.AGE: OF_AGE,
+    Kind.RATE: OF_RATE,
+}
+_COUNT_OF = {"received_bytes": "bytes"}
+
+
+def settings_of(esc: EscSettings) -> Any:
+    """The settings of an ESC for the core. NotInCore where its gear has larger parts than 2100h."""
+    numerator, denominator = esc.gear.numerator, esc.gear.denominator
+    if max(numerator, denominator) > MAX_GEAR or esc.pole_pairs > MAX_POLES:
+        raise NotInCore(
+            f"{esc.name}: gear {esc.gear}, {esc.pole_pairs} pole pairs: parts above {MAX_GEAR}"
+        )
+    timeout, errors = esc.timeout_ns, min(esc.crc_error_threshold, 0xFFFF_FFFF)
+    return Settings(timeout, errors, esc.pole_pairs, numerator, denominator, esc.cell_count)
+
+
+def _places(protocol: EscProtocol) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Offset after the header and wire type of each word of live data and of info."""
+    if protocol.wire is None:
+        raise NotInCore(f"ESC protocol {protocol.name}")
+    found: tuple[list[tuple[int, int]], list[tuple[int, int]]] = ([], [])
+    for places, (codes, _) in zip(found, protocol.wire, strict=True):
+        at = 0
+        for code in codes:
+            places.append((at, WIRE[code]))
+            at += struct.calcsize("<" + code)
+    return found
+
+
+def _triggers(plan: MessagePlan) -> int:
+    if not plan.send_type & (SendType.EVENT | SendType.ON_CHANGE):
+        return Event.NONE
+    found = Event.NONE
+    for pace in plan.paces:
+        found |= _EVENT_OF_PACE[pace]
+    follows_live = SendType.EVENT in plan.send_type and found & Event.LIVE
+    if found & Event.LINK and not plan.cycle_ns and not follows_live:
+        found |= Event.SECOND
+    return found
+
+
+def _constants(plan: MessagePlan, page: int | None, words: int) -> list[int]:
+    bits = 0
+    for signal in plan.signals:
+        if signal.role is Role.CONSTANT and signal.page in (None, page):
+            bits |= place(signal.pieces, signal.constant)
+        elif signal.role is Role.MULTIPLEXER and page is not None:
+            bits |= place(signal.pieces, page)
+    return [bits >> 64 * word & _M64 for word in range(words)]
+
+
+def _reduced(mul: int, add: int, div: int) -> tuple[int, int, int]:
+    """The same quotient with smaller numbers: floor((x * mul + add) / div)."""
+    by = math.gcd(mul, add, div)
+    return mul // by, add // by, div // by
+
+
+def _range(row: Any, value: Value) -> tuple[int, int]:
+    """Of the steps, before any divisor."""
+    if row.kind in (OF_LIVE, OF_INFO, OF_LAST):
+        return _TYPE_RANGES[row.wire]
+    low = 0 if value.low is None else value.low
+    if value.high is not None:
+        return low, value.high
+    return low, 1 << 62 if value.kind is Kind.RUN_TIME else MAX_COUNT  # ns; mW s, ms, frames
+
+
+def _most(row: Any, signal: SignalPlan, value: Value) -> int:
+    """The largest number of steps that the core has to multiply: above it the signal is Error. NotInCore if that leaves int64."""
+    low, high = _range(row, value)
+    by, over = _LARGEST_DIVISOR[value.divisor]
+    if high >= MAX_COUNT and not value.rolls:
+        end = signal.high + 1 if row.mul > 0 else signal.low - 1
+        high = min(high, max(0, -(-(end * row.div - row.add) // row.mul)) if row.mul else high)
+    greatest = max(abs(low), abs(high)) * abs(row.mul) * over + abs(row.add) * by
+    if greatest >= _LIMIT or row.div * by >= _LIMIT or by >= _LIMIT:
+        raise NotInCore("factor and offset leave 64 bits")
+    return high
+
+
+def _scale_float(row: Any, signal: SignalPlan, value: Value) -> None:
+    row.low, row.high = (struct.unpack("<q", struct.pack("<d", end))[0] for end in signal.limits)
+    by, over = _LARGEST_DIVISOR[value.divisor]
+    slope: Fraction = signal.slope
+    row.mul, row.div = slope.numerator, slope.denominator
+    row.add = struct.unpack("<q", struct.pack("<d", float(signal.intercept)))[0]
+    if signal.intercept == 0:
+        row.flags |= PLAIN
+    exact = 1 << 53
+    greatest = max(map(abs, _range(row, value))) * abs(row.mul) * over
+    if signal.numbers is None and max(greatest, row.div * by) >= exact:
+        raise NotInCore("factor leaves 53 bits")
+
+
+def packed(rows: Sequence[Any], kind: Any) -> bytes:
+    """The bytes of a table."""
+    return bytes((kind * len(rows))(*rows))

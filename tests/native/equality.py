@@ -1,0 +1,231 @@
+"""The core in C beside the core in Python: the same random DBC, bytes and times; every frame, event, counter and deadline equal."""
+
+import random
+from collections.abc import Sequence
+from fractions import Fraction
+from itertools import zip_longest
+from typing import Any
+
+from packer_oracle import (
+    LayoutMaker,
+    Msg,
+    Sig,
+    bindings,
+    dbc_text,
+    random_gateway,
+    random_info,
+    random_live,
+    read,
+)
+
+from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.native.core import NativeCore
+from kontronik_can_gw.native.tables import GATEWAY, NotInCore
+from kontronik_can_gw.signals.plan import Layout
+
+START = 1_000 * SECOND
+_STEPS = (0, 1_000, 100_000, MS, 2 * MS, 5 * MS, 10 * MS, 10 * MS, 10 * MS, 50 * MS, 260 * MS)
+
+
+def settings(chance: random.Random, number: int) -> EscSettings:
+    return EscSettings(
+        f"esc{number + 1}",
+        chance.choice((1, 2, 7, 14, 255)),
+        Fraction(chance.randint(1, 300), chance.randint(1, 300)),
+        chance.choice((0, 0, 6, 14)),
+        chance.choice((20, 60, 250, 1000)) * MS,
+        chance.choice((1, 5, 50)),
+    )
+
+
+def layout(chance: random.Random, escs: Sequence[EscSettings]) -> Layout:
+    """A random layout that the gateway accepts."""
+    while True:
+        maker = LayoutMaker(chance, escs)
+        messages = [maker.message() for _ in range(chance.randint(1, 8))]
+        if chance.random() < 0.4:
+            messages.append(protected(chance, escs))
+        more = "\n".join(
+            f'BA_ "GenMsgSendType" BO_ {m.dbc_id} {chance.randrange(5)};\n'
+            f'BA_ "GenMsgCycleTime" BO_ {m.dbc_id} {chance.choice((5, 10, 12, 20, 50, 100, 1000))};\n'
+            f'BA_ "GenMsgDelayTime" BO_ {m.dbc_id} {chance.choice((0, 0, 0, 5, 20, 25, 200))};'
+            for m in messages
+        )
+        try:
+            chosen = DbcSettings(
+                bind=bindings(messages),
+                data_ids={"Protected": 0x1234}
+                if any(m.name == "Protected" for m in messages)
+                else {},
+            )
+            return prepare(read(dbc_text(messages, more)), "x.dbc", escs, chosen, fd_allowed=True)[
+                1
+            ]
+        except UserError:
+            continue
+
+
+def protected(chance: random.Random, escs: Sequence[EscSettings]) -> Msg:
+    """A message with an alive counter and perhaps a CRC of AUTOSAR E2E profile 1."""
+    prefix = f"Esc{chance.randint(1, len(escs))}" if len(escs) > 1 else ""
+    signals = [Sig("Alive", 8, 4), Sig(f"{prefix}BatteryVoltage", 16, 16, unit="V", factor="0.01")]
+    if chance.random() < 0.7:
+        signals.append(Sig("Crc8", 0, 8))
+    return Msg("Protected", 0x7F0, chance.randint(4, 8), signals)
+
+
+def stream(chance: random.Random) -> bytes:
+    """Some frames, in part damaged, cut, and with rubbish around them."""
+    data = b""
+    for _ in range(chance.choice((1, 1, 1, 1, 1, 2, 3, 12))):
+        wire = WireLayout.V4 if chance.random() < 0.95 else WireLayout.LEGACY
+        one = encode(random_live(chance) if chance.random() < 0.8 else random_info(chance), wire)
+        if chance.random() < 0.1:
+            at = chance.randrange(len(one))
+            one = one[:at] + bytes((one[at] ^ 1 << chance.randrange(8),)) + one[at + 1 :]
+        if chance.random() < 0.1:
+            one = one[: chance.randrange(len(one))]
+        if chance.random() < 0.08:
+            one = (
+                bytes(chance.choice(b"KODLI\0\xff\xf0a") for _ in range(chance.randrange(60))) + one
+            )
+        data += one
+    return data
+
+
+def _difference(*sides: Sequence[CanFrame]) -> str:
+    """The first frame that is another."""
+    texts = [[f"{f.can_id:X} {f.data.hex()} {f.page}" for f in frames] for frames in sides]
+    place, pair = next((n, p) for n, p in enumerate(zip_longest(*texts)) if p[0] != p[1])
+    return f"frame {place} of {len(texts[0])} and {len(texts[1])}: {pair[0]}, {pair[1]}"
+
+
+STATE = (
+    *(
+        "live",
+        "info",
+        "last_live",
+        "last_info",
+        "link",
+        "layout",
+        "cells",
+        "last_cells",
+        "counters",
+    ),
+    *("frame_rate", "losses", "late_frames", "suspect_frames", "live_ns", "last_info_ns"),
+    *("info_bound_ns", "pole_pairs", "output_divisor", "gear_denominator", "_diagnosis_counters"),
+)
+
+
+class Both:
+    """Both cores, given the same calls."""
+
+    def __init__(self, library: Any, seed: int) -> None:
+        self.chance = chance = random.Random(seed)
+        self.escs = [settings(chance, n) for n in range(chance.randint(1, 3))]
+        self.layout = layout(chance, self.escs)
+        self.silent = chance.random() < 0.3
+        self.now = START
+        self.events: tuple[list[Any], list[Any]] = ([], [])
+        self.python = PythonCore(
+            *(self.escs, self.layout, self.now, self.silent),
+        )
+        self.status = self.python.status
+        self.native = NativeCore(
+            library,
+            *(self.escs, self.layout, self.now, self.silent),
+        )
+        self.python.followers = [lambda *event: self.events[0].append(event)]
+        self.native.followers = [lambda *event: self.events[1].append(event)]
+        self.count = 0
+        self._tell()
+
+    def _tell(self) -> None:
+        """What the owner of both knows of the gateway."""
+        for name in GATEWAY:
+            if name != "escs_ok":
+                name = name.removeprefix("gateway_")
+                setattr(self.native.status, name, getattr(self.status, name))
+
+    def call(self, name: str, *arguments: Any) -> None:
+        """One call to both."""
+        getattr(self.python, name)(*arguments)
+        getattr(self.native, name)(*arguments)
+
+    def compare(self) -> None:
+        frames, others = self.python.take(self.now), self.native.take(self.now)
+        assert frames == others, _difference(frames, others)
+        self.count += len(frames)
+        assert self.events[0] == self.events[1], self.events
+        for listed in self.events:
+            listed.clear()
+        assert self.python.link_changes == self.native.link_changes
+        assert self.python.next_deadline() == self.native.next_deadline()
+        for esc, other in zip(self.python.escs, self.native.escs, strict=True):
+            for name in STATE:
+                assert getattr(esc, name) == getattr(other, name), name
+            assert esc.drawn.energy_mw_ns == other.drawn.energy_mw_ns
+            assert esc.drawn.run_time == other.drawn.run_time
+
+    def step(self) -> None:
+        """Something happens, and time passes."""
+        chance = self.chance
+        self.now += (
+            chance.choice(_STEPS) if chance.random() < 0.99 else chance.randrange(30 * SECOND)
+        )
+        esc, what = chance.randrange(len(self.escs)), chance.random()
+        if what < 0.1:
+            pass
+        elif what < 0.12:
+            self.call("port", esc, chance.random() < 0.5, self.now)
+        elif what < 0.13:
+            self.call("apply", esc, settings(chance, esc))
+        elif what < 0.14:
+            self.call("repeat", self.now)
+        elif what < 0.16:
+            other = random_gateway(chance, self.now)
+            for name in GATEWAY:
+                if name != "escs_ok":
+                    name = name.removeprefix("gateway_")
+                    setattr(self.status, name, getattr(other, name))
+            self._tell()
+            self.call("gateway_changed", self.now)
+        else:
+            self._receive(esc)
+        self.call("advance", self.now)
+
+    def _receive(self, esc: int) -> None:
+        chance, data = self.chance, stream(self.chance)
+        cuts = (
+            sorted(chance.randrange(len(data) + 1) for _ in range(chance.randrange(6)))
+            if chance.random() < 0.2
+            else []
+        )
+        for begin, end in zip([0, *cuts], [*cuts, len(data)], strict=True):
+            since = self.now - chance.choice((0, 0, 0, MS, 10 * MS, 200 * MS, 2 * SECOND))
+            self.call("receive", esc, data[begin:end], self.now, since)
+            if chance.random() < 0.3:
+                self.now += chance.randrange(3 * MS)
+
+
+def run(library: Any, seed: int, steps: int = 300) -> int:
+    """Frames compared; 0 for a layout that the core in C does not take."""
+    try:
+        both = Both(library, seed)
+    except NotInCore:
+        return 0
+    both.call("repeat", both.now)
+    both.compare()
+    for _ in range(steps):
+        both.step()
+        both.compare()
+    both.call("stop", both.now)
+    both.compare()
+    return both.count
