@@ -211,7 +211,6 @@ def test_nothing_outside_its_folder_knows_the_wire() -> None:
 
 # Larger than the limits for a reason; at most five.
 EXCEPTIONS = {
-    "function esc/kontronik/deframer.py:Deframer:_scan": 63,  # the contract of the brute-force search in one piece
     "methods canopen/nodes.py:Nodes": 27,  # one for each event of an Output, and what nodes ask of each other
 }
 BANNED_WORDS = re.compile(
