@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from kontronik_can_gw.dbc.messages import Messages, own_ids
-from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscStream, EscTelemetry, Event
+from kontronik_can_gw.esc.stream import EscStream
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import Owner
@@ -43,7 +44,7 @@ class Core(Protocol):
     """As 0.5.0 did, to replay its captures: with each event, so that one step may make several frames of a message."""
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
-        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
+        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (stream.py, Arrival)."""
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         """An ESC's port was opened (again), or cannot be used: its values are not available from now on."""

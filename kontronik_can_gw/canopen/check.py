@@ -16,7 +16,8 @@ from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAPPING
 from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROFILE
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import EscSettings, EscStream
+from kontronik_can_gw.esc.stream import EscStream
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
 
 _UNSIGNED = {

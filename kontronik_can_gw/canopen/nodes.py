@@ -20,7 +20,8 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
 from kontronik_can_gw.canopen.reception import FrameTaker, routes
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.esc.telemetry import EscSettings, EscStream, EscTelemetry
+from kontronik_can_gw.esc.stream import EscStream
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState

@@ -125,7 +125,6 @@ class _Run:
             if loaded.store is not None:
                 loaded.store.close(0)
             raise
-        log.info("core: %s", f"Python ({gateway.why_python})" if gateway.why_python else "C")
         loop = Loop(
             gateway,
             [esc.port for esc in config.esc],
@@ -141,6 +140,7 @@ class _Run:
         # first, because a damaged file is moved aside by now and must be reported
         _say_parameters(loaded)
         loop.open()
+        log.info("core: %s", f"Python ({gateway.why_python})" if gateway.why_python else "C")
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         self._loop = loop

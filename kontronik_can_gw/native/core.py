@@ -14,7 +14,7 @@ from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
 
 _OF_ITS_OWN = Event.SECOND | Event.LINK
-"""What is followed here whoever else follows it."""
+"""Followed here in any case."""
 
 
 class NativeCore:

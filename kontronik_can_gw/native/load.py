@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.core import Core, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.native.compile import shared_object
+from kontronik_can_gw.native.compile import shared_object as shared_object
 from kontronik_can_gw.signals.plan import Layout
 
 PURE = "KONTRONIK_PURE"

@@ -11,7 +11,7 @@ from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.native.tables import COUNTS, GATEWAY
 
 _STREAM = COUNTS.index("long_run_bytes") + 1
-"""So many counters of kcg_esc.count are those of the stream."""
+"""Number of counters in kcg_esc.count that are those of the stream."""
 _COUNT = {name: COUNTS.index(name) for name in ("losses", "late_frames", "suspect_frames")}
 _LINK, _LAYOUT = COUNTS.index("link_state"), COUNTS.index("layout")
 
@@ -64,7 +64,7 @@ class NativeEsc(EscTelemetry):
         self.base = self._window_counters = self._diagnosis_counters = self.counters
 
     def apply(self, settings: EscSettings) -> None:
-        """Other settings from now on; the core is told by its owner."""
+        """Other settings from now on; its owner gives them to the core too."""
         self.settings = settings
         self.pole_pairs = settings.pole_pairs
         self.output_divisor = settings.pole_pairs * settings.gear.numerator

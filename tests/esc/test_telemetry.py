@@ -16,12 +16,12 @@ from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, e
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
     MS,
     SECOND,
     EscSettings,
-    EscStream,
     Event,
     LinkState,
 )

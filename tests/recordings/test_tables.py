@@ -35,7 +35,8 @@ from kontronik_can_gw.desk.recordings.tables.rows import Choice, Row, thinned
 from kontronik_can_gw.desk.recordings.tables.writers import open_table
 from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import Layout
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscStream
+from kontronik_can_gw.esc.stream import EscStream
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
 
 Cells = list[dict[str, Any]]

@@ -19,7 +19,8 @@ from esc import sheet
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscStream, EscTelemetry
+from kontronik_can_gw.esc.stream import EscStream
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 
 # --- bits, counted one by one -------------------------------------------------------------------------------------------

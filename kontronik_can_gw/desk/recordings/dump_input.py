@@ -16,7 +16,8 @@ from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.decoder import Reading
-from kontronik_can_gw.esc.telemetry import SECOND, EscStream, Event
+from kontronik_can_gw.esc.stream import EscStream
+from kontronik_can_gw.esc.telemetry import SECOND, Event
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
 LIVE_RATE = 100.0
