@@ -377,7 +377,12 @@ def test_a_mistake_in_what_writes_ends_nothing(
         patch.setattr(capture_part, "data_payload", fail)
         bed.put(2)
         said: list[str] = []
-        until(lambda: said.extend(r.text for r in bed.it.reports(0)) or bool(said))
+
+        def heard() -> bool:
+            said.extend(report.text for report in bed.it.reports(0))
+            return bool(said)
+
+        until(heard)
         until(lambda: bed.it.facts.lost == 2)
     assert "a mistake of ours" in said[0]
     bed.again()
