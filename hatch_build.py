@@ -14,7 +14,6 @@ class CoreBuild(BuildHookInterface[Any]):
         from kontronik_can_gw.native.compile import compile_core, shared_object
 
         target = shared_object()
-        target.unlink(missing_ok=True)
         if (why := compile_core(target)) is not None:
             self.app.display_warning(f"the core in Python will run: {why}")
         else:

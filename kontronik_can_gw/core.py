@@ -22,6 +22,9 @@ OnEvent = Callable[[int, int, int], None]
 class Core(Protocol):
     """The seam of the core: what the gateway asks of it. In Python it is PythonCore, in C native.core.NativeCore."""
 
+    language: str
+    """``Python`` or ``C``."""
+
     @property
     def escs(self) -> Sequence[EscTelemetry]:
         """The state of each ESC."""
@@ -82,7 +85,9 @@ class Core(Protocol):
 
 
 class PythonCore:
-    """The core in plain Python: reference and fallback. ``silent``: see Messages."""
+    """The core in plain Python. ``silent``: see Messages."""
+
+    language = "Python"
 
     def __init__(
         self,

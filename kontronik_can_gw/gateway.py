@@ -36,8 +36,8 @@ class Gateway:
         packs_at_once: bool = False,
     ) -> None:
         self.core: Core
-        self.why_python = "to replay a capture of 0.5.0"
-        """Why the core is the one in Python; empty where it is the one in C."""
+        self.why_python = ""
+        """Why the core is the one in Python although the one in C was asked for; empty else."""
         if packs_at_once:
             self.core = PythonCore(escs, layout, now, silent_on_loss)
             self.core.packs_at_once = True

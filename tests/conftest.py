@@ -5,6 +5,7 @@ On a vcan neither is wanted so early.
 
 import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -43,13 +44,14 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture
-def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Which core every gateway of the test gets."""
     from kontronik_can_gw.native import load
 
+    monkeypatch.setenv(load.CORE, request.param)
+    load.library.cache_clear()
     found, why = load.library()
-    if request.param == "Python":
-        monkeypatch.setattr(load, "library", lambda: (None, "a test"))
-    elif found is None:
+    if found is None and request.param == "C":
         pytest.skip(f"the core in C: {why}; sudo apt-get install gcc libc6-dev, and install again")
-    return str(request.param)
+    yield request.param
+    load.library.cache_clear()

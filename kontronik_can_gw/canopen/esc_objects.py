@@ -8,13 +8,7 @@ from kontronik_can_gw.canopen.dictionary import Dictionary, signature
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
-from kontronik_can_gw.esc.telemetry import (
-    MAX_GEAR_PART,
-    EscSettings,
-    EscTelemetry,
-    Event,
-    LinkState,
-)
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
 from kontronik_can_gw.gateway_status import GatewayStatus
 
 
@@ -46,8 +40,6 @@ class EscObjects:
         dictionary.bind(at.INFO, 7, read=self._firmware)
         for variable in dictionary.subs(at.SETTINGS):
             variable.written = self.apply_settings
-        for part in (2, 3):
-            dictionary.bind(at.SETTINGS, part, check=_check_gear, written=self.apply_settings)
         dictionary.bind(
             at.RESET_STATISTICS,
             1,
@@ -108,9 +100,3 @@ class EscObjects:
         if text is None:
             raise SdoAbort(Abort.NO_DATA)
         return text.encode("ascii")
-
-
-def _check_gear(value: int) -> None:
-    """A new 2100h:2 or :3, whatever limit the EDS has: larger parts leave the whole numbers of the core."""
-    if value > MAX_GEAR_PART:
-        raise SdoAbort(Abort.TOO_HIGH)

@@ -73,7 +73,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         elif error.errno == errno.ENOSPC:
             discard_output()
             say(f"standard output: cannot be written: {error.strerror}", command)
-        elif error.errno in (errno.EACCES, errno.ENAMETOOLONG) and error.filename is not None:
+        elif (
+            error.errno in (errno.EACCES, errno.ENAMETOOLONG)
+            and error.filename is not None
+            and command != "run"
+        ):
             say(f"{error.filename}: {error.strerror}", command)
         else:
             raise

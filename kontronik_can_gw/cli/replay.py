@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import IO
 
 from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
@@ -149,14 +148,6 @@ def _log_kind(name: str, source: Path, force: bool) -> str:
     if target.is_file() and not force:
         raise UserError(f"{name}: exists. Give another -o, or --force.")
     return SUFFIXES[target.suffix]
-
-
-def _log_writer(
-    file: IO[bytes] | Path, kind: str, recording: Input, start_ns: int, name: str
-) -> CanLogWriter:
-    wall_ns = recording.wall_ns(start_ns)
-    begun_ns = None if wall_ns is None else wall_ns - start_ns
-    return CanLogWriter(file, kind, begun_ns, start_ns, recording.channel, name)
 
 
 def _to_can(args: argparse.Namespace, recording: Input, pace: Pace) -> str:

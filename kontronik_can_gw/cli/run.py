@@ -140,7 +140,8 @@ class _Run:
         # first, because a damaged file is moved aside by now and must be reported
         _say_parameters(loaded)
         loop.open()
-        log.info("core: %s", f"Python ({gateway.why_python})" if gateway.why_python else "C")
+        if gateway.why_python:
+            log.warning("core in Python: %s", gateway.why_python)
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         self._loop = loop

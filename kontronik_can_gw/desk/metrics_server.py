@@ -1,5 +1,6 @@
 """Serves the metrics of one gateway's status file on a loopback address, by prometheus_client and the standard library's WSGI server."""
 
+import contextlib
 import errno
 import re
 import socket
@@ -18,6 +19,10 @@ from kontronik_can_gw.desk.monitor.status import FOREIGN, MALFORMED, NOT_RUNNING
 from kontronik_can_gw.errors import RunError
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+REQUEST_S = 5.0
+"""Maximum time of a connection."""
+MAX_CLIENTS = 8
+"""At a time; others are turned away."""
 _LOOPBACK = re.compile(r"(localhost|127(\.[0-9]{1,3}){3}|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 
 
@@ -47,10 +52,34 @@ def metrics_of(file: Path, now: int) -> list[Metric]:
 
 
 class _Server(ThreadingWSGIServer):
-    """A thread for each client; the service's TasksMax limits their number."""
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        self._places = threading.BoundedSemaphore(MAX_CLIENTS)
+        super().__init__(*arguments, **more)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._places.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a client, for no longer than ``REQUEST_S``."""
+        end = threading.Timer(REQUEST_S, _end, (request,))
+        end.daemon = True
+        end.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            end.cancel()
+            self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that ends early or never comes to an end is no fault of ours."""
+
+
+def _end(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it has ended already
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Server6(_Server):
@@ -58,9 +87,6 @@ class _Server6(_Server):
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = 5.0
-    """Seconds without a byte of the client."""
-
     def log_message(self, *_: object) -> None:
         """A log of all requests is of no use."""
 

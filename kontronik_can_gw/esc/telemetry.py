@@ -14,8 +14,6 @@ from kontronik_can_gw.esc.protocols import PROTOCOLS
 
 MS = 1_000_000
 SECOND = 1000 * MS
-MAX_GEAR_PART = 0xFFFF
-"""Of numerator and denominator of a gear, as a master can set it."""
 INFO_TIMEOUT_NS = 10 * SECOND
 """Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
 

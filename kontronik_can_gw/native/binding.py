@@ -9,23 +9,15 @@ from typing import Any
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.compile import source_number
-from kontronik_can_gw.native.tables import (
-    COUNTS,
-    GATEWAY,
-    Message,
-    NotInCore,
-    Pair,
-    Piece,
-    Settings,
-    Signal,
-    Tables,
-    settings_of,
-)
+from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
+from kontronik_can_gw.native.tables import COUNTS, GATEWAY, Tables, nearest_settings
 
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
 _ALL_EVENTS = 15
 _AGAIN = 1 << 30
+_MAX_READ = 16384
+"""Bytes that the core is given at once: not more frames than it can keep."""
 _END_OF_TIME = 1 << 61
 """ns: sums of times stay within int64."""
 _u8, _u16, _u32, _u64, _i64, _i32, _p = (
@@ -193,10 +185,12 @@ class Handle:
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         """As Core.receive."""
         self._check(esc, now)
-        receive, core, size = self._library.kcg_receive, self._core, len(data)
-        while (found := receive(core, esc, data, size, now, since)) >= _AGAIN:
-            self._follow(found & ~_AGAIN, now)
-        self._follow(found, now)
+        receive, core = self._library.kcg_receive, self._core
+        for begin in range(0, len(data) or 1, _MAX_READ):
+            part = data[begin : begin + _MAX_READ] if len(data) > _MAX_READ else data
+            while (found := receive(core, esc, part, len(part), now, since)) >= _AGAIN:
+                self._follow(found & ~_AGAIN, now)
+            self._follow(found, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         """As Core.port."""
@@ -219,8 +213,9 @@ class Handle:
         return found
 
     def apply(self, esc: int, settings: EscSettings) -> None:
-        """As Core.apply. NotInCore where its gear is out of range."""
-        self._library.kcg_apply(self._core, esc, c.byref(settings_of(settings)))
+        """As Core.apply."""
+        self._check(esc, 0)
+        self._library.kcg_apply(self._core, esc, c.byref(nearest_settings(settings)))
 
     def gateway_changed(self, now: int) -> None:
         """As Core.gateway_changed."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
+_LIMIT_S = 120
 SOURCES = (FOLDER / "core.h", FOLDER / "core.c")
 FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_FOUND=512")
 """With CAN FD and floats, for reads of 16 KiB."""
@@ -45,11 +46,20 @@ def compile_core(target: Path, options: Sequence[str] = ("-O2", *FOR_LINUX)) -> 
         "-shared",
         number,
         *options,
-        "-o",
-        str(target),
-        str(SOURCES[1]),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return f"{program}: {next(iter(done.stderr.strip().splitlines()), 'failed')}"
+    part = target.with_name(f"{target.name}.part")
+    try:
+        done = subprocess.run(
+            [*command, "-o", str(part), str(SOURCES[1])],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_LIMIT_S,
+        )
+        if done.returncode:
+            part.unlink(missing_ok=True)
+            return f"{program}: {next(iter(done.stderr.strip().splitlines()), 'failed')}"
+        part.replace(target)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{program}: {error}"
     return None

@@ -20,6 +20,8 @@ _OF_ITS_OWN = Event.SECOND | Event.LINK
 class NativeCore:
     """As Core. NotInCore where the core in C cannot express the layout or an ESC's settings."""
 
+    language = "C"
+
     def __init__(
         self,
         library: Any,

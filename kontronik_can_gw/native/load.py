@@ -1,4 +1,4 @@
-"""Which core runs: the one in C where its shared object is there and can express the layout, else the one in Python."""
+"""Which core runs: the one in Python, unless the one in C is asked for, its shared object is there, and it can express the layout."""
 
 import os
 from collections.abc import Sequence
@@ -7,15 +7,15 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.core import Core, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.native.compile import shared_object as shared_object
+from kontronik_can_gw.native.compile import shared_object
 from kontronik_can_gw.signals.plan import Layout
 
-PURE = "KONTRONIK_PURE"
-"""Environment variable: 1 for the core in Python in any case."""
+CORE = "KONTRONIK_CORE"
+"""Environment variable: C asks for the core in C. (It saves little before it turns the loop too.)"""
 
 
 class Made(NamedTuple):
-    """A core, and in words why it is not the one in C; empty where it is."""
+    """A core, and in words why it is not the one in C although that was asked for; empty else."""
 
     core: Core
     why: str
@@ -23,12 +23,12 @@ class Made(NamedTuple):
 
 @cache
 def library() -> tuple[Any, str]:
-    """The shared object, None where it is not to be used, and why."""
-    if os.environ.get(PURE, "0") not in ("", "0"):
-        return None, f"{PURE} is set"
+    """The shared object where it is asked for; None where it is not or cannot be used, and why."""
+    if os.environ.get(CORE, "") != "C":
+        return None, ""
     path = shared_object()
     if not path.exists():
-        return None, f"no {path.name}: there was no C compiler at the installation"
+        return None, f"no {path.name} in this installation"
     try:
         # where memory must not be executed, ctypes itself may not load
         from kontronik_can_gw.native.binding import WrongObject, load
@@ -36,7 +36,7 @@ def library() -> tuple[Any, str]:
         return None, f"ctypes cannot be used here: {error}"
     try:
         return load(path), ""
-    except WrongObject as error:
+    except (WrongObject, OSError) as error:
         return None, str(error)
 
 
@@ -50,7 +50,7 @@ def make_core(
     found, why = library()
     if found is not None:
         from kontronik_can_gw.native.core import NativeCore
-        from kontronik_can_gw.native.tables import NotInCore
+        from kontronik_can_gw.native.rows import NotInCore
 
         try:
             return Made(NativeCore(found, escs, layout, now, silent), "")

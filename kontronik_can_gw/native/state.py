@@ -86,6 +86,12 @@ class NativeEsc(EscTelemetry):
         found: Counters = self._counters_of(*self._state.count[:_STREAM])
         return found
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if (place := _COUNT.get(name)) is not None:
+            self._state.count[place] = value  # as a capture of a later part begins with
+        else:
+            super().__setattr__(name, value)
+
     def __getattr__(self, name: str) -> Any:
         if (place := _COUNT.get(name)) is not None:
             return self._state.count[place]
@@ -141,6 +147,8 @@ def _member(name: str, place: int, kind: Callable[[int], Any] | None) -> propert
 
 class NativeStatus:
     """As GatewayStatus, in the core's memory: its attributes are those of GATEWAY."""
+
+    __slots__ = ("_gateway",)
 
     def __init__(self, gateway: Any) -> None:
         self._gateway = gateway

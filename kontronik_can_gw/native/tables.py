@@ -4,19 +4,20 @@ The proofs are here: no product leaves int64, whatever value comes and whatever 
 the Python core.
 """
 
-import ctypes as c
 import math
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
 from kontronik_can_gw.dbc.schedule import phases
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import MAX_GEAR_PART, EscSettings, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
@@ -42,8 +43,8 @@ ALL_PAGES = 64
 ALL_ESCS = 255
 MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""
-MAX_GEAR = MAX_GEAR_PART
-MAX_POLES = 0xFFFF
+MAX_POLES = MAX_GEAR = 0xFFFF
+MAX_CELLS = 0xFF
 _DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
@@ -52,33 +53,11 @@ _LARGEST_DIVISOR = {
     Divisor.CELLS: (255, 1),
 }
 _M64 = (1 << 64) - 1
+_END_OF_TIME = 1 << 61
+"""ns: sums of times stay within int64."""
 _LIMIT = 1 << 63
 
 
-class NotInCore(ValueError):
-    """The core in C does not have this: the message in words."""
-
-
-def _structure(name: str, **types: Any) -> Any:
-    return type(name, (c.Structure,), {"_fields_": list(types.items())})
-
-
-_u8, _u16, _u32, _u64, _i64 = c.c_uint8, c.c_uint16, c.c_uint32, c.c_uint64, c.c_int64
-Piece = _structure("Piece", shift=_u8, width=_u8, at=_u16)
-Pair = _structure("Pair", number=_i64, raw=_u64)
-Signal = _structure(
-    "Signal", kind=_u8, wire=_u8, place=_u8, shift=_u8, flags=_u8, pieces=_u8, page=_u8, esc=_u8, mask=_u32, first_piece=_u32,
-    first_pair=_u32, pairs=_u32, divisor=_u8, length=_u8, reserved=_u8 * 6, not_on=_u64, mul=_i64, add=_i64, div=_i64, most=_i64, low=_i64,
-    high=_i64, error=_u64, not_available=_u64,
-)  # fmt: skip
-Message = _structure(
-    "Message", id=_u32, length=_u8, words=_u8, flags=_u8, triggers=_u8, pages=_u8, crc_at=_u8, alive_modulus=_u8, fd_flags=_u8,
-    first_signal=_u16, signals=_u16, data_id=_u16, first_page=_u16, first_word=_u32, first_esc=_u32, escs=_u32, cycle=_i64, delay=_i64,
-    phase=_i64,
-)  # fmt: skip
-Settings = _structure(
-    "Settings", timeout=_i64, crc_errors=_u32, poles=_u32, gear_numerator=_u32, gear_denominator=_u32, cells=_u8, reserved=_u8 * 7
-)  # fmt: skip
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
     Group.INFO: Event.INFO,
@@ -115,11 +94,17 @@ class Tables:
         for index, plan in enumerate(layout.messages):
             if plan.length > longest or len(plan.pages) > ALL_PAGES:
                 raise NotInCore(f"{plan.name}: {plan.length} bytes, {len(plan.pages)} pages")
+            if max(plan.cycle_ns, plan.delay_ns) >= _END_OF_TIME:
+                raise NotInCore(
+                    f"{plan.name}: a cycle or distance of {max(plan.cycle_ns, plan.delay_ns)} ns"
+                )
             self._add(plan, silent, starts[index])
             for esc in plan.escs:
                 if self.messages[-1].triggers:
                     listeners[esc].append(index)
         self.listeners = [index for each in listeners for index in each]
+        if max(len(self.signals), self.pages, len(self.listeners)) > 0xFFFF:
+            raise NotInCore(f"{len(self.signals)} signals, {self.pages} pages")
         self.first_listeners = [sum(map(len, listeners[:n])) for n in range(len(escs) + 1)]
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
@@ -246,14 +231,27 @@ _COUNT_OF = {"received_bytes": "bytes"}
 
 
 def settings_of(esc: EscSettings) -> Any:
-    """The settings of an ESC for the core. NotInCore where its gear has larger parts than 2100h."""
+    """The settings of an ESC for the core. NotInCore where they are beyond its limits."""
     numerator, denominator = esc.gear.numerator, esc.gear.denominator
-    if max(numerator, denominator) > MAX_GEAR or esc.pole_pairs > MAX_POLES:
-        raise NotInCore(
-            f"{esc.name}: gear {esc.gear}, {esc.pole_pairs} pole pairs: parts above {MAX_GEAR}"
-        )
+    if max(numerator, denominator) > MAX_GEAR:
+        raise NotInCore(f"{esc.name}: gear {esc.gear}: parts above {MAX_GEAR}")
+    if esc.pole_pairs > MAX_POLES or esc.cell_count > MAX_CELLS:
+        raise NotInCore(f"{esc.name}: {esc.pole_pairs} pole pairs, {esc.cell_count} cells")
     timeout, errors = esc.timeout_ns, min(esc.crc_error_threshold, 0xFFFF_FFFF)
     return Settings(timeout, errors, esc.pole_pairs, numerator, denominator, esc.cell_count)
+
+
+def nearest_settings(esc: EscSettings) -> Any:
+    """As ``settings_of``, of settings that a master wrote: beyond the limits the nearest within them."""
+    gear = esc.gear.limit_denominator(MAX_GEAR)
+    if gear.numerator > MAX_GEAR:
+        gear = (
+            1 / (1 / esc.gear).limit_denominator(MAX_GEAR)
+            if esc.gear < MAX_GEAR
+            else Fraction(MAX_GEAR)
+        )
+    poles, cells = min(esc.pole_pairs, MAX_POLES), min(esc.cell_count, MAX_CELLS)
+    return settings_of(replace(esc, gear=gear, pole_pairs=poles, cell_count=cells))
 
 
 def _places(protocol: EscProtocol) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -315,7 +313,7 @@ def _most(row: Any, signal: SignalPlan, value: Value) -> int:
         end = signal.high + 1 if row.mul > 0 else signal.low - 1
         high = min(high, max(0, -(-(end * row.div - row.add) // row.mul)) if row.mul else high)
     greatest = max(abs(low), abs(high)) * abs(row.mul) * over + abs(row.add) * by
-    if greatest >= _LIMIT or row.div * by >= _LIMIT or by >= _LIMIT:
+    if greatest >= _LIMIT or row.div * by >= _LIMIT or row.div <= 0:
         raise NotInCore("factor and offset leave 64 bits")
     return high
 

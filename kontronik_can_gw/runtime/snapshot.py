@@ -136,7 +136,7 @@ def snapshot(
             "state": name_in_words(status.state.name),
             "esc_count": status.esc_count,
             "escs_ok": status.escs_ok,
-            "core": "Python" if gateway.why_python else "C",
+            "core": gateway.core.language,
             "core_reason": gateway.why_python or None,
         },
         "can": _can(can, status),

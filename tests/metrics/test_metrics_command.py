@@ -7,7 +7,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from http.client import HTTPConnection
+from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +141,14 @@ def test_only_get_of_metrics_is_answered(server: MetricsServer) -> None:
         assert ask(server.port, path, method)[0] == 404
 
 
+def is_answered(port: int) -> bool:
+    """False where the server turns the client away."""
+    try:
+        return ask(port)[0] == 200
+    except (OSError, HTTPException):
+        return False
+
+
 def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
     server: MetricsServer, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,6 +164,52 @@ def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
     with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as mute:
         assert mute.recv(1) == b""
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_clients_that_never_come_to_an_end_delay_no_other(
+    server: MetricsServer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with (
+        socket.create_connection(("127.0.0.1", server.port)) as mute,
+        socket.create_connection(("127.0.0.1", server.port)) as rude,
+    ):
+        rude.sendall(b"\x16\x03\x01\x02\x00\r\n\r\n")
+        assert ask(server.port)[0] == 200
+        mute.send(b"GET /metr")
+        assert ask(server.port)[0] == 200
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_client_that_goes_on_for_ever_is_ended_and_too_many_are_turned_away(
+    server: MetricsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    idle = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(8)]
+    try:
+        for each in idle:
+            each.settimeout(60)
+            each.send(b"G")
+        one_more = socket.create_connection(("127.0.0.1", server.port))
+        one_more.settimeout(60)
+        assert one_more.recv(1) == b""
+    finally:
+        for each in idle:
+            each.close()
+    monkeypatch.setattr(metrics_server, "REQUEST_S", 0.1)
+    end = time.monotonic() + 60
+    while not is_answered(server.port) and time.monotonic() < end:
+        time.sleep(0.01)  # the eight are noticed one by one
+    with socket.create_connection(("127.0.0.1", server.port)) as dripping:
+        dripping.settimeout(0.01)
+        ended = False
+        while not ended and time.monotonic() < end:
+            try:
+                dripping.send(b"G")
+                ended = dripping.recv(1) == b""
+            except TimeoutError:
+                continue
+            except OSError:
+                ended = True
+        assert ended
 
 
 # --- the command

@@ -27,7 +27,8 @@ from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
-from kontronik_can_gw.native.tables import GATEWAY, NotInCore
+from kontronik_can_gw.native.rows import NotInCore
+from kontronik_can_gw.native.tables import GATEWAY
 from kontronik_can_gw.signals.plan import Layout
 
 START = 1_000 * SECOND

@@ -4,7 +4,7 @@ import os
 import platform
 import re
 import time
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings
@@ -71,5 +71,13 @@ def _versions(findings: Findings) -> None:
         version=__version__,
         python=platform.python_version(),
         kernel=platform.release(),
-        packages=", ".join(f"{name} {version(name)}" for name in _PACKAGES),
+        packages=", ".join(filter(None, map(_package, _PACKAGES))),
     )
+
+
+def _package(name: str) -> str:
+    """Its name and version; empty where it is not known."""
+    try:
+        return f"{name} {version(name)}"
+    except PackageNotFoundError:
+        return ""

@@ -58,7 +58,9 @@ class Output:
         self._target = target
         self._part: Path | None = None
         if target is not None and (not target.exists() or target.is_file()):
-            self._part = target.resolve().with_name(f"{target.name}.part")
+            self._part = Path(os.path.realpath(target)).with_name(f"{target.name}.part")
+            if os.path.lexists(self._part):  # another's
+                self._part = self._part.with_name(f"{target.name}.{os.getpid()}.part")
         self._what = what
         self._by_path = form in _BY_PATH
         self._file: IO[bytes] | None = None
@@ -69,7 +71,7 @@ class Output:
             return sys.stdout.buffer
         path = self._part or self._target
         try:
-            self._file = path.open("wb")
+            self._file = open(path, "wb", opener=_own_file if self._part else None)  # noqa: SIM115
         except OSError as error:
             raise RunError(
                 f"{self._target}: cannot be written: {error.strerror}. Give another {self._what}."
@@ -96,7 +98,12 @@ class Output:
             return
         with self._part.open("rb") as file:
             os.fsync(file.fileno())
-        self._part.replace(self._target.resolve())
+        self._part.replace(os.path.realpath(self._target))
+
+
+def _own_file(path: str, flags: int) -> int:
+    """Open what was not there, and follow no link that somebody put there."""
+    return os.open(path, flags | os.O_EXCL | os.O_NOFOLLOW, 0o666)
 
 
 Reached = Callable[[int], None]
