@@ -283,15 +283,15 @@ def test_a_flood_of_wanted_frames_does_not_starve_the_uart(
     """Frame after frame of the ESC is taken while the flood lasts."""
     node = Node(0x602)
     run_node(node)
-    counters = node.escs[0].counters
+    state = node.escs[0]
     flood = subprocess.Popen(["cangen", vcan, "-g", "0", "-I", "602", "-L", "8", "-i"])
     try:
         wait_for(lambda: node.status.received_frames > 100, "the flood")
         for n in range(100):
-            before, flooded = counters.live, node.status.received_frames
+            before, flooded = state.counters.live, node.status.received_frames
             esc.write(encode(LiveData(electrical_speed=n), UartLayout.V4))
             wait_for(
-                lambda before=before: counters.live > before or flood.poll() is not None,  # type: ignore[misc]
+                lambda before=before: state.counters.live > before or flood.poll() is not None,  # type: ignore[misc]
                 f"live frame {n}",
             )
             wait_for(
@@ -299,7 +299,7 @@ def test_a_flood_of_wanted_frames_does_not_starve_the_uart(
                 "the flood goes on",
             )
         assert flood.poll() is None, "to the end"
-        assert counters.live == 100
+        assert state.counters.live == 100
     finally:
         flood.terminate()
         flood.wait()
