@@ -25,36 +25,23 @@ _EVENT_OF_PACE = {
 }
 
 
-class _Message:
-    """One message at work.
-
-    ``last`` holds the last frame of each page, with alive counter 0, of a message that is sent on change; ``pages_to_send`` the
-    places of the pages that have to follow without waiting for an event.
-    """
+class Traits:
+    """How a message is sent, by its plan; the tables of the core in C are made of the same."""
 
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
-        self.plan = plan
-        self.frame = compile_frame(plan)
+        self.by_event = SendType.EVENT in plan.send_type
+        self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
-        self.place = 0
-        self.pages_to_send: set[int] = set()
-        self.alive = 0
-        roles = {signal.role: signal for signal in plan.signals}
-        alive = roles.get(Role.ALIVE)
-        self.alive_modulus = 0 if alive is None else alive_modulus(alive, Role.CRC in roles)
-        self.last: dict[int, CanFrame] = {}
+        # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
+        self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         # messages with the link's state always go on
         self.silent_able = (
             silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         )
-        self.by_event = SendType.EVENT in plan.send_type
-        self.on_change = SendType.ON_CHANGE in plan.send_type
-        # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
-        self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
-        # one that was asked for is sent, and there is nothing to note
-        self.is_stateless = self.is_free and not (
-            self.silent_able or self.on_change or self.alive_modulus
-        )
+        self.follows_gateway = Group.GATEWAY in plan.paces and (self.by_event or self.on_change)
+        roles = {signal.role: signal for signal in plan.signals}
+        alive = roles.get(Role.ALIVE)
+        self.alive_modulus = 0 if alive is None else alive_modulus(alive, Role.CRC in roles)
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:
@@ -65,6 +52,27 @@ class _Message:
                 and not (self.by_event and self.triggers & Event.LIVE)
             ):
                 self.triggers |= Event.SECOND  # counters, rates and ages change all the time
+
+
+class _Message(Traits):
+    """One message at work.
+
+    ``last`` holds the last frame of each page, with alive counter 0, of a message that is sent on change; ``pages_to_send`` the
+    places of the pages that have to follow without waiting for an event.
+    """
+
+    def __init__(self, plan: MessagePlan, silent: bool) -> None:
+        super().__init__(plan, silent)
+        self.plan = plan
+        self.frame = compile_frame(plan)
+        self.place = 0
+        self.pages_to_send: set[int] = set()
+        self.alive = 0
+        self.last: dict[int, CanFrame] = {}
+        # one that was asked for is sent, and there is nothing to note
+        self.is_stateless = self.is_free and not (
+            self.silent_able or self.on_change or self.alive_modulus
+        )
 
     def follows(self, events: int, up: bool) -> bool:
         """Whether these events of an ESC are news to it. ``up``: the ESC's live data is fresh."""
@@ -130,11 +138,7 @@ class Messages:
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
         self._stateless = [m.frame if m.is_stateless else None for m in self._messages]
-        self._of_gateway = [
-            (i, m)
-            for i, m in enumerate(self._messages)
-            if Group.GATEWAY in m.plan.paces and (m.by_event or m.on_change)
-        ]
+        self._of_gateway = [(i, m) for i, m in enumerate(self._messages) if m.follows_gateway]
         self.schedule = Schedule(layout.messages, now)
         self.pending: dict[tuple[int, ...], int] = {}
         """Messages that ``take`` hands over, in groups that became pending together, and since when."""

@@ -68,11 +68,7 @@ class EscStream(EscTelemetry):
         return found
 
     def apply(self, settings: EscSettings) -> None:
-        """Other settings from now on."""
-        self.settings = settings
-        self.pole_pairs = settings.pole_pairs
-        self.output_divisor = settings.pole_pairs * settings.gear.numerator
-        self.gear_denominator = settings.gear.denominator
+        super().apply(settings)
         self.cells = settings.cell_count or self.protocol.value("cell_count", self.info) or 0
 
     def receive_each(self, data: bytes, now: int, since: int) -> Iterator[int]:

@@ -103,6 +103,13 @@ class EscTelemetry:
         """Counters of the whole stream so far."""
         raise NotImplementedError
 
+    def apply(self, settings: EscSettings) -> None:
+        """Other settings from now on."""
+        self.settings = settings
+        self.pole_pairs = settings.pole_pairs
+        self.output_divisor = settings.pole_pairs * settings.gear.numerator
+        self.gear_denominator = settings.gear.denominator
+
     @property
     def up(self) -> bool:
         """True while live telemetry is fresh."""

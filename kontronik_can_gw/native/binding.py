@@ -10,16 +10,13 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.compile import source_number
 from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
-from kontronik_can_gw.native.tables import COUNTS, GATEWAY, Tables, nearest_settings
+from kontronik_can_gw.native.tables import COUNTS, END_OF_TIME, GATEWAY, Tables, nearest_settings
 
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
-_ALL_EVENTS = 15
 _AGAIN = 1 << 30
 _MAX_READ = 16384
 """Bytes that the core is given at once: not more frames than it can keep."""
-_END_OF_TIME = 1 << 61
-"""ns: sums of times stay within int64."""
 _u8, _u16, _u32, _u64, _i64, _i32, _p = (
     *(c.c_uint8, c.c_uint16, c.c_uint32, c.c_uint64, c.c_int64, c.c_int32, c.c_void_p),
 )
@@ -154,7 +151,6 @@ class Handle:
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)
         self._core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
-        self.report_only(_ALL_EVENTS)
         begin = c.addressof(self._memory)
         at = library.kcg_escs(self._core) - begin, library.kcg_gateway(self._core) - begin
         self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, at[0])
@@ -172,14 +168,14 @@ class Handle:
             found = self._library.kcg_next_event(self._core)
 
     def report_only(self, events: int) -> None:
-        """As Core.report_only."""
+        """Give ``on_event`` these alone: bits of telemetry.Event."""
         self._library.kcg_set_mask(self._core, events)
 
     def _check(self, esc: int, now: int) -> None:
         """What a damaged capture may hold never reaches the core."""
         if not 0 <= esc < len(self.escs):
             raise IndexError(f"ESC {esc}")
-        if not 0 <= now < _END_OF_TIME:
+        if not 0 <= now < END_OF_TIME:
             raise OverflowError(f"time {now}")
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:

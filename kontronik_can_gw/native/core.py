@@ -38,7 +38,6 @@ class NativeCore:
         self._followers: Sequence[OnEvent] = ()
         self._handle.report_only(_OF_ITS_OWN)
         self.link_changes: list[int] = []
-        self._settings = list(escs)
         self.shortest_timeout_ns = self._shortest_timeout()
         self.packs_at_once = False
         handle = self._handle
@@ -63,7 +62,6 @@ class NativeCore:
     def apply(self, esc: int, settings: EscSettings) -> None:
         self._handle.apply(esc, settings)
         self.escs[esc].apply(settings)
-        self._settings[esc] = settings
         self.shortest_timeout_ns = self._shortest_timeout()
 
     def pack(self, now: int) -> None:
@@ -77,4 +75,4 @@ class NativeCore:
             follow(esc, events, now)
 
     def _shortest_timeout(self) -> int:
-        return min(settings.timeout_ns for settings in self._settings)
+        return min(esc.settings.timeout_ns for esc in self.escs)

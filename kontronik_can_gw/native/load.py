@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.core import Core, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.native.compile import shared_object
 from kontronik_can_gw.signals.plan import Layout
 
 CORE = "KONTRONIK_CORE"
@@ -26,6 +25,10 @@ def library() -> tuple[Any, str]:
     """The shared object where it is asked for; None where it is not or cannot be used, and why."""
     if os.environ.get(CORE, "") != "C":
         return None, ""
+    from kontronik_can_gw.native.compile import (
+        shared_object,  # a compiler's driver: not at each start
+    )
+
     path = shared_object()
     if not path.exists():
         return None, f"no {path.name} in this installation"

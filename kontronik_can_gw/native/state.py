@@ -63,13 +63,6 @@ class NativeEsc(EscTelemetry):
         self.apply(settings)
         self.base = self._window_counters = self._diagnosis_counters = self.counters
 
-    def apply(self, settings: EscSettings) -> None:
-        """Other settings from now on; its owner gives them to the core too."""
-        self.settings = settings
-        self.pole_pairs = settings.pole_pairs
-        self.output_divisor = settings.pole_pairs * settings.gear.numerator
-        self.gear_denominator = settings.gear.denominator
-
     def follow(self, events: int) -> None:
         """Keep the counters of the begin of the second before, for ``diagnosis``."""
         came_up = False

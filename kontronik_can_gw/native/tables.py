@@ -11,15 +11,16 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
+from kontronik_can_gw.dbc.messages import Traits
 from kontronik_can_gw.dbc.schedule import phases
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import EscSettings, Event
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
 from kontronik_can_gw.signals.packer import alive_modulus, place
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 (
     OF_LIVE, OF_INFO, OF_LAST, OF_POWER, OF_COUNT, OF_ENERGY, OF_RUN_TIME, OF_AGE, OF_RATE, OF_GATEWAY, OF_UPTIME, OF_ALIVE
@@ -53,17 +54,9 @@ _LARGEST_DIVISOR = {
     Divisor.CELLS: (255, 1),
 }
 _M64 = (1 << 64) - 1
-_END_OF_TIME = 1 << 61
+END_OF_TIME = 1 << 61
 """ns: sums of times stay within int64."""
 _LIMIT = 1 << 63
-
-
-_EVENT_OF_PACE = {
-    Group.LIVE: Event.LIVE,
-    Group.INFO: Event.INFO,
-    Group.LINK: Event.LINK,
-    Group.GATEWAY: Event.NONE,
-}
 
 
 class Tables:
@@ -94,7 +87,7 @@ class Tables:
         for index, plan in enumerate(layout.messages):
             if plan.length > longest or len(plan.pages) > ALL_PAGES:
                 raise NotInCore(f"{plan.name}: {plan.length} bytes, {len(plan.pages)} pages")
-            if max(plan.cycle_ns, plan.delay_ns) >= _END_OF_TIME:
+            if max(plan.cycle_ns, plan.delay_ns) >= END_OF_TIME:
                 raise NotInCore(
                     f"{plan.name}: a cycle or distance of {max(plan.cycle_ns, plan.delay_ns)} ns"
                 )
@@ -109,15 +102,10 @@ class Tables:
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.signals if s.role is Role.CRC), None)
-        alive = next((s for s in plan.signals if s.role is Role.ALIVE), None)
-        by_event, on_change = SendType.EVENT in plan.send_type, SendType.ON_CHANGE in plan.send_type
-        flags = EVENT * by_event | ON_CHANGE * on_change | HAS_CRC * (crc is not None)
-        if silent and plan.paces & {Group.LIVE, Group.INFO} and Group.LINK not in plan.paces:
-            flags |= SILENT
-        if Group.GATEWAY in plan.paces and (by_event or on_change):
-            flags |= OF_THE_GATEWAY
-        if not (plan.cycle_ns or plan.delay_ns or len(plan.pages) > 1):
-            flags |= FREE
+        traits = Traits(plan, silent)
+        flags = EVENT * traits.by_event | ON_CHANGE * traits.on_change | HAS_CRC * (crc is not None)
+        flags |= SILENT * traits.silent_able | OF_THE_GATEWAY * traits.follows_gateway
+        flags |= FREE * traits.is_free
         first, words = len(self.signals), max(1, -(-plan.length // 8))
         first_word = len(self.constants)
         for page in plan.pages:
@@ -130,9 +118,9 @@ class Tables:
         self.messages.append(
             Message(
                 plan.can_id | (EXTENDED if plan.extended else 0),
-                *(plan.length, words, flags, _triggers(plan), len(plan.pages)),
+                *(plan.length, words, flags, traits.triggers, len(plan.pages)),
                 crc.pieces[0].at // 8 if crc else 0,
-                alive_modulus(alive, crc is not None) & 0xFF if alive else 0,
+                traits.alive_modulus,
                 *(int(plan.fd), first, len(self.signals) - first, plan.data_id & 0xFFFF),
                 *(self.pages, first_word, first_esc, len(plan.escs)),
                 *(plan.cycle_ns, plan.delay_ns, phase),
@@ -267,18 +255,6 @@ def _places(protocol: EscProtocol) -> tuple[list[tuple[int, int]], list[tuple[in
     return found
 
 
-def _triggers(plan: MessagePlan) -> int:
-    if not plan.send_type & (SendType.EVENT | SendType.ON_CHANGE):
-        return Event.NONE
-    found = Event.NONE
-    for pace in plan.paces:
-        found |= _EVENT_OF_PACE[pace]
-    follows_live = SendType.EVENT in plan.send_type and found & Event.LIVE
-    if found & Event.LINK and not plan.cycle_ns and not follows_live:
-        found |= Event.SECOND
-    return found
-
-
 def _constants(plan: MessagePlan, page: int | None, words: int) -> list[int]:
     bits = 0
     for signal in plan.signals:
@@ -330,8 +306,3 @@ def _scale_float(row: Any, signal: SignalPlan, value: Value) -> None:
     greatest = max(map(abs, _range(row, value))) * abs(row.mul) * over
     if signal.numbers is None and max(greatest, row.div * by) >= exact:
         raise NotInCore("factor leaves 53 bits")
-
-
-def packed(rows: Sequence[Any], kind: Any) -> bytes:
-    """The bytes of a table."""
-    return bytes((kind * len(rows))(*rows))

@@ -74,7 +74,7 @@ def test_without_an_object_for_this_machine_the_one_in_python_runs(
     path = tmp_path / "core-other.so"
     if content is not None:
         path.write_text(content)
-    monkeypatch.setattr(load, "shared_object", lambda: path)
+    monkeypatch.setattr(compiling, "shared_object", lambda: path)
     said = why()
     begin = "no core-other.so in this installation" if content is None else "core-other.so: "
     assert said.startswith(begin) and "\n" not in said
