@@ -10,6 +10,7 @@ from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import Tables
+from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
 
@@ -54,6 +55,19 @@ class NativeCore:
     def followers(self, given: Sequence[OnEvent]) -> None:
         self._followers = given
         self._handle.report_only(Event.ALL if given else _OF_ITS_OWN)
+
+    def turns(self) -> Turns:
+        """Whole turns of a loop with this core."""
+        return Turns(self._handle.library, self._handle.core, len(self.escs))
+
+    def follow(self, found: int, now: int) -> None:
+        """Follow an event that a turn came back with, and what else there is."""
+        self._handle.follow(found, now)
+
+    @property
+    def reports_live(self) -> bool:
+        """True while somebody follows each live frame."""
+        return bool(self._followers)
 
     @property
     def is_pending(self) -> bool:
