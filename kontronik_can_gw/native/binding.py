@@ -99,6 +99,7 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "kcg_set_mask": (None, _p, _u32),
     "kcg_pending": (_u32, _p),
     "kcg_turn": (None, _p),
+    "kcg_watch": (c.c_int, _p),
     "kcg_turns_size": (_u32,),
 }
 
