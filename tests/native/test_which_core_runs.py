@@ -1,4 +1,4 @@
-"""The core in C runs where it is asked for and can; where it cannot, the one in Python does, and the gateway says why."""
+"""The core in C runs where it can; where it cannot, the one in Python does, and the gateway says why."""
 
 import builtins
 import stat
@@ -34,8 +34,8 @@ VOLTAGE = 'BatteryVoltage : 0|16@1+ ({},0) [0|0] "V"'
 
 
 @pytest.fixture(autouse=True)
-def asked_for(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv(load.CORE, "C")
+def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv(load.PURE, raising=False)
     load.library.cache_clear()
     yield
     load.library.cache_clear()
@@ -55,16 +55,16 @@ def why(**settings: object) -> str:
 
 
 @pytest.mark.usefixtures("built")
-def test_it_is_the_one_in_c_where_that_is_asked_for() -> None:
+@pytest.mark.parametrize("pure", [None, "", "0"])
+def test_it_is_the_one_in_c(monkeypatch: pytest.MonkeyPatch, pure: str | None) -> None:
+    if pure is not None:
+        monkeypatch.setenv(load.PURE, pure)
     assert why() == ""
 
 
-def test_it_is_the_one_in_python_where_nothing_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv(load.CORE)
-    gateway = Gateway([EscSettings()], EMPTY, 0)
-    assert (type(gateway.core), gateway.why_python) == (PythonCore, "")
+def test_it_is_the_one_in_python_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(load.PURE, "1")
+    assert why() == "KONTRONIK_PURE is set"
 
 
 @pytest.mark.parametrize("content", [None, "no object, but long enough to look like one" * 9])
