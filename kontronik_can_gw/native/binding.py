@@ -8,7 +8,7 @@ from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.native.compile import source_number
+from kontronik_can_gw.native.objects import source_number
 from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
 from kontronik_can_gw.native.tables import COUNTS, END_OF_TIME, GATEWAY, Tables, nearest_settings
 

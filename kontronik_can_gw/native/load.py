@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.core import Core, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.native.objects import fault, shared_object
 from kontronik_can_gw.signals.plan import Layout
 
 PURE = "KONTRONIK_PURE"
@@ -25,13 +26,9 @@ def library() -> tuple[Any, str]:
     """The shared object; None where it cannot or is not to be used, and why."""
     if os.environ.get(PURE, "0") not in ("", "0"):
         return None, f"{PURE} is set"
-    from kontronik_can_gw.native.compile import (
-        shared_object,  # a compiler's driver: not at each start
-    )
-
     path = shared_object()
-    if not path.exists():
-        return None, f"no {path.name} in this installation"
+    if why := fault(path):
+        return None, why
     try:
         # where memory must not be executed, ctypes itself may not load
         from kontronik_can_gw.native.binding import WrongObject, load
