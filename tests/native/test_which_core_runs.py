@@ -3,6 +3,7 @@
 import builtins
 import os
 import stat
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -48,6 +49,11 @@ def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def built() -> None:
     if not objects.shared_object().exists():
         pytest.skip("no core in C: sudo apt-get install gcc libc6-dev, and install again")
+
+
+def layout_of(signal: str, more: str = "") -> Layout:
+    database = parse_database((HEAD.format(signal) + more).encode(), "t.dbc")
+    return prepare(database, "t.dbc", (EscSettings(),), DbcSettings())[1]
 
 
 def why(**settings: object) -> str:
@@ -158,13 +164,31 @@ def test_a_gear_beyond_its_limits_runs_in_python() -> None:
     assert f"parts above {MAX_GEAR}" in why(gear=Fraction(MAX_GEAR + 1))
 
 
+SPEEDS = 'MotorSpeed : 0|32@1+ (1,0) [0|0] "rpm" Car\n SG_ OutputSpeed : 32|32@1+ (1,0) [0|0] "rpm"'
+NOT_AVAILABLE = 0xFFFF_FFFF
+
+
 @pytest.mark.usefixtures("built")
-def test_what_a_master_writes_beyond_its_limits_is_the_nearest_within() -> None:
-    gateway = Gateway([EscSettings()], EMPTY, 0)
-    gears = Fraction(100_000, 7), Fraction(42857143, 5_000_000), Fraction(1, 10**9), Fraction(10**9)
-    for gear in gears:
-        gateway.core.apply(0, EscSettings(gear=gear, pole_pairs=100_000, cell_count=300))
-    assert gateway.escs[0].settings.gear == 10**9
+def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available() -> None:
+    gateway = Gateway([EscSettings(pole_pairs=7)], layout_of(SPEEDS), 0)
+    assert gateway.core.language == "C"
+    for now, (poles, gear, motor, output) in enumerate(
+        (
+            (7, Fraction(490_909, 50_000), 10_000, 1_019),
+            (7, Fraction(1, MAX_GEAR + 1), NOT_AVAILABLE, NOT_AVAILABLE),
+            (7, Fraction(MAX_GEAR + 2, 2), NOT_AVAILABLE, NOT_AVAILABLE),
+            (100_000, Fraction(1), NOT_AVAILABLE, NOT_AVAILABLE),
+            (7, Fraction(5), 10_000, 2_000),
+        )
+    ):
+        given = EscSettings(pole_pairs=poles, gear=gear)
+        gateway.core.apply(0, given)
+        assert gateway.escs[0].settings == given
+        time = now * SECOND // 10
+        live = encode(LiveData(electrical_speed=70_000), codec.Layout.V4)
+        gateway.receive_bytes(0, live, time, time)
+        (frame,) = gateway.take_frames(time)
+        assert struct.unpack("<2I", frame.data) == (motor, output), given
 
 
 @pytest.mark.usefixtures("built")
@@ -186,9 +210,7 @@ def test_another_esc_protocol_runs_in_python(monkeypatch: pytest.MonkeyPatch) ->
     ],
 )
 def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str) -> None:
-    database = parse_database((HEAD.format(signal) + more).encode(), "t.dbc")
-    layout = prepare(database, "t.dbc", (EscSettings(),), DbcSettings())[1]
-    gateway = Gateway([EscSettings()], layout, 0)
+    gateway = Gateway([EscSettings()], layout_of(signal, more), 0)
     assert isinstance(gateway.core, PythonCore) and gateway.why_python
 
 
