@@ -39,11 +39,12 @@ class Gateway:
         packs_at_once: bool = False,
     ) -> None:
         self.core: Core
-        self.why_python = ""
-        """Why the core is the one in Python although the one in C was asked for; empty else."""
+        self.why_python: str
+        """Why the core is the one in Python; empty with the one in C."""
         if packs_at_once:
             self.core = PythonCore(escs, layout, now, silent_on_loss)
             self.core.packs_at_once = True
+            self.why_python = "a capture of 0.5.0 is replayed"
         else:
             self.core, self.why_python = make_core(escs, layout, now, silent_on_loss)
         self.escs, self.status = self.core.escs, self.core.status

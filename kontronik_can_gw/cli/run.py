@@ -101,6 +101,7 @@ class _Run:
 
     def _opened(self) -> "Loop":
         """The loop with everything open. The parsed DBC is freed at the end of this method."""
+        from kontronik_can_gw.native.load import in_words
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.native_poller import poller_for
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
@@ -135,8 +136,7 @@ class _Run:
         # first, because a damaged file is moved aside by now and must be reported
         _say_parameters(loaded)
         loop.open()
-        if gateway.why_python:
-            log.warning("core in Python: %s", gateway.why_python)
+        log.info("%s", in_words(gateway.core.language, gateway.why_python))
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         self._loop = loop

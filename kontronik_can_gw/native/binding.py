@@ -8,9 +8,9 @@ from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.native.compile import source_number
+from kontronik_can_gw.native.objects import source_number
 from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
-from kontronik_can_gw.native.tables import COUNTS, END_OF_TIME, GATEWAY, Tables, nearest_settings
+from kontronik_can_gw.native.tables import COUNTS, END_OF_TIME, GATEWAY, Tables, held_settings
 
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
@@ -215,7 +215,7 @@ class Handle:
     def apply(self, esc: int, settings: EscSettings) -> None:
         """As Core.apply."""
         self._check(esc, 0)
-        self.library.kcg_apply(self.core, esc, c.byref(nearest_settings(settings)))
+        self.library.kcg_apply(self.core, esc, c.byref(held_settings(settings)))
 
     def gateway_changed(self, now: int) -> None:
         """As Core.gateway_changed."""

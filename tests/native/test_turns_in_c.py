@@ -107,7 +107,7 @@ class World:
         self.bus.close()
 
     def replayed(self, monkeypatch: pytest.MonkeyPatch) -> list[CanFrame]:
-        monkeypatch.delenv(load.CORE)
+        monkeypatch.setenv(load.PURE, "1")
         load.library.cache_clear()
         gateway = Gateway(self.escs, self.layout, self.begun)
         assert gateway.core.language == "Python"
@@ -119,7 +119,7 @@ class World:
 
 @pytest.fixture(autouse=True)
 def _core_in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv(load.CORE, "C")
+    monkeypatch.delenv(load.PURE, raising=False)
     load.library.cache_clear()
     if load.library()[0] is None:
         pytest.skip(f"the core in C: {load.library()[1]}")
