@@ -31,6 +31,7 @@ TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
     *("gateway", "golden", "dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
     *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
+    *("runtime/test_hold_ups.py", "runtime/test_can_hold_ups.py"),
 )
 """Files and folders of tests of what the core does: they run on the core in C and on the one in Python."""
 
@@ -39,19 +40,23 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run the tests of the core on both."""
     path = Path(str(metafunc.module.__file__)).relative_to(TESTS)
     if any(path.is_relative_to(each) for each in ON_BOTH_CORES):
-        metafunc.fixturenames.append("core_language")
         metafunc.parametrize("core_language", ["C", "Python"], indirect=True)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Which core every gateway of the test gets."""
+    """Which core every gateway of the test gets: the one named, where one is."""
+    language = getattr(request, "param", "")
+    if not language:
+        yield ""
+        return
     from kontronik_can_gw.native import load
 
-    monkeypatch.setenv(load.PURE, str(int(request.param == "Python")))
-    load.library.cache_clear()
-    found, why = load.library()
-    if found is None and request.param == "C":
+    monkeypatch.setenv(load.PURE, str(int(language == "Python")))
+    library = load.library
+    library.cache_clear()
+    found, why = library()
+    if found is None and language == "C":
         pytest.skip(f"the core in C: {why}; sudo apt-get install gcc libc6-dev, and install again")
-    yield request.param
-    load.library.cache_clear()
+    yield language
+    library.cache_clear()

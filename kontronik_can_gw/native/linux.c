@@ -13,7 +13,7 @@
 #include "linux.h"
 
 #define MS INT64_C(1000000)
-#define ASK_ALL (10 * MS) /* how long ago it may be that all ports were asked: by that much values may seem older */
+#define ASK_ALL (10 * MS) /* by how much values may seem older, where others come meanwhile, for the sake of fewer questions */
 #define BYTE_NS (11 * INT64_C(1000000000) / 115200)
 enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72, READ_SIZE = 4096, MAX_READS = KCG_READ / READ_SIZE };
 
@@ -169,7 +169,7 @@ static void ask_read(kcg_turns *t)
 static int wait_for_turn(kcg_turns *t)
 {
     struct epoll_event events[AT_ONCE];
-    int64_t due = kcg_next_deadline(t->core), wake = t->now + t->period, begun = now_ns(), limit = MS * 3600000;
+    int64_t due = kcg_next_deadline(t->core), wake = t->asked + t->period, begun = now_ns(), limit = MS * 3600000;
     if (t->due < due)
         due = t->due;
     if (wake < due)
@@ -222,7 +222,7 @@ void kcg_turn(kcg_turns *t)
             t->late = 0;
             break;
         }
-        if (t->now - t->asked >= ASK_ALL)
+        if (t->now - t->asked >= (t->period < ASK_ALL ? t->period : ASK_ALL))
             ask_all(t);
         else
             ask_read(t);

@@ -23,7 +23,7 @@ typedef struct {
     kcg *core;
     kcg_input *inputs;
     int64_t now, asked, before, late;    /* the last turn; when was asked what is ready, and the time before; how late that was */
-    int64_t due, leave, period, max_late, max_turn; /* the loop's deadline; when to come back; the longest wait; limits of lateness */
+    int64_t due, leave, period, max_late, max_turn; /* the loop's deadline; when to come back; how often all are to be asked; limits of lateness */
     int32_t epoll, bus, found;           /* descriptors; an event to be followed; below 0: none */
     uint32_t count, ready, unsent, taken, turns, records, recorded;
     struct pollfd fds[KCG_FDS];

@@ -3,10 +3,12 @@
 Time goes on only where the loop waits, and where a test says that the process is held up.
 """
 
+import os
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from typing import cast
 
+import native_world
 import pytest
 
 from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -23,6 +25,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT
@@ -121,8 +124,8 @@ class Wire:
     def fileno(self) -> int:
         return _FIRST_PORT + self._number
 
-    def read(self) -> bytes:
-        count = min(self.waiting, _MAX_READ)
+    def read(self, most: int = _MAX_READ) -> bytes:
+        count = min(self.waiting, most)
         data = bytes(self._bytes[self._read : self._read + count])
         self._read += count
         self.drained = not self.waiting
@@ -151,7 +154,7 @@ class Wire:
 class Bus:
     """A CAN interface: ``sent`` with times, ``inbox`` with the times at which frames came."""
 
-    reports_full = True
+    reports_full = is_socket = True
     gone = False
 
     def __init__(self, world: "World") -> None:
@@ -251,18 +254,26 @@ class World:
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         pause = max(0, due - self.now)
-        self.now = max(self.now, min(self.now + -(-pause // MS) * MS, *self._arrivals()))
-        self.now += self.hold_up()
+        self.pass_until(self.now + -(-pause // MS) * MS)
+        self.look()
         self.late = self.now - last - pause
+        return [(self.handlers[fd], 1) for fd in self.ready()]
+
+    def pass_until(self, until: int) -> None:
+        """Time goes by until something comes; then the process may stand still."""
+        self.now = max(self.now, min(until, *self._arrivals()))
+        self.now += self.hold_up()
+
+    def look(self) -> None:
+        """It is asked what is ready."""
         self.before, self.looked = self.looked, self.now
         self.looks.append(self.now)
-        ready = [(wire.fileno(), wire.waits_to_be_read) for wire in self.wires]
-        ready.append((CAN_FD, self.bus.waits_to_be_read))
-        return [
-            (self.handlers[fd], 1)
-            for fd, is_ready in ready
-            if is_ready and fd in self.handlers.keys() - self.blind
-        ]
+
+    def ready(self) -> list[int]:
+        """The descriptors that are."""
+        found = [wire.fileno() for wire in self.wires if wire.waits_to_be_read]
+        found += [CAN_FD] * self.bus.waits_to_be_read
+        return [fd for fd in found if fd in self.handlers.keys() - self.blind]
 
     def _arrivals(self) -> list[int]:
         found = [wire.next_arrival for wire in self.wires if wire.fileno() not in self.blind]
@@ -319,12 +330,13 @@ def loop_in(
     by_path = {wire.path: wire for wire in world.wires}
     patch.setattr(can_link, "open_can", open_bus)
     patch.setattr(esc_input, "SerialPort", lambda path, _protocol: by_path[path])
+    if in_c := os.environ.get(load.PURE, "1") != "1":
+        patch.setattr(load, "library", lambda: (native_world.library(), ""))
     gateway = Gateway(escs, layout or layout_of(escs), world.now, canopen=canopen)
     config = CanConfig(interface="virtual", channel="world")
     paths = list(by_path)
-    return Loop(
-        gateway, paths, config, True, clock=world.clock, poller=world.poller, notifier=notifier
-    )
+    poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller
+    return Loop(gateway, paths, config, True, clock=world.clock, poller=poller, notifier=notifier)
 
 
 def run(loop: Loop, world: World, until: int) -> None:

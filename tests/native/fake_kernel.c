@@ -1,0 +1,104 @@
+/* What linux.c asks of the kernel, answered by a test. Compiled with it and with -D macros that give each call its name here. */
+#define _GNU_SOURCE
+#include <errno.h>
+#include <poll.h>
+#include <stdint.h>
+#include <string.h>
+#include <sys/epoll.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+typedef struct {
+    int64_t (*now)(void);
+    void (*wait)(int64_t until, int all); /* until something has come; then the process may stand still */
+    int (*ready)(int fd);
+    int (*size)(int fd, int most);        /* how many bytes a read gives: `data` then has them */
+    int (*send)(const uint8_t *frame, int size); /* 0: it is not taken */
+} kernel;
+static kernel k;
+uint8_t fake_data[1 << 16];
+static struct { int fd; struct epoll_event e; } watched[64];
+static int count;
+
+void fake_use(const kernel *given)
+{
+    k = *given;
+}
+
+int fake_clock_gettime(clockid_t id, struct timespec *t)
+{
+    int64_t now = k.now();
+    (void)id;
+    t->tv_sec = now / 1000000000, t->tv_nsec = now % 1000000000;
+    return 0;
+}
+
+int fake_epoll_create1(int flags)
+{
+    (void)flags;
+    count = 0;
+    return 1;
+}
+
+int fake_close(int fd)
+{
+    (void)fd;
+    return 0;
+}
+
+int fake_epoll_ctl(int epoll, int what, int fd, struct epoll_event *e)
+{
+    (void)epoll, (void)what;
+    watched[count].fd = fd;
+    watched[count++].e = *e;
+    return 0;
+}
+
+int fake_epoll_wait(int epoll, struct epoll_event *events, int most, int ms)
+{
+    int found = 0;
+    (void)epoll;
+    k.wait(k.now() + (int64_t)ms * 1000000, 0);
+    for (int i = 0; i < count && found < most; i++)
+        if (k.ready(watched[i].fd)) {
+            events[found] = watched[i].e;
+            events[found++].events = EPOLLIN;
+        }
+    return found;
+}
+
+int fake_poll(struct pollfd *fds, nfds_t n, int ms)
+{
+    int found = 0;
+    (void)ms;
+    if (n == (nfds_t)count)
+        k.wait(0, 1);
+    for (nfds_t i = 0; i < n; i++) {
+        fds[i].revents = k.ready(fds[i].fd) ? POLLIN : 0;
+        found += fds[i].revents != 0;
+    }
+    return found;
+}
+
+ssize_t fake_read(int fd, void *data, size_t most)
+{
+    int size = k.size(fd, (int)most);
+    if (size <= 0) {
+        errno = EAGAIN;
+        return -1;
+    }
+    memcpy(data, fake_data, (size_t)size);
+    return size;
+}
+
+int fake_sendmmsg(int fd, struct mmsghdr *m, unsigned n, int flags)
+{
+    (void)fd, (void)flags;
+    for (unsigned i = 0; i < n; i++)
+        if (!k.send(m[i].msg_hdr.msg_iov->iov_base, (int)m[i].msg_hdr.msg_iov->iov_len)) {
+            errno = EAGAIN;
+            return i ? (int)i : -1;
+        }
+    return (int)n;
+}

@@ -1,0 +1,94 @@
+"""The World for a loop that turns in C: what linux.c asks of the kernel is answered by it (tests/native/fake_kernel.c)."""
+
+import ctypes as c
+import struct
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.native.binding import load
+from kontronik_can_gw.native.compile import compile_core
+from kontronik_can_gw.native.objects import OPTIONS
+from kontronik_can_gw.runtime.native_poller import NativePoller
+from kontronik_can_gw.runtime.poller import Handler
+from kontronik_can_gw.transmit_queue import Sent
+
+if TYPE_CHECKING:
+    from wire_world import World
+
+_CALLS = ("clock_gettime", "epoll_create1", "epoll_ctl", "epoll_wait", "close", "poll", "read")
+_KERNEL = Path(__file__).parents[1] / "native" / "fake_kernel.c"
+_HEAD = struct.Struct("=IB3x")
+
+
+class _Kernel(c.Structure):
+    _fields_ = (
+        ("now", c.CFUNCTYPE(c.c_int64)),
+        ("wait", c.CFUNCTYPE(None, c.c_int64, c.c_int)),
+        ("ready", c.CFUNCTYPE(c.c_int, c.c_int)),
+        ("size", c.CFUNCTYPE(c.c_int, c.c_int, c.c_int)),
+        ("send", c.CFUNCTYPE(c.c_int, c.POINTER(c.c_uint8), c.c_int)),
+    )
+
+
+@cache
+def library() -> Any:
+    """The core in C with this kernel."""
+    names = [f"-D{call}=fake_{call}" for call in (*_CALLS, "sendmmsg")]
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder, "core.so")
+        assert compile_core(target, ("-O1", *OPTIONS, *names, str(_KERNEL))) is None
+        return load(target)
+
+
+class FakeNativePoller(NativePoller):
+    """Waits as the world says, in Python and in C."""
+
+    def __init__(self, world: "World", gateway: Gateway) -> None:
+        super().__init__(gateway, world.clock)
+        self._world = world
+        self._data = (c.c_uint8 * (1 << 16)).in_dll(library(), "fake_data")
+        kinds: list[Any] = [kind for _, kind in _Kernel._fields_]
+        calls = (world.clock, self._wait, self._is_ready, self._read, self._send)
+        self._kernel = _Kernel(*(kind(call) for kind, call in zip(kinds, calls, strict=True)))
+        library().fake_use(c.byref(self._kernel))
+
+    def register(self, fd: int, handler: Handler, events: int = 1, esc: int | None = None) -> None:
+        self._world.register(fd, handler)
+        if fd >= 1000:  # the others are real ones
+            self._watched[fd] = (handler, events, esc)
+            self.changes += 1
+
+    def unregister(self, fd: int) -> None:
+        del self._watched[fd]
+        self._world.unregister(fd)
+        self.changes += 1
+
+    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+        ready = self._world.wait(last, due)
+        self.before, self.now = self._world.before, self._world.looked
+        self.late = self._world.late
+        return ready
+
+    def _wait(self, until: int, asks: int) -> None:
+        if asks:
+            self._world.look()
+        else:
+            self._world.pass_until(until)
+
+    def _is_ready(self, fd: int) -> int:
+        return int(fd in self._world.ready())
+
+    def _read(self, fd: int, most: int) -> int:
+        data = self._world.wires[fd - 1000].read(most)
+        c.memmove(self._data, data, len(data))
+        return len(data)
+
+    def _send(self, frame: Any, size: int) -> int:
+        raw = bytes(frame[:size])
+        number, length = _HEAD.unpack_from(raw)
+        of = CanFrame(number & ~EXTENDED, raw[8 : 8 + length], number >= EXTENDED, size > 16)
+        return int(self._world.bus.send(of) is Sent.OK)
