@@ -175,6 +175,7 @@ case $what in
         install_small_tools
         install_vm uml
         install_browser
+        install_programs "a second C compiler" clang
         install_programs "systemd and a broker" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients
         tests/foreign/install.sh || say "tests with the masters named above are left out"
         ;;

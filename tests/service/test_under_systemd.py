@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from kontronik_can_gw.native.objects import shared_object
+
 pytestmark = pytest.mark.extended
 
 HERE = Path(__file__).resolve().parent
@@ -194,6 +196,11 @@ def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> 
     assert set(probe) == {*needed, *refused}
     assert [name for name in needed if probe[name] != "works"] == []
     assert [name for name, error in refused.items() if error not in probe[name]] == []
+
+
+@pytest.mark.skipif(not shared_object().exists(), reason="the core in C was not built")
+def test_the_cage_lets_the_core_in_c_be_loaded(facts: Facts) -> None:
+    assert "core: C" in [message for _, message in facts["log"]]
 
 
 def test_metrics_are_served_and_the_gateway_still_has_no_ip(facts: Facts) -> None:
