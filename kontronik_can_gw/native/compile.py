@@ -10,7 +10,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 _LIMIT_S = 120
 SOURCES = (FOLDER / "core.h", FOLDER / "core.c")
-FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_FOUND=512")
+FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_FOUND=512", "-DKCG_SLICES=8")
 """With CAN FD and floats, for reads of 16 KiB."""
 
 

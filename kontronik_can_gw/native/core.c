@@ -2,9 +2,6 @@
 
 #include <string.h>
 
-#ifndef KCG_SLICES
-#define KCG_SLICES 8 /* tables of the CRC-32: 8 kB for 8, 1 kB for 1, 64 bytes for 0 */
-#endif
 #define SECOND INT64_C(1000000000)
 #define BYTE_NS (11 * SECOND / 115200)
 #define INFO_TIMEOUT (10 * SECOND)
@@ -13,6 +10,8 @@
 enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
 enum { KNOWN = 1, TO_SEND = 2 };             /* of a page: its last frame is known; it follows without an event */
 enum { VOLTAGE_AT = 4, CURRENT_AT = 6, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
+#define PAGES_OF(m) (KCG_PAGED ? (m)->pages : 1)
+#define WORDS_OF(m) (WORDS == 1 ? 1u : (m)->words) /* of 64 bits, that a frame has */
 
 /* --- CRC-32 ---------------------------------------------------------------------------------------------------------- */
 
@@ -285,14 +284,35 @@ static int lose(kcg_esc *e, int state)
     return events;
 }
 
+/* When live data, or info, is too old; KCG_NEVER where there is none. */
+static int64_t end_of_live(const kcg_esc *e)
+{
+    return e->has_live ? e->live_bound + e->settings.timeout + 1 : KCG_NEVER;
+}
+
+static int64_t end_of_info(const kcg_esc *e)
+{
+    return e->has_info ? e->info_bound + INFO_TIMEOUT + 1 : KCG_NEVER;
+}
+
+static int64_t earlier(int64_t a, int64_t b)
+{
+    return a < b ? a : b;
+}
+
+static int64_t esc_deadline(const kcg_esc *e)
+{
+    return earlier(e->window_ns + SECOND, earlier(end_of_live(e), end_of_info(e)));
+}
+
 static int expire_esc(kcg_esc *e, int64_t now)
 {
     int events = 0;
-    if (e->has_live && now - e->live_bound > e->settings.timeout) {
+    if (now >= end_of_live(e)) {
         e->count[KCG_N_LOSSES]++;
         events = lose(e, KCG_LOST);
     }
-    if (e->has_info && now - e->info_bound > INFO_TIMEOUT) {
+    if (now >= end_of_info(e)) {
         forget_device(e);
         events |= KCG_INFO;
     }
@@ -303,14 +323,18 @@ static int close_window(kcg_esc *e, int64_t now)
 {
     uint32_t new[4], *old = e->window;
     note_window(e, new);
-    int64_t length = now - e->window_ns, frames = new[0] - old[0], tenths = frames * (10 * SECOND);
-    int64_t q = tenths / length, r = tenths % length;
-    e->rate = e->has_live ? (int32_t)(q + (2 * r > length || (2 * r == length && q & 1))) : 0;
-    e->interval = e->has_live && frames ? length / frames : 0;
+    int64_t length = now - e->window_ns, frames = new[0] - old[0];
     int bad = new[3] - old[3] >= e->settings.crc_errors || (uint64_t)(new[1] - old[1]) * 10 > new[2] - old[2];
     e->window_ns = now;
     memcpy(old, new, sizeof new);
-    return KCG_SECOND | (e->has_live ? set_link(e, bad ? KCG_DEGRADED : KCG_OK) : 0);
+    e->rate = 0;
+    e->interval = 0;
+    if (!e->has_live)
+        return KCG_SECOND;
+    if (frames)
+        e->interval = length / frames;
+    e->rate = (int32_t)((20 * SECOND * frames + length) / (2 * length)); /* halves up */
+    return KCG_SECOND | set_link(e, bad ? KCG_DEGRADED : KCG_OK);
 }
 
 static int accept_info(kcg_esc *e, const uint8_t *body, int64_t when, int64_t bound)
@@ -367,16 +391,6 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
         note_window(e, e->window);
     }
     return events | KCG_LIVE;
-}
-
-static int64_t esc_deadline(const kcg_esc *e)
-{
-    int64_t due = e->window_ns + SECOND;
-    if (e->has_live && e->live_bound + e->settings.timeout + 1 < due)
-        due = e->live_bound + e->settings.timeout + 1;
-    if (e->has_info && e->info_bound + INFO_TIMEOUT + 1 < due)
-        due = e->info_bound + INFO_TIMEOUT + 1;
-    return due;
 }
 
 /* --- values to bits (twin: packer.py, values.py) --------------------------------------------------------------------- */
@@ -503,14 +517,14 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
 {
     const kcg_plan *plan = g->plan;
     const kcg_signal *s = plan->signal + m->first_signal, *end = s + m->signals;
-    memcpy(bits, plan->constant + m->first_word + (size_t)place * m->words, m->words * sizeof *bits);
+    memcpy(bits, plan->constant + m->first_word + (size_t)place * WORDS_OF(m), WORDS_OF(m) * sizeof *bits);
     for (; s < end; s++) {
         if (s->page != KCG_PAGES && s->page != place)
             continue;
         uint64_t raw = raw_of(g, s, now, alive);
         const kcg_piece *p = plan->piece + s->first_piece;
         for (int i = 0; i < s->pieces; i++, p++)
-            bits[p->at / 64] |= (raw >> p->shift & (~UINT64_C(0) >> (64 - p->width))) << p->at % 64;
+            bits[WORDS == 1 ? 0 : p->at / 64] |= (raw >> p->shift & (~UINT64_C(0) >> (64 - p->width))) << p->at % 64;
     }
 }
 
@@ -518,8 +532,7 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
 
 static int64_t due_of(const kcg *g, uint32_t i)
 {
-    const kcg_sending *s = &g->sending[i];
-    return s->cycle_due < s->deferred ? s->cycle_due : s->deferred;
+    return earlier(g->sending[i].cycle_due, g->sending[i].deferred);
 }
 
 static void put_in_heap(kcg *g, uint32_t place, uint32_t i)
@@ -577,7 +590,7 @@ static void let_follow(kcg *g, uint32_t i, int place)
 /* Let all pages follow, of a message that has several. */
 static void let_all_follow(kcg *g, uint32_t i)
 {
-    int pages = g->plan->message[i].pages;
+    int pages = PAGES_OF(&g->plan->message[i]);
     for (int place = 0; pages > 1 && place < pages; place++)
         let_follow(g, i, place);
 }
@@ -598,7 +611,7 @@ static void turn_page(kcg *g, uint32_t i)
 static int next_place(kcg *g, uint32_t i)
 {
     const kcg_message *m = &g->plan->message[i];
-    if (m->pages <= 1)
+    if (PAGES_OF(m) <= 1)
         return 0;
     if (!g->sending[i].pages_to_send)
         turn_page(g, i);
@@ -628,12 +641,12 @@ static int is_news(kcg *g, uint32_t i, int64_t now)
     int changed = 0;
     if (m->flags & KCG_EVENT || !(m->flags & KCG_ON_CHANGE))
         return 1;
-    for (int place = 0; place < m->pages; place++) {
+    for (int place = 0; place < PAGES_OF(m); place++) {
         pack(g, m, place, now, 0, bits);
         if (!(g->page[m->first_page + place] & KNOWN) ||
-            memcmp(bits, g->last + m->first_word + (size_t)place * m->words, m->words * sizeof *bits)) {
+            memcmp(bits, g->last + m->first_word + (size_t)place * WORDS_OF(m), WORDS_OF(m) * sizeof *bits)) {
             changed = 1;
-            if (m->pages > 1)
+            if (PAGES_OF(m) > 1)
                 let_follow(g, i, place);
         }
     }
@@ -688,7 +701,7 @@ void kcg_repeat(kcg *g, int64_t now)
 {
     for (uint32_t i = 0; i < g->plan->messages; i++) {
         const kcg_message *m = &g->plan->message[i];
-        for (int place = 0; place < m->pages; place++)
+        for (int place = 0; place < PAGES_OF(m); place++)
             g->page[m->first_page + place] &= TO_SEND;
         if (!m->cycle) {
             let_all_follow(g, i);
@@ -765,7 +778,7 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     const kcg_message *m = &g->plan->message[i];
     kcg_sending *s = &g->sending[i];
     uint64_t bits[WORDS];
-    if (s->why & CYCLE && m->pages > 1) {
+    if (s->why & CYCLE && PAGES_OF(m) > 1) {
         s->why = REQUEST | TURNED; /* once, however often it is taken before it is sent */
         turn_page(g, i);
     }
@@ -776,7 +789,7 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
     for (int k = 0; k < m->length; k++, bits[(k - 1) / 8] >>= 8)
         f->data[k] = (uint8_t)bits[k / 8];
-    if (m->flags & KCG_HAS_CRC)
+    if (KCG_E2E && m->flags & KCG_HAS_CRC)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
 }
 
@@ -811,7 +824,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
         kcg_sending *s = &g->sending[i];
         int why = s->why;
         if (is_silent(g, m)) {
-            for (int place = 0; place < m->pages; place++)
+            for (int place = 0; place < PAGES_OF(m); place++)
                 g->page[m->first_page + place] &= KNOWN;
             s->pages_to_send = 0;
             s->why = 0;
@@ -824,7 +837,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
         }
         make_frame(g, i, now, &frames[g->taken++]);
         g->pending[kept++] = (uint16_t)i;
-        if (g->stopping && s->pages_to_send > 1) {
+        if (KCG_PAGED && g->stopping && s->pages_to_send > 1) {
             k++; /* its other pages go next */
             break;
         }
@@ -842,10 +855,12 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
         kcg_sending *s = &g->sending[i];
         int place = next_place(g, i);
         uint8_t *page = &g->page[m->first_page + place];
-        s->pages_to_send = (uint8_t)(s->pages_to_send - (*page / TO_SEND & 1));
-        *page &= KNOWN;
+        if (KCG_PAGED) {
+            s->pages_to_send = (uint8_t)(s->pages_to_send - (*page / TO_SEND & 1));
+            *page &= KNOWN;
+        }
         if (m->flags & KCG_ON_CHANGE) {
-            pack(g, m, place, now, 0, g->last + m->first_word + (size_t)place * m->words);
+            pack(g, m, place, now, 0, g->last + m->first_word + (size_t)place * WORDS_OF(m));
             *page = KNOWN;
         }
         s->alive = (uint16_t)(s->alive < m->last_alive ? s->alive + 1 : 0);
@@ -855,9 +870,11 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
             s->cycle_deferred = 0;
             if (s->deferred != KCG_NEVER)
                 s->deferred = KCG_NEVER, moved(g, i);
-            if (g->stopping && s->pages_to_send)
+            if (!KCG_PAGED || !s->pages_to_send)
+                continue;
+            if (g->stopping)
                 s->why = REQUEST, g->pending[kept++] = (uint16_t)i;
-            else if (s->pages_to_send)
+            else
                 defer(g, i, now + (m->delay > MIN_DISTANCE ? m->delay : MIN_DISTANCE));
         }
     }
@@ -874,9 +891,7 @@ static void report(kcg *g, int esc, int events, int64_t now)
     on_event(g, esc, events, now);
     if (events & (KCG_LINK | KCG_INFO)) {
         int64_t ok = 0;
-        int64_t due = esc_deadline(&g->esc[esc]);
-        if (due < g->next_expiry)
-            g->next_expiry = due;
+        g->next_expiry = earlier(g->next_expiry, esc_deadline(&g->esc[esc]));
         for (int i = 0; i < g->plan->escs; i++)
             ok += g->esc[i].has_live;
         if (ok != g->gateway[KCG_ESCS_OK]) {
@@ -894,11 +909,8 @@ static void report(kcg *g, int esc, int events, int64_t now)
 static int64_t first_expiry(const kcg *g)
 {
     int64_t first = KCG_NEVER;
-    for (int i = 0; i < g->plan->escs; i++) {
-        int64_t due = esc_deadline(&g->esc[i]);
-        if (due < first)
-            first = due;
-    }
+    for (int i = 0; i < g->plan->escs; i++)
+        first = earlier(first, esc_deadline(&g->esc[i]));
     return first;
 }
 
@@ -984,9 +996,7 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     g->again = 0;
     if (e->arrivals && now - e->arrival_bound[0] > e->settings.timeout)
         flush(e);
-    int64_t bound = since + ((int64_t)size - 1) * BYTE_NS;
-    if (bound > now) /* a pseudo terminal is faster than the wire */
-        bound = now;
+    int64_t bound = earlier(now, since + ((int64_t)size - 1) * BYTE_NS); /* a pseudo terminal is faster than the wire */
     g->read_esc = esc;
     g->read_now = now;
     g->read_bound = bound;
@@ -1029,9 +1039,7 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
 int64_t kcg_next_deadline(kcg *g)
 {
     int64_t due = g->next_expiry ? g->next_expiry : first_expiry(g);
-    if (g->heaped && due_of(g, g->heap[0]) < due)
-        due = due_of(g, g->heap[0]);
-    return due;
+    return g->heaped ? earlier(due, due_of(g, g->heap[0])) : due;
 }
 
 void kcg_apply(kcg *g, int esc, const kcg_settings *settings)

@@ -18,6 +18,15 @@
 #ifndef KCG_LEGACY
 #define KCG_LEGACY 1 /* 0: the V4 frame layout only */
 #endif
+#ifndef KCG_PAGED
+#define KCG_PAGED 1  /* 0: no multiplexed messages */
+#endif
+#ifndef KCG_E2E
+#define KCG_E2E 1    /* 0: no message with a CRC of AUTOSAR E2E profile 1 */
+#endif
+#ifndef KCG_SLICES
+#define KCG_SLICES 0 /* tables of the CRC-32: none but 64 bytes, 1 (1 kB of RAM) or, for 64-bit machines, 8 (8 kB) */
+#endif
 #ifndef KCG_SOURCE
 #define KCG_SOURCE 0 /* a number of these sources, for kcg_sizes */
 #endif
