@@ -9,7 +9,7 @@ from typing import Any
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.compile import source_number
-from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
+from kontronik_can_gw.native.rows import Message, NotInCore, Settings, Signal
 from kontronik_can_gw.native.tables import (
     END_OF_TIME,
     GATEWAY,
@@ -42,7 +42,7 @@ class Frame(c.Structure):
 
 
 class Plan(c.Structure):
-    """kcg_plan."""
+    """kcg_plan: as Tables.arrays and Tables.counts."""
 
     _fields_ = (
         *((name, _p) for name in ("message", "signal", "piece", "pair", "constant")),
@@ -137,18 +137,8 @@ class Handle:
             raise NotInCore(f"fields on the wire: {tables.wire}")
         self._library = library
         self._on_event = on_event
-        self._kept = [
-            self._array(Message, tables.messages),
-            self._array(Signal, tables.signals),
-            self._array(Piece, tables.pieces),
-            self._array(Pair, tables.pairs),
-            self._array(_u64, tables.constants),
-            self._array(_u16, tables.esc_of),
-            self._array(_u16, tables.listeners),
-            self._array(_u16, tables.first_listeners),
-        ]
-        counts = (len(tables.constants), len(tables.messages), len(tables.settings), tables.pages)
-        self._plan = Plan(*(c.addressof(table) for table in self._kept), *counts)
+        self._kept = [self._array(*table) for table in tables.arrays.values()]
+        self._plan = Plan(*map(c.addressof, self._kept), *tables.counts.values())
         size = library.kcg_size(c.byref(self._plan))
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)

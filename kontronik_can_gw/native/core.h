@@ -61,7 +61,10 @@ enum {
     KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED] */
     KCG_OF_ALIVE    /* the message's alive counter, up to `div` */
 };
-enum { KCG_ESCS_OK = 0, KCG_STARTED = 11, KCG_OF_GATEWAY_COUNT = 12 }; /* of kcg.gateway; the others are the owner's */
+enum { /* of kcg.gateway; KCG_ESCS_OK is the core's, KCG_STARTED kcg_init's, the others are the owner's */
+    KCG_ESCS_OK, KCG_GATEWAY_STATE, KCG_CAN_STATE, KCG_ESC_COUNT, KCG_SENT_FRAMES, KCG_REPLACED_FRAMES, KCG_SEND_FAILURES,
+    KCG_RECEIVED_FRAMES, KCG_BUS_OFF_COUNT, KCG_DROPPED_FRAMES, KCG_ID_CONFLICTS, KCG_STARTED, KCG_OF_GATEWAY_COUNT
+};
 enum { KCG_U8, KCG_I8, KCG_U16, KCG_I16, KCG_U32 };
 enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
 /* Counters of a stream, then what is counted like them. Twin: deframer.Counters. */

@@ -7,6 +7,7 @@ the Python core.
 import math
 import struct
 from collections.abc import Sequence
+from ctypes import c_uint16, c_uint64
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -68,6 +69,7 @@ class Tables:
         self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False, longest: int = 64
     ) -> None:
         self.names = [plan.name for plan in layout.messages]
+        self.signal_names: list[str] = []
         self.signals: list[Any] = []
         self.messages: list[Any] = []
         self.pieces: list[Any] = []
@@ -101,6 +103,26 @@ class Tables:
         if max(len(self.signals), self.pages, len(self.listeners)) > 0xFFFF:
             raise NotInCore(f"{len(self.signals)} signals, {self.pages} pages")
         self.first_listeners = [sum(map(len, listeners[:n])) for n in range(len(escs) + 1)]
+
+    @property
+    def arrays(self) -> dict[str, tuple[Any, list[Any]]]:
+        """The tables of kcg_plan in its order: their type and rows."""
+        return {
+            "message": (Message, self.messages),
+            "signal": (Signal, self.signals),
+            "piece": (Piece, self.pieces),
+            "pair": (Pair, self.pairs),
+            "constant": (c_uint64, self.constants),
+            "esc_of": (c_uint16, self.esc_of),
+            "listener": (c_uint16, self.listeners),
+            "first_listener": (c_uint16, self.first_listeners),
+        }
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """The numbers of kcg_plan in its order."""
+        words, messages, escs = map(len, (self.constants, self.messages, self.settings))
+        return {"words": words, "messages": messages, "escs": escs, "pages": self.pages}
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.signals if s.role is Role.CRC), None)
@@ -157,6 +179,7 @@ class Tables:
             except NotInCore as error:
                 raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
         self.signals.append(row)
+        self.signal_names.append(f"{plan.name}.{signal.name}")
 
     def _source(self, row: Any, value: Value, esc: int | None) -> None:
         row.divisor = _DIVISORS[value.divisor]
