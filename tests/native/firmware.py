@@ -38,7 +38,7 @@ class Case:
         self.folder = folder
         self.silent = chance.random() < 0.3
         while True:
-            self.escs = escs or [equality.settings(chance, n) for n in range(chance.randint(1, 3))]
+            self.escs = escs or equality.some_escs(chance)
             self.layout = layout or equality.layout(chance, self.escs)
             try:
                 licence = shipped("LICENSE").read_text(encoding="utf-8")
