@@ -5,7 +5,8 @@
 #   test      and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and small tools that
 #             some tests look through the eyes of
 #   test-all  and User Mode Linux in any case, systemd, a browser, an MQTT broker, the CANopen masters of others (tests/foreign)
-#   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
+#   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB; clang, cross
+#             compilers and their QEMU
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
@@ -138,6 +139,14 @@ install_small_tools() {
     install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl
 }
 
+install_clang() { install_programs "a second C compiler, with a fuzzer" clang=clang,libclang-rt-dev; }
+
+install_cross() {
+    install_programs "the core in C on other machines" arm-none-eabi-gcc=gcc-arm-none-eabi,libnewlib-arm-none-eabi \
+        arm-linux-gnueabihf-gcc=gcc-arm-linux-gnueabihf,libc6-dev-armhf-cross aarch64-linux-gnu-gcc=gcc-aarch64-linux-gnu,libc6-dev-arm64-cross \
+        s390x-linux-gnu-gcc=gcc-s390x-linux-gnu,libc6-dev-s390x-cross qemu-system-arm qemu-arm=qemu-user
+}
+
 install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }
 
 # The faults that set clocks and mount file systems are never tried on the machine itself.
@@ -168,9 +177,18 @@ case $what in
         install_small_tools
         install_vm uml
         install_browser
+        install_clang
         install_programs "systemd and a broker" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients
         tests/foreign/install.sh || say "tests with the masters named above are left out"
         ;;
-    release) install_compiler; install_project test '.[test]'; install_vcan; install_vm uml; install_vm qemu ;;
+    release)
+        install_compiler
+        install_project test '.[test]'
+        install_vcan
+        install_vm uml
+        install_vm qemu
+        install_clang
+        install_cross
+        ;;
     *) die "$what: demo, lint, test, test-all or release" ;;
 esac
