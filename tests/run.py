@@ -57,7 +57,7 @@ STEPS = {
     "mutants": "python tests/mutants/mutants.py --compare tests/mutants/version_0_5_0.json",
     "put-in": "python tests/mutants/put_in_faults.py",
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
-    "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} -s tests/native/test_fuzz.py",
+    "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} -s -o faulthandler_timeout=900 tests/native/test_fuzz.py",
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),

@@ -49,6 +49,7 @@ MAX_COUNT = 1 << 48
 MAX_POLES = MAX_GEAR = 0xFFFF
 MAX_CELLS = 0xFF
 MAX_ALIVE = 1 << 16
+MAX_BITS = 64
 _DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
@@ -152,6 +153,8 @@ class Tables:
         self.pages += len(plan.pages)
 
     def _add_signal(self, signal: SignalPlan, plan: MessagePlan, has_crc: bool) -> None:
+        if signal.length > MAX_BITS:
+            raise NotInCore(f"{plan.name}.{signal.name}: {signal.length} bits")
         first_piece = len(self.pieces)
         for piece in signal.pieces:  # never across 64 bits
             width = min(piece.width, 64 - piece.at % 64)
