@@ -6,7 +6,8 @@
 #             some tests look through the eyes of
 #   test-all  and User Mode Linux in any case, systemd, a browser, an MQTT broker, the CANopen masters of others (tests/foreign)
 #   wheels    as `lint`, and cross compilers and qemu-user
-#   release   as `test` and `wheels`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
+#   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB; clang, cross
+#             compilers and their QEMU
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
@@ -139,6 +140,8 @@ install_small_tools() {
     install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl
 }
 
+install_clang() { install_programs "a second C compiler, with a fuzzer" clang=clang,libclang-rt-dev; }
+
 install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }
 
 # The faults that set clocks and mount file systems are never tried on the machine itself.
@@ -156,6 +159,11 @@ install_vm() { # $1: uml or qemu
 
 # With a C compiler the core in C is built when the project is installed; without one the core in Python runs.
 install_compiler() { command -v cc >/dev/null || command -v gcc >/dev/null || install_programs "a C compiler" gcc=gcc,libc6-dev; }
+
+install_other_machines() {
+    install_programs "the core in C on other machines" arm-none-eabi-gcc=gcc-arm-none-eabi,libnewlib-arm-none-eabi \
+        s390x-linux-gnu-gcc=gcc-s390x-linux-gnu,libc6-dev-s390x-cross qemu-system-arm
+}
 
 install_cross_compilers() {
     install_programs "compilers for other machines" x86_64-linux-gnu-gcc=gcc-x86-64-linux-gnu,libc6-dev-amd64-cross \
@@ -175,11 +183,20 @@ case $what in
         install_small_tools
         install_vm uml
         install_browser
-        install_programs "a second C compiler" clang
+        install_clang
         install_programs "systemd and a broker" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients
         tests/foreign/install.sh || say "tests with the masters named above are left out"
         ;;
+    release)
+        install_compiler
+        install_project test '.[test]'
+        install_vcan
+        install_vm uml
+        install_vm qemu
+        install_clang
+        install_cross_compilers
+        install_other_machines
+        ;;
     wheels) install_project test '.[test]'; install_cross_compilers ;;
-    release) install_compiler; install_project test '.[test]'; install_vcan; install_vm uml; install_vm qemu; install_cross_compilers ;;
     *) die "$what: demo, lint, test, test-all, wheels or release" ;;
 esac

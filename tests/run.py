@@ -6,7 +6,8 @@ test      lint (ruff), types (mypy), unit (pytest on this machine), vcan (pytest
 test-all  what `test` leaves out: faults (the fault programme in User Mode Linux) and, by the marker "extended", tools (the service
           under a real systemd, a browser, a broker ...) and masters (CANopen masters of others, and more, on a vcan)
 release   by hand, on a quiet machine: qemu (the fault programme on emulated hardware), soak (random faults), hour (recorded),
-          mutants (share of a sample that the tests kill, not below that of 0.5.0), put-in (a list of faults that they must see)
+          mutants (share of a sample that the tests kill, not below that of 0.5.0), put-in (a list of faults that they must see),
+          machines (the exported core on other machines), fuzz (the core in C under fuzzers, ten minutes each)
 
 The lanes of a tier run side by side. A step runs once, and what it prints appears when it ends. Exit code 0: all that ran has
 passed. What could not be run is listed with the line that enables it; with CI=true that and each skipped test is a failure. The
@@ -56,15 +57,30 @@ STEPS = {
     "mutants": "python tests/mutants/mutants.py --compare tests/mutants/version_0_5_0.json",
     "put-in": "python tests/mutants/put_in_faults.py",
     "wheels": "python tests/native/wheels.py {scratch}",
+    "machines": f"{PYTEST} -s tests/native/on_machines.py",
+    "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} -s -o faulthandler_timeout=900 tests/native/test_fuzz.py",
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
     "test-all": (("faults",), ("tools", "masters")),
-    "release": (("qemu", "soak", "hour", "mutants", "put-in", "wheels"),),
+    "release": (("qemu", "soak", "hour", "mutants", "put-in", "machines", "fuzz", "wheels"),),
 }
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
 """Of one step: the two that CI runs end within its 90 minutes whatever happens."""
 ENABLE_UML = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
+CROSS = (
+    *(
+        "arm-none-eabi-gcc",
+        "arm-linux-gnueabihf-gcc",
+        "aarch64-linux-gnu-gcc",
+        "s390x-linux-gnu-gcc",
+    ),
+    *("qemu-system-arm", "qemu-arm"),
+)
+ENABLE_CROSS = (
+    "sudo apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi gcc-arm-linux-gnueabihf libc6-dev-armhf-cross "
+    "gcc-aarch64-linux-gnu libc6-dev-arm64-cross gcc-s390x-linux-gnu libc6-dev-s390x-cross qemu-system-arm qemu-user"
+)
 ENABLE_VCAN = (
     f"{ENABLE_UML}  (or, on Ubuntu, linux-modules-extra-{platform.release()} can-utils iproute2)"
 )
@@ -76,6 +92,8 @@ NEEDS = {
         ("aarch64-linux-gnu-gcc", "arm-linux-gnueabihf-gcc", "qemu-arm"),
         "sudo apt-get install gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user",
     ),
+    "machines": (CROSS, ENABLE_CROSS),
+    "fuzz": (("clang",), "sudo apt-get install clang"),
 }
 """What a step needs besides Python, "vcan" being a kernel with one, and the line that enables it."""
 

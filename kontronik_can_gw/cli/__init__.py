@@ -39,6 +39,7 @@ COMMANDS = {
     "simulate": "simulate ESCs on pseudo terminals",
     "mqtt": "publish the ESCs' values from the bus to an MQTT broker",
     "metrics": "serve a gateway's statistics for Prometheus",
+    "export": "write the core in C with the tables of the DBC in use, for a firmware",
     "schema": "print the JSON Schema of the configuration",
     "describe": "what is sent and what it means: messages, objects, errors with remedies",
     "completion": "print the completion script of a shell",

@@ -211,8 +211,9 @@ class EscStream(EscTelemetry):
     def _close_window(self, now: int) -> int:
         old, new = self._window_counters, self.counters
         frames = new.live - old.live
-        self.frame_rate = round(frames * 10 * SECOND / (now - self._window_ns)) if self.up else 0
-        self._interval_ns = (now - self._window_ns) // frames if self.up and frames else 0
+        length = now - self._window_ns
+        self.frame_rate = (20 * SECOND * frames + length) // (2 * length) if self.up else 0
+        self._interval_ns = length // frames if self.up and frames else 0
         dropped, received = new.dropped_bytes - old.dropped_bytes, new.bytes - old.bytes
         bad = (
             new.crc_errors - old.crc_errors >= self.settings.crc_error_threshold

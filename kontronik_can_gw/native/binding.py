@@ -9,8 +9,14 @@ from typing import Any
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.objects import source_number
-from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
-from kontronik_can_gw.native.tables import COUNTS, END_OF_TIME, GATEWAY, Tables, held_settings
+from kontronik_can_gw.native.rows import Message, NotInCore, Settings, Signal
+from kontronik_can_gw.native.tables import (
+    END_OF_TIME,
+    GATEWAY,
+    STORED_COUNTS,
+    Tables,
+    held_settings,
+)
 
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
@@ -36,7 +42,7 @@ class Frame(c.Structure):
 
 
 class Plan(c.Structure):
-    """kcg_plan."""
+    """kcg_plan: as Tables.arrays and Tables.counts."""
 
     _fields_ = (
         *((name, _p) for name in ("message", "signal", "piece", "pair", "constant")),
@@ -46,31 +52,27 @@ class Plan(c.Structure):
     )
 
 
-class Arrival(c.Structure):
-    _fields_ = (("end", _u64), ("bound", _i64))
-
-
 class Esc(c.Structure):
     """kcg_esc: the state of an ESC."""
 
     _fields_ = (
+        *((name, _u8) for name in ("has_live", "has_info", "had_live", "had_info", "has_time")),
+        *((name, _u8) for name in ("turns", "cells", "held_count", "need", "arrivals")),
+        *((name, _u8) for name in ("blame", "reported", "link", "layout")),
+        *((name, _i32) for name in ("rate", "power")),
         ("settings", Settings),
-        ("count", _u64 * (len(COUNTS) - 3)),
-        ("window", _u64 * 4),
-        ("before", _u64 * 4),
-        *((name, _u64) for name in ("base", "blame_until", "energy")),
-        *((name, _i64) for name in ("energy_rest", "run_time", "power", "live_ns", "live_bound")),
-        *((name, _i64) for name in ("info_ns", "info_bound", "last_info_ns", "window_ns")),
-        ("interval", _i64),
-        ("arrival", Arrival * (HELD + 1)),
-        ("rate", _i32),
+        ("count", _u64 * STORED_COUNTS),
+        ("window", _u32 * 4),
+        *((name, _u32) for name in ("base", "blame_until")),
+        ("energy", _u64),
+        *((name, _i64) for name in ("energy_rest", "run_time", "live_ns", "live_bound")),
+        *((name, _i64) for name in ("info_bound", "last_info_ns", "window_ns", "interval")),
+        ("arrival_bound", _i64 * (HELD + 1)),
+        ("arrival_end", _u32 * (HELD + 1)),
         ("generation", _u32),
         ("live", _u8 * BODY),
         ("info", _u8 * BODY),
         ("held", _u8 * (HELD + LONGEST)),
-        *((name, _u8) for name in ("has_live", "has_info", "had_live", "had_info", "has_time")),
-        *((name, _u8) for name in ("turns", "cells", "held_count", "need", "arrivals")),
-        *((name, _u8) for name in ("blame", "reported")),
     )
 
 
@@ -138,18 +140,8 @@ class Handle:
             raise NotInCore(f"fields on the wire: {tables.wire}")
         self.library = library
         self._on_event = on_event
-        self._kept = [
-            self._array(Message, tables.messages),
-            self._array(Signal, tables.signals),
-            self._array(Piece, tables.pieces),
-            self._array(Pair, tables.pairs),
-            self._array(_u64, tables.constants),
-            self._array(_u16, tables.esc_of),
-            self._array(_u16, tables.listeners),
-            self._array(_u16, tables.first_listeners),
-        ]
-        counts = (len(tables.constants), len(tables.messages), len(tables.settings), tables.pages)
-        self._plan = Plan(*(c.addressof(table) for table in self._kept), *counts)
+        self._kept = [self._array(*table) for table in tables.arrays.values()]
+        self._plan = Plan(*map(c.addressof, self._kept), *tables.counts.values())
         size = library.kcg_size(c.byref(self._plan))
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)

@@ -7,6 +7,7 @@ runs on the Python core; settings beyond them that a master writes to 2100h leav
 import math
 import struct
 from collections.abc import Sequence
+from ctypes import c_uint16, c_uint64
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -29,10 +30,11 @@ WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
 COUNTS = (
     "bytes", "live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds", "dropped_noise", "dropped_crc",
-    "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes", "link_state", "layout", "losses", "late_frames", "suspect_frames",
-    "live_frames", "info_frames", "dropped_bytes",
+    "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes", "losses", "late_frames", "suspect_frames",
+    "link_state", "layout", "live_frames", "info_frames", "dropped_bytes",
 )  # fmt: skip
-"""Of kcg_esc.count, in its order; the last three are sums."""
+"""Of kcg_esc.count, in its order; the last ones are states and sums."""
+STORED_COUNTS = COUNTS.index("link_state")
 GATEWAY = (
     "escs_ok", "gateway_state", "can_state", "esc_count", "sent_frames", "replaced_frames", "send_failures", "received_frames",
     "bus_off_count", "dropped_frames", "id_conflicts", "started_ns",
@@ -47,6 +49,8 @@ MAX_COUNT = 1 << 48
 MAX_POLES = MAX_CELLS = 0xFF
 MAX_GEAR = 0xF_FFFF
 """Of numerator and denominator of a gear in its lowest terms: 9.81818 has 490909 and 50000."""
+MAX_ALIVE = 1 << 16
+MAX_BITS = 64
 _DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
@@ -67,6 +71,7 @@ class Tables:
         self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False, longest: int = 64
     ) -> None:
         self.names = [plan.name for plan in layout.messages]
+        self.signal_names: list[str] = []
         self.signals: list[Any] = []
         self.messages: list[Any] = []
         self.pieces: list[Any] = []
@@ -101,6 +106,26 @@ class Tables:
             raise NotInCore(f"{len(self.signals)} signals, {self.pages} pages")
         self.first_listeners = [sum(map(len, listeners[:n])) for n in range(len(escs) + 1)]
 
+    @property
+    def arrays(self) -> dict[str, tuple[Any, list[Any]]]:
+        """The tables of kcg_plan in its order: their type and rows."""
+        return {
+            "message": (Message, self.messages),
+            "signal": (Signal, self.signals),
+            "piece": (Piece, self.pieces),
+            "pair": (Pair, self.pairs),
+            "constant": (c_uint64, self.constants),
+            "esc_of": (c_uint16, self.esc_of),
+            "listener": (c_uint16, self.listeners),
+            "first_listener": (c_uint16, self.first_listeners),
+        }
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """The numbers of kcg_plan in its order."""
+        words, messages, escs = map(len, (self.constants, self.messages, self.settings))
+        return {"words": words, "messages": messages, "escs": escs, "pages": self.pages}
+
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.signals if s.role is Role.CRC), None)
         traits = Traits(plan, silent)
@@ -120,16 +145,17 @@ class Tables:
             Message(
                 plan.can_id | (EXTENDED if plan.extended else 0),
                 *(plan.length, words, flags, traits.triggers, len(plan.pages)),
-                crc.pieces[0].at // 8 if crc else 0,
-                traits.alive_modulus,
-                *(int(plan.fd), first, len(self.signals) - first, plan.data_id & 0xFFFF),
-                *(self.pages, first_word, first_esc, len(plan.escs)),
+                *(crc.pieces[0].at // 8 if crc else 0, len(plan.escs), int(plan.fd)),
+                *(first, len(self.signals) - first, plan.data_id & 0xFFFF, self.pages),
+                *(max(0, traits.alive_modulus - 1), first_word, first_esc),
                 *(plan.cycle_ns, plan.delay_ns, phase),
             )
         )
         self.pages += len(plan.pages)
 
     def _add_signal(self, signal: SignalPlan, plan: MessagePlan, has_crc: bool) -> None:
+        if signal.length > MAX_BITS:
+            raise NotInCore(f"{plan.name}.{signal.name}: {signal.length} bits")
         first_piece = len(self.pieces)
         for piece in signal.pieces:  # never across 64 bits
             width = min(piece.width, 64 - piece.at % 64)
@@ -145,7 +171,7 @@ class Tables:
         row.error, row.not_available = signal.error & _M64, signal.not_available & _M64
         if signal.role is Role.ALIVE:
             row.kind, row.div = OF_ALIVE, alive_modulus(signal, has_crc)
-            if row.div > 255:
+            if row.div > MAX_ALIVE:
                 raise NotInCore(
                     f"{plan.name}.{signal.name}: an alive counter of {signal.length} bits"
                 )
@@ -157,6 +183,7 @@ class Tables:
             except NotInCore as error:
                 raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
         self.signals.append(row)
+        self.signal_names.append(f"{plan.name}.{signal.name}")
 
     def _source(self, row: Any, value: Value, esc: int | None) -> None:
         row.divisor = _DIVISORS[value.divisor]

@@ -47,29 +47,28 @@ def settings(chance: random.Random, number: int) -> EscSettings:
     )
 
 
+def dbc(chance: random.Random, escs: Sequence[EscSettings]) -> tuple[str, DbcSettings]:
+    """A random DBC, and how its signals are bound; not always one that the gateway accepts."""
+    maker = LayoutMaker(chance, escs)
+    messages = [maker.message() for _ in range(chance.randint(1, 8))]
+    if chance.random() < 0.4:
+        messages.append(protected(chance, escs))
+    more = "\n".join(
+        f'BA_ "GenMsgSendType" BO_ {m.dbc_id} {chance.randrange(5)};\n'
+        f'BA_ "GenMsgCycleTime" BO_ {m.dbc_id} {chance.choice((5, 10, 12, 20, 50, 100, 1000))};\n'
+        f'BA_ "GenMsgDelayTime" BO_ {m.dbc_id} {chance.choice((0, 0, 0, 5, 20, 25, 200))};'
+        for m in messages
+    )
+    ids = {"Protected": 0x1234} if any(m.name == "Protected" for m in messages) else {}
+    return dbc_text(messages, more), DbcSettings(bind=bindings(messages), data_ids=ids)
+
+
 def layout(chance: random.Random, escs: Sequence[EscSettings]) -> Layout:
     """A random layout that the gateway accepts."""
     while True:
-        maker = LayoutMaker(chance, escs)
-        messages = [maker.message() for _ in range(chance.randint(1, 8))]
-        if chance.random() < 0.4:
-            messages.append(protected(chance, escs))
-        more = "\n".join(
-            f'BA_ "GenMsgSendType" BO_ {m.dbc_id} {chance.randrange(5)};\n'
-            f'BA_ "GenMsgCycleTime" BO_ {m.dbc_id} {chance.choice((5, 10, 12, 20, 50, 100, 1000))};\n'
-            f'BA_ "GenMsgDelayTime" BO_ {m.dbc_id} {chance.choice((0, 0, 0, 5, 20, 25, 200))};'
-            for m in messages
-        )
         try:
-            chosen = DbcSettings(
-                bind=bindings(messages),
-                data_ids={"Protected": 0x1234}
-                if any(m.name == "Protected" for m in messages)
-                else {},
-            )
-            return prepare(read(dbc_text(messages, more)), "x.dbc", escs, chosen, fd_allowed=True)[
-                1
-            ]
+            text, chosen = dbc(chance, escs)
+            return prepare(read(text), "x.dbc", escs, chosen, fd_allowed=True)[1]
         except UserError:
             continue
 
@@ -77,10 +76,11 @@ def layout(chance: random.Random, escs: Sequence[EscSettings]) -> Layout:
 def protected(chance: random.Random, escs: Sequence[EscSettings]) -> Msg:
     """A message with an alive counter and perhaps a CRC of AUTOSAR E2E profile 1."""
     prefix = f"Esc{chance.randint(1, len(escs))}" if len(escs) > 1 else ""
-    signals = [Sig("Alive", 8, 4), Sig(f"{prefix}BatteryVoltage", 16, 16, unit="V", factor="0.01")]
+    voltage = Sig(f"{prefix}BatteryVoltage", 24, 16, unit="V", factor="0.01")
+    signals = [Sig("Alive", 8, chance.choice((2, 4, 8, 16))), voltage]
     if chance.random() < 0.7:
         signals.append(Sig("Crc8", 0, 8))
-    return Msg("Protected", 0x7F0, chance.randint(4, 8), signals)
+    return Msg("Protected", 0x7F0, chance.randint(5, 8), signals)
 
 
 def stream(chance: random.Random) -> bytes:
@@ -129,10 +129,14 @@ STATE = (
 class Both:
     """Both cores, given the same calls."""
 
-    def __init__(self, library: Any, seed: int) -> None:
-        self.chance = chance = random.Random(seed)
-        self.escs = [settings(chance, n) for n in range(chance.randint(1, 3))]
-        self.layout = layout(chance, self.escs)
+    def __init__(
+        self,
+        library: Any,
+        chance: random.Random,
+        escs: Sequence[EscSettings],
+        layout: Layout,
+    ) -> None:
+        self.chance, self.escs, self.layout = chance, escs, layout
         self.silent = chance.random() < 0.3
         self.now = START
         self.events: tuple[list[Any], list[Any]] = ([], [])
@@ -217,12 +221,22 @@ class Both:
                 self.now += chance.randrange(3 * MS)
 
 
-def run(library: Any, seed: int, steps: int = 300) -> int:
+def some_escs(chance: random.Random) -> list[EscSettings]:
+    return [settings(chance, n) for n in range(chance.randint(1, 3))]
+
+
+def run(library: Any, seed: int) -> int:
     """Frames compared; 0 for a layout that the core in C does not take."""
+    chance = random.Random(seed)
+    escs = some_escs(chance)
     try:
-        both = Both(library, seed)
+        return compare(Both(library, chance, escs, layout(chance, escs)), 300)
     except NotInCore:
         return 0
+
+
+def compare(both: Both, steps: int) -> int:
+    """Frames compared in so many steps."""
     both.call("repeat", both.now)
     both.compare()
     for _ in range(steps):

@@ -1,14 +1,11 @@
 """The core in C gives what the core in Python gives; gcc and clang build it without a warning, for a small machine too."""
 
-import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import equality
 import pytest
+from sanitized import run_sanitized
 
 from kontronik_can_gw.native.binding import WrongObject, load
 from kontronik_can_gw.native.compile import compile_core, compiler
@@ -83,27 +80,12 @@ def test_the_core_builds_for_a_small_machine(tmp_path: Path, program: str, optio
 
 @pytest.mark.extended
 def test_no_byte_outside_its_memory_and_nothing_undefined(tmp_path: Path) -> None:
-    """Under AddressSanitizer and UndefinedBehaviorSanitizer, whose libraries must be loaded before all others."""
-    sanitizers = "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-wrapv"
-    target = built(tmp_path / "core.so", "-g", "-O1", *sanitizers, *OPTIONS)
-    asked = [[str(compiler()), f"-print-file-name=lib{name}.so"] for name in ("asan", "ubsan")]
-    found = [subprocess.run(each, capture_output=True, text=True, check=True) for each in asked]
-    script = tmp_path / "many.py"
-    script.write_text(
-        "import pathlib\nimport equality\nfrom kontronik_can_gw.native.binding import load\n"
-        f"library = load(pathlib.Path({str(target)!r}))\n"
+    script = (
+        "import pathlib, sys\nimport equality\nfrom kontronik_can_gw.native.binding import load\n"
+        "library = load(pathlib.Path(sys.argv[1]))\n"
         "print(sum(equality.run(library, seed) for seed in range(10)))\n"
     )
-    environment = os.environ | {
-        "LD_PRELOAD": " ".join(each.stdout.strip() for each in found),
-        "ASAN_OPTIONS": "detect_leaks=0",
-        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-    }
-    done = subprocess.run(
-        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert int(done.stdout) > 1_000
+    assert int(run_sanitized(tmp_path, "-c", script)) > 1_000
 
 
 def test_an_object_with_other_tables_is_refused_in_one_line(tmp_path: Path) -> None:

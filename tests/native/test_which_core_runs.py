@@ -215,6 +215,17 @@ def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str) -> Non
 
 
 @pytest.mark.usefixtures("built")
+@pytest.mark.parametrize("bits", [64, 65, 300])
+def test_a_signal_of_more_than_64_bits_runs_in_python(bits: int) -> None:
+    signal = f'BatteryVoltage : 0|{bits}@1+ (0.01,0) [0|0] "V"'
+    text = HEAD.format(signal).replace("M: 8", "M: 64")
+    database = parse_database(text.encode(), "t.dbc")
+    layout = prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)[1]
+    found = Gateway([EscSettings()], layout, 0).why_python
+    assert found == ("" if bits == 64 else f"M.BatteryVoltage: {bits} bits")
+
+
+@pytest.mark.usefixtures("built")
 def test_the_losses_of_a_later_part_go_on() -> None:
     gateway = Gateway([EscSettings()], EMPTY, 0)
     gateway.escs[0].losses = 42

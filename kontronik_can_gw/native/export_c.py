@@ -1,0 +1,173 @@
+"""Core and tables as C for a firmware: the sources of the core as they are, the tables as constants, an example, a page about it.
+
+What a DBC does not need is left out by the defaults of core.h's macros. The tables are those that the binding has (``Tables.arrays``).
+"""
+
+import ctypes
+import re
+from collections.abc import Iterator, Sequence
+from string import Template
+from typing import Any
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.native.compile import FOLDER
+from kontronik_can_gw.native.rows import NotInCore, Settings
+from kontronik_can_gw.native.tables import HAS_CRC, REAL, Tables
+from kontronik_can_gw.signals.plan import Layout
+
+MARK = "made by kontronik-can-gw export c"
+"""In the first line of every file: a later export may replace it."""
+EXAMPLE = "example_main.c"
+"""The user's own as soon as it is there."""
+_CLASSIC = 8
+_LARGE = 1 << 15
+_WIDTH = 118
+
+
+def exported(
+    layout: Layout, escs: Sequence[EscSettings], silent: bool, licence: str
+) -> dict[str, str]:
+    """Text of each file by its name. NotInCore where the core in C cannot express the layout or an ESC's settings."""
+    tables = Tables(layout, escs, silent)
+    core_c, core_h = ((FOLDER / name).read_text(encoding="utf-8") for name in ("core.c", "core.h"))
+    if tables.wire not in core_c:
+        raise NotInCore(f"fields on the wire: {tables.wire}")
+    for name, value in _options(layout, tables).items():
+        core_h, count = re.subn(rf"(#define {name} +)\d+", rf"\g<1>{value}", core_h)
+        assert count == 1, name
+    names = _names("KCG_MESSAGE_", tables.names)
+    messages = [
+        f"| {name.removeprefix('KCG_MESSAGE_')} | {_id(row)} | {row.length} |"
+        for name, row in zip(names, tables.messages, strict=True)
+    ]
+    dbc = _plain(layout.file.rpartition("/")[2])
+    words = {
+        "dbc": dbc,
+        "messages": "\n".join(messages),
+        "escs": ", ".join(_plain(esc.name) for esc in escs),
+        "tables": sum(ctypes.sizeof(kind) * len(rows) for kind, rows in tables.arrays.values()),
+        "licence": licence.strip(),
+        "mark": MARK,
+        "version": __version__,
+    }
+    folder = FOLDER / "firmware"
+    page = Template((folder / "README.md").read_text(encoding="utf-8")).substitute(words)
+    texts = {
+        "core.c": core_c,
+        "core.h": core_h,
+        "tables.h": _header(dbc, tables, names, escs),
+        "tables.c": "\n".join(_tables(tables)),
+        EXAMPLE: (folder / EXAMPLE).read_text(encoding="utf-8"),
+    }
+    line = f"/* {MARK}, version {__version__}; SPDX-License-Identifier: MIT */\n"
+    return {name: line + text for name, text in texts.items()} | {"README.md": page}
+
+
+def _options(layout: Layout, tables: Tables) -> dict[str, int]:
+    """Macros of core.h, as this layout needs them."""
+    longest = max((plan.length for plan in layout.messages), default=0)
+    return {
+        "KCG_DATA": _CLASSIC if longest <= _CLASSIC else 64,
+        "KCG_FLOATS": int(any(row.flags & REAL for row in tables.signals)),
+        "KCG_PAGED": int(any(row.pages > 1 for row in tables.messages)),
+        "KCG_E2E": int(any(row.flags & HAS_CRC for row in tables.messages)),
+    }
+
+
+def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSettings]) -> str:
+    """Names of messages and ESCs: their places, ids (bit 31: 29 bits) and lengths."""
+    places = _names("KCG_ESC_", [esc.name for esc in escs])
+    rows = [
+        f"#define {name.replace('MESSAGE', 'ID', 1)} {_id(row)}u\n"
+        f"#define {name.replace('MESSAGE', 'LENGTH', 1)} {row.length}"
+        for name, row in zip(names, tables.messages, strict=True)
+    ]
+    parts = (
+        "#ifndef KCG_TABLES_H",
+        "#define KCG_TABLES_H",
+        '#include "core.h"\n',
+        f"/* Messages of {dbc}: place in kcg_tables.message, id (bit 31: 29 bits), data bytes. */",
+        f"enum {{\n    {', '.join([*names, 'KCG_MESSAGES'])}\n}};".replace(", ", ",\n    "),
+        *rows,
+        "",
+        "/* ESCs: the number of each in calls of the core. */",
+        f"enum {{ {', '.join([*places, 'KCG_ESCS'])} }};\n",
+        "/* Bytes for kcg_init. */",
+        f"#define KCG_MEMORY KCG_SIZE(KCG_MESSAGES, KCG_ESCS, {tables.pages}, {len(tables.constants)})\n",
+        "extern const kcg_plan kcg_tables;",
+        "extern const kcg_settings kcg_esc_settings[KCG_ESCS];",
+        "#endif\n",
+    )
+    return "\n".join(parts)
+
+
+def _tables(tables: Tables) -> Iterator[str]:
+    """Lines of the tables' definitions."""
+    yield '#include "tables.h"'
+    for name, (kind, rows) in tables.arrays.items():
+        label = {"message": tables.names, "signal": tables.signal_names}.get(name)
+        yield f"\nstatic const {_type(name, kind)} {name}[] = {{"
+        yield from _rows(kind, rows or [kind()], label)
+        yield "};"
+    yield "\nconst kcg_settings kcg_esc_settings[KCG_ESCS] = {"
+    yield from _rows(Settings, tables.settings, None)
+    yield "};\n\nconst kcg_plan kcg_tables = {"
+    yield "    " + ", ".join(f".{name} = {name}" for name in tables.arrays) + ","
+    yield "    " + ", ".join(f".{name} = {number}" for name, number in tables.counts.items())
+    yield "};\n"
+
+
+def _type(name: str, kind: Any) -> str:
+    if issubclass(kind, ctypes.Structure):
+        return f"kcg_{name}"
+    return f"uint{8 * ctypes.sizeof(kind)}_t"
+
+
+def _rows(kind: Any, rows: Sequence[Any], labels: Sequence[str] | None) -> Iterator[str]:
+    """Lines of a table's rows; fields that are 0 are left out."""
+    if not issubclass(kind, ctypes.Structure):
+        numbers = [_number(kind, getattr(row, "value", row)) for row in rows]
+        each = 4 if ctypes.sizeof(kind) > 4 else 16
+        for at in range(0, len(numbers), each):
+            yield f"    {', '.join(numbers[at : at + each])},"
+        return
+    for place, row in enumerate(rows):
+        fields = [
+            f".{name} = {_number(typed, value)}"
+            for name, typed in kind._fields_
+            if isinstance(value := getattr(row, name), int) and value
+        ]
+        if labels:
+            yield f"    /* {_plain(labels[place])} */"
+        yield f"    {{{', '.join(fields) or '0'}}},"
+
+
+def _number(kind: Any, value: int) -> str:
+    """A constant of a type that holds it, whatever the width of int."""
+    if abs(value) < _LARGE:
+        return str(value)
+    if kind is ctypes.c_int64:
+        return f"INT64_C({value})" if value > -1 << 63 else "-INT64_C(9223372036854775807) - 1"
+    return f"UINT{8 * ctypes.sizeof(kind)}_C({value:#x})"
+
+
+def _id(row: Any) -> str:
+    return f"0x{row.id:X}"
+
+
+def _names(prefix: str, texts: Sequence[str]) -> list[str]:
+    """A C identifier for each, no two the same."""
+    found: dict[str, None] = {}
+    for text in texts:
+        name = base = prefix + re.sub(r"\W", "_", text, flags=re.ASCII)
+        number = 2
+        while name in found:
+            name, number = f"{base}_{number}", number + 1
+        found[name] = None
+    return list(found)
+
+
+def _plain(text: str) -> str:
+    """For a comment or a page: ends neither, and is ASCII."""
+    return re.sub(r"[^\w .,+()-]", "_", text, flags=re.ASCII)

@@ -1,0 +1,132 @@
+/* A gateway around core.c: bytes of UARTs in, CAN frames out. As it stands it is a program for a PC that reads recorded UART bytes, a file
+   for each ESC in their order (without any: standard input), and prints the frames as candump logs them, by a simulated clock:
+
+       cc -std=c99 -O2 -o example core.c tables.c example_main.c && ./example uart.bin
+
+   On a board only the three hooks at its end are others. */
+#include "core.h"
+#include "tables.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+
+enum { RING = 128, FRAMES = 4, RUNNING = 1, ERROR_ACTIVE = 1 }; /* RING: 11 ms of one UART */
+
+static struct { uint8_t byte[RING]; volatile uint8_t in, out; } ring[KCG_ESCS];
+static int64_t memory[(KCG_MEMORY + 7) / 8], empty_at[KCG_ESCS];
+static kcg *core;
+
+static int64_t clock_ns(void);
+static int frame_out(const kcg_frame *frame);
+
+/* A byte was received: for the interrupt of a UART. Where there is no room it is lost, which the frame's CRC shows. */
+static void byte_in(int esc, uint8_t byte)
+{
+    uint8_t in = ring[esc].in, next = (uint8_t)((in + 1) % RING);
+    if (next != ring[esc].out) {
+        ring[esc].byte[in] = byte;
+        ring[esc].in = next;
+    }
+}
+
+static void start(void)
+{
+    int64_t now = clock_ns();
+    core = kcg_init(memory, &kcg_tables, kcg_esc_settings, now);
+    core->gateway[KCG_GATEWAY_STATE] = RUNNING;
+    core->gateway[KCG_CAN_STATE] = ERROR_ACTIVE;
+    core->gateway[KCG_ESC_COUNT] = KCG_ESCS;
+    for (int esc = 0; esc < KCG_ESCS; esc++)
+        empty_at[esc] = now;
+    kcg_repeat(core, now);
+}
+
+/* Hand over what is pending; what finds no room stays pending, and the values of then are sent. */
+static void send(int64_t now)
+{
+    kcg_frame frames[FRAMES];
+    uint32_t taken, sent, all = 0;
+    do {
+        taken = kcg_take(core, now, frames, FRAMES);
+        for (sent = 0; sent < taken && frame_out(&frames[sent]); sent++)
+            ;
+        kcg_sent(core, now, sent);
+        all += sent;
+    } while (taken && sent == taken);
+    core->gateway[KCG_SENT_FRAMES] += all;
+}
+
+/* One turn of the main loop: at least every few milliseconds, or when an interrupt was there, or at kcg_next_deadline. */
+static void turn(void)
+{
+    uint8_t data[RING];
+    int64_t now = clock_ns(); /* first: what comes later is of the next turn */
+    for (int esc = 0; esc < KCG_ESCS; esc++) {
+        uint8_t in = ring[esc].in, out = ring[esc].out;
+        size_t size = 0;
+        for (; out != in; out = (uint8_t)((out + 1) % RING))
+            data[size++] = ring[esc].byte[out];
+        ring[esc].out = out;
+        if (size)
+            kcg_receive(core, esc, data, size, now, empty_at[esc]);
+        empty_at[esc] = now;
+    }
+    kcg_advance(core, now);
+    send(now);
+}
+
+/* --- the three hooks, of a PC ---------------------------------------------------------------------------------------- */
+
+#define MS INT64_C(1000000)
+#define BYTE_NS (11 * 1000 * MS / 115200)
+
+static int64_t simulated;
+
+/* Hook 1, the clock: nanoseconds that never go back, of a timer of 64 bits. */
+static int64_t clock_ns(void)
+{
+    return simulated;
+}
+
+/* Hook 2, a frame for the bus: 1 if a mailbox took it, 0 if none is free. */
+static int frame_out(const kcg_frame *frame)
+{
+    printf("(%lu.%06lu) can0 ", (unsigned long)(simulated / (1000 * MS)), (unsigned long)(simulated % (1000 * MS) / 1000));
+    printf(frame->id >> 31 ? "%08lX#" : "%03lX#", (unsigned long)(frame->id & 0x1FFFFFFF));
+    if (frame->flags)
+        printf("#0");
+    for (int i = 0; i < frame->length; i++)
+        printf("%02X", frame->data[i]);
+    printf("\n");
+    return 1;
+}
+
+/* Hook 3, the bytes: here of all files as if they came at once, without a pause, and 3 s of silence after the last. */
+int main(int argc, char **argv)
+{
+    FILE *line[KCG_ESCS] = {NULL};
+    int64_t due[KCG_ESCS] = {0}, end = 0;
+    for (int esc = 0; esc < KCG_ESCS; esc++) {
+        if (argc < 2 ? esc > 0 : esc + 1 >= argc)
+            break;
+        line[esc] = argc < 2 ? stdin : fopen(argv[esc + 1], "rb");
+        if (!line[esc]) {
+            perror(argv[esc + 1]);
+            return EXIT_FAILURE;
+        }
+    }
+    start();
+    for (; simulated <= end; simulated += MS) {
+        for (int esc = 0; esc < KCG_ESCS; esc++)
+            for (; line[esc] && due[esc] <= simulated; due[esc] += BYTE_NS) {
+                int byte = getc(line[esc]);
+                if (byte == EOF)
+                    fclose(line[esc]), line[esc] = NULL;
+                else
+                    byte_in(esc, (uint8_t)byte);
+                end = simulated + 3000 * MS;
+            }
+        turn();
+    }
+    return EXIT_SUCCESS;
+}

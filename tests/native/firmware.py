@@ -1,0 +1,113 @@
+"""An exported folder at work: its example fed with recorded bytes, and what the core in Python sends for the same."""
+
+import random
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import equality
+
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.gateway_status import CanState, GatewayState
+from kontronik_can_gw.native.export_c import exported
+from kontronik_can_gw.native.rows import NotInCore
+from kontronik_can_gw.signals.plan import Layout
+
+BYTE_NS = 11 * SECOND // 115200
+SILENCE = 3 * SECOND
+STRICT = (
+    *("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion"),
+    *("-Wshadow", "-Werror"),
+)
+SOURCES = ("core.c", "tables.c", "example_main.c")
+
+
+class Case:
+    """A folder with the export of a random layout, and random bytes of its ESCs; of a given layout where there is one."""
+
+    def __init__(
+        self,
+        folder: Path,
+        seed: int,
+        layout: Layout | None = None,
+        escs: Sequence[EscSettings] | None = None,
+    ) -> None:
+        chance = random.Random(seed)
+        self.folder = folder
+        self.silent = chance.random() < 0.3
+        while True:
+            self.escs = escs or equality.some_escs(chance)
+            self.layout = layout or equality.layout(chance, self.escs)
+            try:
+                licence = shipped("LICENSE").read_text(encoding="utf-8")
+                files = exported(self.layout, self.escs, self.silent, licence)
+                break
+            except NotInCore:
+                assert layout is None
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        self.lines = [_line(chance) for _ in self.escs]
+        for number, data in enumerate(self.lines):
+            (folder / f"uart{number}.bin").write_bytes(data)
+
+    @property
+    def inputs(self) -> list[str]:
+        return [f"uart{number}.bin" for number in range(len(self.lines))]
+
+    def build(self, compiler: str, *options: str) -> Path:
+        """The example, compiled in the folder. AssertionError with what the compiler said."""
+        target = self.folder / f"example-{compiler}"
+        command = [compiler, *STRICT, *options, "-o", str(target), *SOURCES]
+        done = subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[:3000]
+        return target
+
+    def run(self, *command: str) -> str:
+        """What the example prints."""
+        done = subprocess.run(
+            [*command, *self.inputs],
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stderr[:3000]
+        return done.stdout
+
+    def expected(self) -> str:
+        """The frames of the core in Python, by the same clock, as candump logs them."""
+        core = PythonCore(self.escs, self.layout, 0, self.silent)
+        core.status.state, core.status.can_state = GatewayState.RUNNING, CanState.ERROR_ACTIVE
+        core.repeat(0)
+        taken, empty = [0] * len(self.lines), [0] * len(self.lines)
+        last = max(-(-len(line) * BYTE_NS // MS) * MS for line in self.lines)
+        text = []
+        for now in range(0, last + SILENCE + 1, MS):
+            for esc, line in enumerate(self.lines):
+                end = min(len(line), now // BYTE_NS + 1)
+                if end > taken[esc]:
+                    core.receive(esc, line[taken[esc] : end], now, empty[esc])
+                    taken[esc] = end
+                empty[esc] = now
+            core.advance(now)
+            frames = core.take(now)
+            core.status.sent_frames += len(frames)
+            for f in frames:
+                name = f"{f.can_id:08X}" if f.extended else f"{f.can_id:03X}"
+                data = ("#0" if f.fd else "") + f.data.hex().upper()
+                text.append(f"({now // SECOND}.{now % SECOND // 1000:06d}) can0 {name}#{data}\n")
+        return "".join(text)
+
+
+def _line(chance: random.Random) -> bytes:
+    """Telemetry with faults, and stretches of noise in which it becomes stale."""
+    data = b""
+    for _ in range(chance.randint(60, 120)):
+        data += equality.stream(chance)
+        if chance.random() < 0.05:
+            data += chance.randbytes(chance.choice((300, 3_000, 12_000)))
+    return data

@@ -1,0 +1,108 @@
+"""Changed DBC text -> layout -> tables -> both cores, which must agree:  fuzz_dbc.py SECONDS SEED CORE
+
+Random changes without guidance by coverage (libFuzzer cannot see into Python). A DBC is refused by a UserError, or by NotInCore of
+the core in C; anything else is a fault of the seed that was printed last.
+"""
+
+import logging
+import random
+import re
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import equality
+
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.native.binding import load
+from kontronik_can_gw.native.rows import NotInCore
+
+STEPS = 40
+NUMBERS = (
+    *("0", "1", "-1", "2", "7", "8", "9", "15", "16", "31", "32", "33", "62", "63", "64", "65"),
+    *("255", "256", "511", "512", "65535", "65536", "2147483647", "2147483648", "4294967295"),
+    *("9223372036854775807", "-9223372036854775808", "18446744073709551615"),
+    *("0.1", "-0.5", "1e-9", "1e9", "1e18", "1e300", "0.00592884289493769", "1e-320", "nan", "inf"),
+)
+HERE = Path(__file__).parents[1]
+FILES = [
+    path.read_text(encoding="latin-1")
+    for path in (
+        shipped("dbc/kontronik_esc.dbc"),
+        HERE / "dbc/rich.dbc",
+        HERE / "benchmarks/five.dbc",
+    )
+]
+
+
+def changed(chance: random.Random, text: str) -> str:
+    """With a number, a line, a sign, a byte order or a character that is another."""
+    for _ in range(chance.choice((1, 1, 2, 3, 8))):
+        what = chance.random()
+        if what < 0.6:
+            found = list(re.finditer(r"(?<![A-Za-z_\d])-?\d+(\.\d+)?", text))
+            one = chance.choice(found)
+            text = text[: one.start()] + chance.choice(NUMBERS) + text[one.end() :]
+        elif what < 0.85:
+            lines = text.split("\n")
+            at, to = chance.randrange(len(lines)), chance.randrange(len(lines))
+            line = lines[at] if chance.random() < 0.5 else lines.pop(at)
+            lines.insert(to, line)
+            text = "\n".join(lines)
+        elif what < 0.95:
+            found = list(re.finditer(r"@[01][+-]", text))
+            if found:
+                one = chance.choice(found)
+                new = chance.choice(("@0+", "@0-", "@1+", "@1-"))
+                text = text[: one.start()] + new + text[one.end() :]
+        else:
+            at = chance.randrange(len(text))
+            text = text[:at] + chr(chance.randrange(256)) + text[at + 1 :]
+    return text
+
+
+def one(library: Any, seed: int) -> tuple[str, int]:
+    """What came of it, and frames compared."""
+    chance = random.Random(seed)
+    escs = equality.some_escs(chance)
+    chosen = DbcSettings()
+    if chance.random() < 0.7:
+        text, chosen = equality.dbc(chance, escs)
+    else:
+        text = chance.choice(FILES)
+    text = changed(chance, text)
+    try:
+        database = parse_database(text.encode("latin-1"), "x.dbc")
+        layout = prepare(database, "x.dbc", escs, chosen, fd_allowed=True)[1]
+        both = equality.Both(library, chance, escs, layout)
+    except UserError:
+        return "refused", 0
+    except NotInCore:
+        return "in Python only", 0
+    return "compared", equality.compare(both, STEPS)
+
+
+def main(seconds: str, seed: str, core: str) -> None:
+    logging.disable()
+    library = load(Path(core))
+    found: Counter[str] = Counter()
+    end = time.monotonic() + float(seconds)
+    number = int(seed)
+    while time.monotonic() < end:
+        print(f"seed {number}", flush=True)  # a sanitizer ends the process
+        what, frames = one(library, number)
+        found[what] += 1
+        found["frames"] += frames
+        number += 1
+    print(dict(found))
+    assert found["compared"] and found["refused"] and found["frames"]
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,65 @@
+"""The core under fuzzers, with sanitizers: 30 s each here, ten minutes each in `make release` (KCG_FUZZ_SECONDS)."""
+
+import os
+import random
+import shutil
+import subprocess
+from pathlib import Path
+
+import equality
+import pytest
+from firmware import Case
+from sanitized import run_sanitized
+
+SECONDS = int(os.environ.get("KCG_FUZZ_SECONDS", "30"))
+SEED = random.Random().randrange(1 << 30) if SECONDS > 30 else 1
+"""Always the same in CI."""
+HERE = Path(__file__).parent
+FUZZED = (1, 2, 5)
+"""Seeds of layouts."""
+pytestmark = pytest.mark.extended
+
+
+@pytest.mark.parametrize("layout", FUZZED)
+def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
+    """Any calls, by libFuzzer: nothing outside its memory, nothing undefined, no deadline that does not move on."""
+    if shutil.which("clang") is None:
+        pytest.skip("no clang: sudo apt-get install clang")
+    case = Case(tmp_path / "export", layout)
+    corpus = tmp_path / "corpus"
+    corpus.mkdir()
+    chance = random.Random(layout)
+    for number in range(20):
+        calls = [b"\0"]
+        for _ in range(20):
+            data = equality.stream(chance)[:127]
+            calls.append(
+                bytes((6 | chance.randrange(16) << 4, chance.randrange(256), len(data), 0))
+            )
+            calls.append(data + bytes((3,)))
+        (corpus / str(number)).write_bytes(b"".join(calls))
+    program = tmp_path / "fuzz"
+    sanitizers = "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"
+    command = ["clang", "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
+    sources = [
+        str(case.folder / "core.c"),
+        str(case.folder / "tables.c"),
+        str(HERE / "fuzz_bytes.c"),
+    ]
+    subprocess.run([*command, "-o", str(program), *sources], check=True)
+    limits = f"-max_total_time={max(1, SECONDS // len(FUZZED))}", f"-seed={SEED}", "-max_len=4096"
+    done = subprocess.run(
+        [str(program), *limits, "-timeout=10", "-print_final_stats=1", str(corpus)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-6000:]
+    print(done.stderr[-600:])
+
+
+def test_dbc_text(tmp_path: Path) -> None:
+    """Changed DBC text: refused in words, or both cores agree."""
+    printed = run_sanitized(tmp_path, str(HERE / "fuzz_dbc.py"), str(SECONDS), str(SEED))
+    print(printed.splitlines()[-1])
