@@ -11,7 +11,7 @@
 #define MIN_DISTANCE INT64_C(1000000)
 #define LONG_AGO (-(INT64_C(1) << 61))
 enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
-enum { VOLTAGE_AT = 4, CURRENT_AT = 6, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
+enum { VOLTAGE_AT = 4, CURRENT_AT = 6, ERRORS_AT = 24, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
 
 /* --- CRC-32 ---------------------------------------------------------------------------------------------------------- */
 
@@ -347,6 +347,8 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
         }
     }
     e->generation++;
+    if (!e->has_live || memcmp(e->live + ERRORS_AT, f->body + ERRORS_AT, 4))
+        events |= KCG_ERRORS;
     memcpy(e->live, f->body, 30);
     e->power = wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16);
     e->turns = u32(f->body) != 0;

@@ -18,13 +18,13 @@ from packer_oracle import (
     read,
 )
 
-from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.core import Follower, PythonCore
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import NotInCore
@@ -143,8 +143,8 @@ class Both:
             library,
             *(self.escs, self.layout, self.now, self.silent),
         )
-        self.python.followers = [lambda *event: self.events[0].append(event)]
-        self.native.followers = [lambda *event: self.events[1].append(event)]
+        self.python.followers = [Follower(Event.ALL, lambda *event: self.events[0].append(event))]
+        self.native.followers = [Follower(Event.ALL, lambda *event: self.events[1].append(event))]
         self.count = 0
         self._tell()
 
