@@ -55,10 +55,14 @@ class Schedule:
         self._cycle_deferred[index] = False
         if self._deferred_until[index] != NEVER:
             self._deferred_until[index] = NEVER
-            heap = self._heap
-            while heap and heap[0][2] and heap[0][0] != self._deferred_until[heap[0][1]]:
-                heapq.heappop(heap)
-            self.next_due = heap[0][0] if heap else NEVER
+            self._note_next()
+
+    def _note_next(self) -> None:
+        """The first deadline that still holds; before it go those of requests that were done meanwhile."""
+        heap = self._heap
+        while heap and heap[0][2] and heap[0][0] != self._deferred_until[heap[0][1]]:
+            heapq.heappop(heap)
+        self.next_due = heap[0][0] if heap else NEVER
 
     def due(self, now: int) -> list[tuple[int, int, int]]:
         """(deadline, message, CYCLE, REQUEST or both), each message once.
@@ -87,7 +91,7 @@ class Schedule:
                 else:
                     self.defer(index)
                     self._cycle_deferred[index] = True
-        self.next_due = heap[0][0] if heap else NEVER
+        self._note_next()
         return list(found.values())
 
     def _defer(self, index: int, until: int) -> None:

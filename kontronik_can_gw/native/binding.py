@@ -10,7 +10,13 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.compile import source_number
 from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
-from kontronik_can_gw.native.tables import COUNTS, END_OF_TIME, GATEWAY, Tables, nearest_settings
+from kontronik_can_gw.native.tables import (
+    END_OF_TIME,
+    GATEWAY,
+    STORED_COUNTS,
+    Tables,
+    nearest_settings,
+)
 
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
@@ -46,31 +52,27 @@ class Plan(c.Structure):
     )
 
 
-class Arrival(c.Structure):
-    _fields_ = (("end", _u64), ("bound", _i64))
-
-
 class Esc(c.Structure):
     """kcg_esc: the state of an ESC."""
 
     _fields_ = (
+        *((name, _u8) for name in ("has_live", "has_info", "had_live", "had_info", "has_time")),
+        *((name, _u8) for name in ("turns", "cells", "held_count", "need", "arrivals")),
+        *((name, _u8) for name in ("blame", "reported", "link", "layout")),
+        *((name, _i32) for name in ("rate", "power")),
         ("settings", Settings),
-        ("count", _u64 * (len(COUNTS) - 3)),
-        ("window", _u64 * 4),
-        ("before", _u64 * 4),
-        *((name, _u64) for name in ("base", "blame_until", "energy")),
-        *((name, _i64) for name in ("energy_rest", "run_time", "power", "live_ns", "live_bound")),
-        *((name, _i64) for name in ("info_ns", "info_bound", "last_info_ns", "window_ns")),
-        ("interval", _i64),
-        ("arrival", Arrival * (HELD + 1)),
-        ("rate", _i32),
+        ("count", _u64 * STORED_COUNTS),
+        ("window", _u32 * 4),
+        *((name, _u32) for name in ("base", "blame_until")),
+        ("energy", _u64),
+        *((name, _i64) for name in ("energy_rest", "run_time", "live_ns", "live_bound")),
+        *((name, _i64) for name in ("info_bound", "last_info_ns", "window_ns", "interval")),
+        ("arrival_bound", _i64 * (HELD + 1)),
+        ("arrival_end", _u32 * (HELD + 1)),
         ("generation", _u32),
         ("live", _u8 * BODY),
         ("info", _u8 * BODY),
         ("held", _u8 * (HELD + LONGEST)),
-        *((name, _u8) for name in ("has_live", "has_info", "had_live", "had_info", "has_time")),
-        *((name, _u8) for name in ("turns", "cells", "held_count", "need", "arrivals")),
-        *((name, _u8) for name in ("blame", "reported")),
     )
 
 

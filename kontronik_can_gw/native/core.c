@@ -11,6 +11,7 @@
 #define MIN_DISTANCE INT64_C(1000000)
 #define LONG_AGO (-(INT64_C(1) << 61))
 enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
+enum { KNOWN = 1, TO_SEND = 2 };             /* of a page: its last frame is known; it follows without an event */
 enum { VOLTAGE_AT = 4, CURRENT_AT = 6, ERRORS_AT = 24, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
 
 /* --- CRC-32 ---------------------------------------------------------------------------------------------------------- */
@@ -72,7 +73,9 @@ static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reaso
         uint8_t run = (uint8_t)(0x100 - b[i]); /* 0, FF, FE, FC ... 80: long runs of equal bits */
         e->count[KCG_N_LONG_RUN] += !(run & (run - 1));
     }
-    uint64_t begin = e->base + from, size = to - from, blamed = e->blame_until > begin ? e->blame_until - begin : 0;
+    uint32_t size = (uint32_t)(to - from), blamed = e->blame_until - (e->base + (uint32_t)from);
+    if ((int32_t)blamed < 0)
+        blamed = 0;
     if (blamed > size)
         blamed = size;
     e->count[e->blame] += blamed;
@@ -81,16 +84,17 @@ static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reaso
 
 static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int reason)
 {
+    uint32_t end = e->base + (uint32_t)(at + length);
     e->blame = (uint8_t)reason;
-    if (e->blame_until < e->base + at + length)
-        e->blame_until = e->base + at + length;
+    if ((int32_t)(end - e->blame_until) > 0)
+        e->blame_until = end;
     drop(e, b, at, at + 4, KCG_N_NOISE);
 }
 
 static int accept_next(kcg *g);
 
 /* A frame was found; where no further one can be kept, those found are taken first. */
-static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, uint64_t end)
+static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, uint32_t end)
 {
     if (!g) { /* of a flush: too late for use */
         e->count[KCG_N_LATE]++;
@@ -167,8 +171,9 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
             e->count[KCG_N_HEADERS]++;
             e->count[(is_info ? KCG_N_INFO_V4 : KCG_N_LIVE_V4) + !v4]++;
             at += forms[is_info][v4].length;
-            e->blame_until = 0;
-            found(g, e, is_info, v4, f + 4, e->base + at);
+            uint32_t end = e->base + (uint32_t)at;
+            e->blame_until = end;
+            found(g, e, is_info, v4, f + 4, end);
         } else if (ended) {
             e->count[KCG_N_HEADERS]++;
             reject(e, b, at, have, KCG_N_INCOMPLETE);
@@ -178,7 +183,7 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
             break;
         }
     }
-    e->base += at;
+    e->base += (uint32_t)at;
     return at;
 }
 
@@ -242,20 +247,23 @@ uint64_t kcg_count(const kcg_esc *e, int what)
     case KCG_N_LIVE: return n[KCG_N_LIVE_V4] + n[KCG_N_LIVE_LEGACY];
     case KCG_N_INFO: return n[KCG_N_INFO_V4] + n[KCG_N_INFO_LEGACY];
     case KCG_N_DROPPED: return n[KCG_N_NOISE] + n[KCG_N_BAD_CRC] + n[KCG_N_UNKNOWN_KIND] + n[KCG_N_INCOMPLETE];
+    case KCG_N_LINK: return e->link;
+    case KCG_N_LAYOUT: return e->layout;
     default: return n[what];
     }
 }
 
-static void note_window(const kcg_esc *e, uint64_t *w)
+static void note_window(const kcg_esc *e, uint32_t *w)
 {
-    w[0] = kcg_count(e, KCG_N_LIVE), w[1] = kcg_count(e, KCG_N_DROPPED), w[2] = e->count[KCG_N_BYTES], w[3] = e->count[KCG_N_CRC_ERRORS];
+    w[0] = (uint32_t)kcg_count(e, KCG_N_LIVE), w[1] = (uint32_t)kcg_count(e, KCG_N_DROPPED);
+    w[2] = (uint32_t)e->count[KCG_N_BYTES], w[3] = (uint32_t)e->count[KCG_N_CRC_ERRORS];
 }
 
 static int set_link(kcg_esc *e, int state)
 {
-    if (e->count[KCG_N_LINK] == (uint64_t)state)
+    if (e->link == state)
         return 0;
-    e->count[KCG_N_LINK] = (uint64_t)state;
+    e->link = (uint8_t)state;
     return KCG_LINK;
 }
 
@@ -293,16 +301,15 @@ static int expire_esc(kcg_esc *e, int64_t now)
 
 static int close_window(kcg_esc *e, int64_t now)
 {
-    uint64_t new[4], *old = e->window;
+    uint32_t new[4], *old = e->window;
     note_window(e, new);
-    int64_t length = now - e->window_ns, frames = (int64_t)(new[0] - old[0]), tenths = frames * 10 * SECOND;
+    int64_t length = now - e->window_ns, frames = new[0] - old[0], tenths = frames * (10 * SECOND);
     int64_t q = tenths / length, r = tenths % length;
     e->rate = e->has_live ? (int32_t)(q + (2 * r > length || (2 * r == length && q & 1))) : 0;
     e->interval = e->has_live && frames ? length / frames : 0;
-    int bad = new[3] - old[3] >= e->settings.crc_errors || (new[1] - old[1]) * 10 > new[2] - old[2];
+    int bad = new[3] - old[3] >= e->settings.crc_errors || (uint64_t)(new[1] - old[1]) * 10 > new[2] - old[2];
     e->window_ns = now;
-    memcpy(e->before, old, sizeof e->before);
-    memcpy(e->window, new, sizeof new);
+    memcpy(old, new, sizeof new);
     return KCG_SECOND | (e->has_live ? set_link(e, bad ? KCG_DEGRADED : KCG_OK) : 0);
 }
 
@@ -321,8 +328,8 @@ static int accept_info(kcg_esc *e, const uint8_t *body, int64_t when, int64_t bo
 static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
 {
     int events = 0;
-    if (e->count[KCG_N_LAYOUT] != f->layout) {
-        e->count[KCG_N_LAYOUT] = f->layout;
+    if (e->layout != f->layout) {
+        e->layout = f->layout;
         forget_device(e);
         e->had_live = e->had_info = 0;
         events = KCG_INFO | KCG_LINK;
@@ -350,17 +357,16 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
     if (!e->has_live || memcmp(e->live + ERRORS_AT, f->body + ERRORS_AT, 4))
         events |= KCG_ERRORS;
     memcpy(e->live, f->body, 30);
-    e->power = wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16);
+    e->power = (int32_t)(wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16));
     e->turns = u32(f->body) != 0;
     e->has_live = e->had_live = e->has_time = 1;
     e->live_ns = when, e->live_bound = bound;
-    if (e->count[KCG_N_LINK] != KCG_OK && e->count[KCG_N_LINK] != KCG_DEGRADED) {
+    if (e->link != KCG_OK && e->link != KCG_DEGRADED) {
         events |= set_link(e, KCG_OK);
         e->rate = -1;
         e->interval = 0;
         e->window_ns = when;
         note_window(e, e->window);
-        memcpy(e->before, e->window, sizeof e->before);
     }
     return events | KCG_LIVE;
 }
@@ -512,20 +518,20 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
 
 /* --- when (twin: schedule.py) ---------------------------------------------------------------------------------------- */
 
-static int64_t due_of(const kcg *g, int i)
+static int64_t due_of(const kcg *g, uint32_t i)
 {
     const kcg_sending *s = &g->sending[i];
     return s->cycle_due < s->deferred ? s->cycle_due : s->deferred;
 }
 
-static void put_in_heap(kcg *g, uint32_t place, uint16_t i)
+static void put_in_heap(kcg *g, uint32_t place, uint32_t i)
 {
-    g->heap[place] = i;
+    g->heap[place] = (uint16_t)i;
     g->sending[i].place_in_heap = (uint16_t)place;
 }
 
 /* Restore the order of the heap after a change of one message's deadline. */
-static void moved(kcg *g, uint16_t i)
+static void moved(kcg *g, uint32_t i)
 {
     uint32_t at = g->sending[i].place_in_heap;
     int64_t due = due_of(g, i);
@@ -547,7 +553,7 @@ static void moved(kcg *g, uint16_t i)
     put_in_heap(g, at, i);
 }
 
-static void defer(kcg *g, uint16_t i, int64_t until)
+static void defer(kcg *g, uint32_t i, int64_t until)
 {
     if (g->sending[i].deferred == KCG_NEVER) {
         g->sending[i].deferred = until;
@@ -555,42 +561,60 @@ static void defer(kcg *g, uint16_t i, int64_t until)
     }
 }
 
-static int may_go(const kcg *g, uint16_t i, int64_t now)
+static int may_go(const kcg *g, uint32_t i, int64_t now)
 {
     return now >= g->sending[i].last + g->plan->message[i].delay;
 }
 
 /* --- messages (twin: messages.py) ------------------------------------------------------------------------------------ */
 
-static uint64_t all_pages(const kcg_message *m)
+/* Let a page follow without waiting for an event. */
+static void let_follow(kcg *g, uint32_t i, int place)
 {
-    return m->pages > 1 ? ~UINT64_C(0) >> (KCG_PAGES - m->pages) : 0;
+    uint8_t *page = &g->page[g->plan->message[i].first_page + place];
+    g->sending[i].pages_to_send = (uint8_t)(g->sending[i].pages_to_send + !(*page & TO_SEND));
+    *page |= TO_SEND;
 }
 
-static void turn_page(kcg_sending *s, const kcg_message *m)
+/* Let all pages follow, of a message that has several. */
+static void let_all_follow(kcg *g, uint32_t i)
 {
-    s->pages_to_send |= UINT64_C(1) << s->page;
-    s->page = (uint8_t)((s->page + 1) % m->pages);
+    int pages = g->plan->message[i].pages;
+    for (int place = 0; pages > 1 && place < pages; place++)
+        let_follow(g, i, place);
+}
+
+static int page_after(const kcg_message *m, int place)
+{
+    return place + 1 < m->pages ? place + 1 : 0;
+}
+
+static void turn_page(kcg *g, uint32_t i)
+{
+    kcg_sending *s = &g->sending[i];
+    let_follow(g, i, s->page);
+    s->page = (uint8_t)page_after(&g->plan->message[i], s->page);
 }
 
 /* The first page that is to follow, from the one on whose turn it is next. */
-static int next_place(kcg_sending *s, const kcg_message *m)
+static int next_place(kcg *g, uint32_t i)
 {
+    const kcg_message *m = &g->plan->message[i];
     if (m->pages <= 1)
         return 0;
-    if (!s->pages_to_send)
-        turn_page(s, m);
-    int place = s->page;
-    while (!(s->pages_to_send >> place & 1))
-        place = (place + 1) % m->pages;
+    if (!g->sending[i].pages_to_send)
+        turn_page(g, i);
+    int place = g->sending[i].page;
+    while (!(g->page[m->first_page + place] & TO_SEND))
+        place = page_after(m, place);
     return place;
 }
 
-static void mark(kcg *g, uint16_t i, int64_t since, int why)
+static void mark(kcg *g, uint32_t i, int64_t since, int why)
 {
     kcg_sending *s = &g->sending[i];
     if (!s->why) {
-        g->pending[g->pendings++] = i;
+        g->pending[g->pendings++] = (uint16_t)i;
         s->since = since;
     } else if (since < s->since) {
         s->since = since;
@@ -599,25 +623,27 @@ static void mark(kcg *g, uint16_t i, int64_t since, int why)
 }
 
 /* False for a message that is sent on change and has not changed; of several pages those that have follow. */
-static int is_news(kcg *g, uint16_t i, int64_t now)
+static int is_news(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
-    uint64_t bits[WORDS], changed = 0;
+    uint64_t bits[WORDS];
+    int changed = 0;
     if (m->flags & KCG_EVENT || !(m->flags & KCG_ON_CHANGE))
         return 1;
     for (int place = 0; place < m->pages; place++) {
         pack(g, m, place, now, 0, bits);
-        if (!g->last_known[m->first_page + place] ||
-            memcmp(bits, g->last + m->first_word + (size_t)place * m->words, m->words * sizeof *bits))
-            changed |= UINT64_C(1) << place;
+        if (!(g->page[m->first_page + place] & KNOWN) ||
+            memcmp(bits, g->last + m->first_word + (size_t)place * m->words, m->words * sizeof *bits)) {
+            changed = 1;
+            if (m->pages > 1)
+                let_follow(g, i, place);
+        }
     }
-    if (m->pages > 1)
-        g->sending[i].pages_to_send |= changed;
     return changed || g->sending[i].pages_to_send;
 }
 
 /* Let a message be handed over as soon as its minimum distance allows. */
-static void request(kcg *g, uint16_t i, int64_t now)
+static void request(kcg *g, uint32_t i, int64_t now)
 {
     if (may_go(g, i, now)) {
         if (!g->sending[i].why)
@@ -633,7 +659,7 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
     const kcg_esc *e = &g->esc[esc];
     int gone = !e->has_live || (events & KCG_INFO && !e->has_info);
     for (int k = plan->first_listener[esc]; k < plan->first_listener[esc + 1]; k++) {
-        uint16_t i = plan->listener[k];
+        uint32_t i = plan->listener[k];
         const kcg_message *m = &plan->message[i];
         int hit = m->triggers & events;
         if (e->has_live && m->flags & KCG_EVENT && m->triggers & KCG_LIVE)
@@ -641,7 +667,7 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
         if (!hit)
             continue;
         if (gone && m->flags & KCG_EVENT)
-            g->sending[i].pages_to_send |= all_pages(m);
+            let_all_follow(g, i);
         if (g->sending[i].why)
             continue;
         if (m->flags & KCG_FREE)
@@ -653,7 +679,7 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
 
 void kcg_gateway_changed(kcg *g, int each_second, int64_t now)
 {
-    for (uint16_t i = 0; i < g->plan->messages; i++) {
+    for (uint32_t i = 0; i < g->plan->messages; i++) {
         const kcg_message *m = &g->plan->message[i];
         if (m->flags & KCG_OF_THE_GATEWAY && !(each_second && m->cycle))
             request(g, i, now);
@@ -662,11 +688,12 @@ void kcg_gateway_changed(kcg *g, int each_second, int64_t now)
 
 void kcg_repeat(kcg *g, int64_t now)
 {
-    for (uint16_t i = 0; i < g->plan->messages; i++) {
+    for (uint32_t i = 0; i < g->plan->messages; i++) {
         const kcg_message *m = &g->plan->message[i];
-        memset(g->last_known + m->first_page, 0, m->pages);
+        for (int place = 0; place < m->pages; place++)
+            g->page[m->first_page + place] &= TO_SEND;
         if (!m->cycle) {
-            g->sending[i].pages_to_send |= all_pages(m);
+            let_all_follow(g, i);
             request(g, i, now);
         }
     }
@@ -675,12 +702,12 @@ void kcg_repeat(kcg *g, int64_t now)
 void kcg_stop(kcg *g, int64_t now)
 {
     g->stopping = 1;
-    for (uint16_t i = 0; i < g->plan->messages; i++) {
+    for (uint32_t i = 0; i < g->plan->messages; i++) {
         const kcg_message *m = &g->plan->message[i];
         if (!(m->flags & KCG_OF_THE_GATEWAY))
             continue;
         if (m->flags & KCG_EVENT)
-            g->sending[i].pages_to_send |= all_pages(m);
+            let_all_follow(g, i);
         mark(g, i, now, REQUEST);
     }
 }
@@ -688,7 +715,7 @@ void kcg_stop(kcg *g, int64_t now)
 static void advance_messages(kcg *g, int64_t now)
 {
     while (g->heaped) {
-        uint16_t i = g->heap[0];
+        uint32_t i = g->heap[0];
         const kcg_message *m = &g->plan->message[i];
         kcg_sending *s = &g->sending[i];
         int64_t when = due_of(g, i);
@@ -735,22 +762,22 @@ static uint8_t e2e_crc(const kcg_frame *f, int at, int data_id) /* AUTOSAR E2E p
     return c;
 }
 
-static void make_frame(kcg *g, uint16_t i, int64_t now, kcg_frame *f)
+static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
 {
     const kcg_message *m = &g->plan->message[i];
     kcg_sending *s = &g->sending[i];
     uint64_t bits[WORDS];
     if (s->why & CYCLE && m->pages > 1) {
         s->why = REQUEST | TURNED; /* once, however often it is taken before it is sent */
-        turn_page(s, m);
+        turn_page(g, i);
     }
-    int place = next_place(s, m);
+    int place = next_place(g, i);
     pack(g, m, place, now, s->alive, bits);
     memset(f, 0, sizeof *f);
     f->page = (uint8_t)place;
     f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
-    for (int k = 0; k < m->length; k++)
-        f->data[k] = (uint8_t)(bits[k / 8] >> k % 8 * 8);
+    for (int k = 0; k < m->length; k++, bits[(k - 1) / 8] >>= 8)
+        f->data[k] = (uint8_t)bits[k / 8];
     if (m->flags & KCG_HAS_CRC)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
 }
@@ -759,13 +786,20 @@ static void make_frame(kcg *g, uint16_t i, int64_t now, kcg_frame *f)
 static void sort_pending(kcg *g)
 {
     for (uint32_t k = 1; k < g->pendings; k++) {
-        uint16_t i = g->pending[k];
+        uint32_t i = g->pending[k];
         int64_t since = g->sending[i].since;
         uint32_t at = k;
         for (; at && (g->sending[g->pending[at - 1]].since > since || (g->sending[g->pending[at - 1]].since == since && g->pending[at - 1] > i)); at--)
             g->pending[at] = g->pending[at - 1];
-        g->pending[at] = i;
+        g->pending[at] = (uint16_t)i;
     }
+}
+
+/* Of the first `done` that were pending the first `kept` places stay. */
+static void keep_pending(kcg *g, uint32_t kept, uint32_t done)
+{
+    memmove(g->pending + kept, g->pending + done, (g->pendings - done) * sizeof *g->pending);
+    g->pendings -= done - kept;
 }
 
 uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
@@ -774,11 +808,13 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
     g->taken = 0;
     sort_pending(g);
     for (; k < g->pendings && g->taken < max; k++) {
-        uint16_t i = g->pending[k];
+        uint32_t i = g->pending[k];
         const kcg_message *m = &g->plan->message[i];
         kcg_sending *s = &g->sending[i];
         int why = s->why;
         if (is_silent(g, m)) {
+            for (int place = 0; place < m->pages; place++)
+                g->page[m->first_page + place] &= KNOWN;
             s->pages_to_send = 0;
             s->why = 0;
             continue;
@@ -789,14 +825,13 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
             continue;
         }
         make_frame(g, i, now, &frames[g->taken++]);
-        g->pending[kept++] = i;
-        if (g->stopping && s->pages_to_send & (s->pages_to_send - 1)) {
+        g->pending[kept++] = (uint16_t)i;
+        if (g->stopping && s->pages_to_send > 1) {
             k++; /* its other pages go next */
             break;
         }
     }
-    memmove(g->pending + kept, g->pending + k, (g->pendings - k) * sizeof *g->pending);
-    g->pendings -= k - kept;
+    keep_pending(g, kept, k);
     return g->taken;
 }
 
@@ -804,17 +839,18 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
 {
     uint32_t kept = 0;
     for (uint32_t k = 0; k < count; k++) {
-        uint16_t i = g->pending[k];
+        uint32_t i = g->pending[k];
         const kcg_message *m = &g->plan->message[i];
         kcg_sending *s = &g->sending[i];
-        int place = next_place(s, m);
+        int place = next_place(g, i);
+        uint8_t *page = &g->page[m->first_page + place];
+        s->pages_to_send = (uint8_t)(s->pages_to_send - (*page / TO_SEND & 1));
+        *page &= KNOWN;
         if (m->flags & KCG_ON_CHANGE) {
             pack(g, m, place, now, 0, g->last + m->first_word + (size_t)place * m->words);
-            g->last_known[m->first_page + place] = 1;
+            *page = KNOWN;
         }
-        if (m->alive_modulus)
-            s->alive = (uint8_t)((s->alive + 1) % m->alive_modulus);
-        s->pages_to_send &= ~(UINT64_C(1) << place);
+        s->alive = (uint16_t)(s->alive < m->last_alive ? s->alive + 1 : 0);
         s->why = 0;
         if (!(m->flags & KCG_FREE)) {
             s->last = now;
@@ -822,23 +858,16 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
             if (s->deferred != KCG_NEVER)
                 s->deferred = KCG_NEVER, moved(g, i);
             if (g->stopping && s->pages_to_send)
-                s->why = REQUEST, g->pending[kept++] = i;
+                s->why = REQUEST, g->pending[kept++] = (uint16_t)i;
             else if (s->pages_to_send)
                 defer(g, i, now + (m->delay > MIN_DISTANCE ? m->delay : MIN_DISTANCE));
         }
     }
-    memmove(g->pending + kept, g->pending + count, (g->pendings - count) * sizeof *g->pending);
-    g->pendings -= count - kept;
+    keep_pending(g, kept, count);
     g->taken = 0;
 }
 
 /* --- together (twin: core.py) ---------------------------------------------------------------------------------------- */
-
-static void sooner(kcg *g, int64_t due)
-{
-    if (due < g->next_expiry)
-        g->next_expiry = due;
-}
 
 static void report(kcg *g, int esc, int events, int64_t now)
 {
@@ -847,7 +876,9 @@ static void report(kcg *g, int esc, int events, int64_t now)
     on_event(g, esc, events, now);
     if (events & (KCG_LINK | KCG_INFO)) {
         int64_t ok = 0;
-        sooner(g, esc_deadline(&g->esc[esc]));
+        int64_t due = esc_deadline(&g->esc[esc]);
+        if (due < g->next_expiry)
+            g->next_expiry = due;
         for (int i = 0; i < g->plan->escs; i++)
             ok += g->esc[i].has_live;
         if (ok != g->gateway[KCG_ESCS_OK]) {
@@ -860,6 +891,17 @@ static void report(kcg *g, int esc, int events, int64_t now)
             g->report[g->reports++] = (uint8_t)esc;
         g->esc[esc].reported = (uint8_t)(g->esc[esc].reported | events);
     }
+}
+
+static int64_t first_expiry(const kcg *g)
+{
+    int64_t first = KCG_NEVER;
+    for (int i = 0; i < g->plan->escs; i++) {
+        int64_t due = esc_deadline(&g->esc[i]);
+        if (due < first)
+            first = due;
+    }
+    return first;
 }
 
 static void expire(kcg *g, int64_t now, int but)
@@ -875,9 +917,7 @@ static void expire(kcg *g, int64_t now, int but)
             report(g, i, events, now);
         }
     }
-    g->next_expiry = KCG_NEVER;
-    for (int i = 0; i < g->plan->escs; i++)
-        sooner(g, esc_deadline(&g->esc[i]));
+    g->next_expiry = first_expiry(g);
     if (now - g->second >= SECOND) {
         g->second = now;
         kcg_gateway_changed(g, 1, now);
@@ -891,7 +931,7 @@ static int accept_next(kcg *g)
         return 0;
     const kcg_found *f = &g->found[g->found_at++];
     kcg_esc *e = &g->esc[g->read_esc];
-    int64_t after = (int64_t)(g->read_end - f->end) * BYTE_NS, limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
+    int64_t after = (g->read_end - f->end) * BYTE_NS, limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
     if (g->read_now - g->read_bound + after > limit) /* the bytes after it in the same read make it old already */
         e->count[KCG_N_LATE]++;
     else
@@ -913,26 +953,24 @@ int kcg_next_event(kcg *g)
         if (g->read_esc < 0)
             return -1;
         kcg_esc *e = &g->esc[g->read_esc];
-        if (e->count[KCG_N_LINK] == KCG_NEVER_SEEN)
+        if (e->link == KCG_NEVER_SEEN)
             report(g, g->read_esc, set_link(e, KCG_SEARCHING), g->read_now);
         g->read_esc = -1;
     }
 }
 
-static void note_arrival(kcg_esc *e, uint64_t end, int64_t bound)
+static void note_arrival(kcg_esc *e, uint32_t end, int64_t bound)
 {
-    int gone = 0;
-    if (!e->held_count) {
-        e->arrivals = 0;
-        return;
-    }
-    uint64_t begin = end - e->held_count;
-    while (gone < e->arrivals && e->arrival[gone].end <= begin)
+    int gone = 0, left;
+    uint32_t begin = end - e->held_count;
+    while (gone < e->arrivals && (int32_t)(e->arrival_end[gone] - begin) <= 0)
         gone++;
-    e->arrivals = (uint8_t)(e->arrivals - gone);
-    memmove(e->arrival, e->arrival + gone, e->arrivals * sizeof *e->arrival);
-    e->arrival[e->arrivals].end = end;
-    e->arrival[e->arrivals++].bound = bound;
+    left = e->arrivals - gone;
+    memmove(e->arrival_end, e->arrival_end + gone, (size_t)left * sizeof *e->arrival_end);
+    memmove(e->arrival_bound, e->arrival_bound + gone, (size_t)left * sizeof *e->arrival_bound);
+    if (e->held_count)
+        e->arrival_end[left] = end, e->arrival_bound[left++] = bound;
+    e->arrivals = (uint8_t)left;
 }
 
 int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since)
@@ -946,7 +984,7 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
             return kcg_next_event(g) | KCG_AGAIN;
     }
     g->again = 0;
-    if (e->arrivals && now - e->arrival[0].bound > e->settings.timeout)
+    if (e->arrivals && now - e->arrival_bound[0] > e->settings.timeout)
         flush(e);
     int64_t bound = since + ((int64_t)size - 1) * BYTE_NS;
     if (bound > now) /* a pseudo terminal is faster than the wire */
@@ -955,7 +993,7 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     g->read_now = now;
     g->read_bound = bound;
     g->read_shown = now - bound <= e->interval ? now : bound;
-    g->read_end = e->count[KCG_N_BYTES] + size;
+    g->read_end = e->base + e->held_count + (uint32_t)size;
     g->found_count = g->found_at = 0;
     feed(g, e, data, size);
     if (size)
@@ -984,7 +1022,7 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
         flush(e);
         e->count[KCG_N_LATE] = late; /* that it was dropped is said by the link */
         report(g, esc, lose(e, KCG_PORT_ERROR), now);
-    } else if (e->count[KCG_N_LINK] == KCG_PORT_ERROR) {
+    } else if (e->link == KCG_PORT_ERROR) {
         report(g, esc, set_link(e, e->has_time ? KCG_LOST : KCG_NEVER_SEEN), now);
     }
     return kcg_next_event(g);
@@ -992,13 +1030,7 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
 
 int64_t kcg_next_deadline(kcg *g)
 {
-    int64_t due = g->next_expiry;
-    if (!due) {
-        due = KCG_NEVER;
-        for (int i = 0; i < g->plan->escs; i++)
-            if (esc_deadline(&g->esc[i]) < due)
-                due = esc_deadline(&g->esc[i]);
-    }
+    int64_t due = g->next_expiry ? g->next_expiry : first_expiry(g);
     if (g->heaped && due_of(g, g->heap[0]) < due)
         due = due_of(g, g->heap[0]);
     return due;
@@ -1012,31 +1044,23 @@ void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
     g->next_expiry = 0;
 }
 
-static size_t rounded(size_t n)
-{
-    return (n + 7) / 8 * 8;
-}
-
 size_t kcg_size(const kcg_plan *p)
 {
-    return rounded(sizeof(kcg)) + rounded(p->escs * sizeof(kcg_esc)) + rounded(p->messages * sizeof(kcg_sending)) + p->words * sizeof(uint64_t) +
-           rounded(p->pages) + rounded(p->escs) + 2 * rounded(p->messages * sizeof(uint16_t));
+    return KCG_SIZE(p->messages, p->escs, p->pages, p->words);
 }
 
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now)
 {
-    uint8_t *at = memory;
     kcg *g = memory;
     memset(memory, 0, kcg_size(plan));
     crc_init();
-    at += rounded(sizeof *g);
-    g->esc = (void *)at, at += rounded(plan->escs * sizeof(kcg_esc));
-    g->sending = (void *)at, at += rounded(plan->messages * sizeof(kcg_sending));
-    g->last = (void *)at, at += plan->words * sizeof(uint64_t);
-    g->heap = (void *)at, at += rounded(plan->messages * sizeof(uint16_t));
-    g->pending = (void *)at, at += rounded(plan->messages * sizeof(uint16_t));
-    g->last_known = at, at += rounded(plan->pages);
-    g->report = at;
+    g->esc = (kcg_esc *)(g + 1);
+    g->sending = (kcg_sending *)(g->esc + plan->escs);
+    g->last = (uint64_t *)(g->sending + plan->messages);
+    g->heap = (uint16_t *)(g->last + plan->words);
+    g->pending = g->heap + plan->messages;
+    g->page = (uint8_t *)(g->pending + plan->messages);
+    g->report = g->page + plan->pages;
     g->plan = plan;
     g->gateway[KCG_STARTED] = g->second = now;
     g->read_esc = -1;
@@ -1048,7 +1072,7 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
         e->window_ns = now;
         e->cells = e->settings.cells;
     }
-    for (uint16_t i = 0; i < plan->messages; i++) {
+    for (uint32_t i = 0; i < plan->messages; i++) {
         kcg_sending *s = &g->sending[i];
         s->last = LONG_AGO;
         s->deferred = KCG_NEVER;
@@ -1061,6 +1085,7 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
 
 /* --- for a caller that cannot see structures ------------------------------------------------------------------------- */
 
+#if KCG_SOURCE
 uint32_t kcg_sizes(uint32_t what)
 {
     static const size_t size[] = {KCG_SOURCE, sizeof(kcg_signal), sizeof(kcg_message), sizeof(kcg_settings), sizeof(kcg_plan), sizeof(kcg_esc), sizeof(kcg_frame)};
@@ -1091,3 +1116,4 @@ uint32_t kcg_pending(const kcg *g)
 {
     return g->pendings;
 }
+#endif

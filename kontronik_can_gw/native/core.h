@@ -58,9 +58,8 @@ enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
 /* Counters of a stream, then what is counted like them. Twin: deframer.Counters. */
 enum {
     KCG_N_BYTES, KCG_N_LIVE_V4, KCG_N_LIVE_LEGACY, KCG_N_INFO_V4, KCG_N_INFO_LEGACY, KCG_N_HEADERS, KCG_N_CRC_ERRORS, KCG_N_UNKNOWN_KINDS,
-    KCG_N_NOISE, KCG_N_BAD_CRC, KCG_N_UNKNOWN_KIND, KCG_N_INCOMPLETE, KCG_N_LONG_RUN, KCG_N_LINK, KCG_N_LAYOUT, KCG_N_LOSSES, KCG_N_LATE,
-    KCG_N_SUSPECT, KCG_COUNTS,
-    KCG_N_LIVE = KCG_COUNTS, KCG_N_INFO, KCG_N_DROPPED /* sums */
+    KCG_N_NOISE, KCG_N_BAD_CRC, KCG_N_UNKNOWN_KIND, KCG_N_INCOMPLETE, KCG_N_LONG_RUN, KCG_N_LOSSES, KCG_N_LATE, KCG_N_SUSPECT, KCG_COUNTS,
+    KCG_N_LINK = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE, KCG_N_INFO, KCG_N_DROPPED /* states, sums */
 };
 enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16 };                             /* of a signal */
 enum { KCG_EVENT = 1, KCG_ON_CHANGE = 2, KCG_SILENT = 4, KCG_HAS_CRC = 8, KCG_OF_THE_GATEWAY = 16, KCG_FREE = 32 }; /* of a message */
@@ -78,10 +77,10 @@ typedef struct {
 } kcg_signal;
 typedef struct {
     uint32_t id;
-    uint8_t length, words, flags, triggers, pages, crc_at, alive_modulus, fd_flags;
-    uint16_t first_signal, signals, data_id, first_page;         /* first_page: of all pages of all messages */
+    uint8_t length, words, flags, triggers, pages, crc_at, escs, fd_flags;
+    uint16_t first_signal, signals, data_id, first_page, last_alive; /* first_page: of all pages of all messages; last_alive: of the alive counter, which begins at 0 */
     uint32_t first_word;                                         /* of the constants: `words` for each page */
-    uint32_t first_esc, escs;                                    /* whose values it holds: kcg_plan.esc_of */
+    uint32_t first_esc;                                          /* `escs` whose values it holds: kcg_plan.esc_of */
     int64_t cycle, delay, phase;
 } kcg_message;
 typedef struct { int64_t timeout; uint32_t crc_errors, poles, gear_numerator, gear_denominator; uint8_t cells, reserved[7]; } kcg_settings;
@@ -97,49 +96,51 @@ typedef struct {
     uint16_t messages, escs, pages;
 } kcg_plan;
 
-typedef struct {
+typedef struct { /* what is read most comes first: a small machine's instructions reach it in two bytes */
+    uint8_t has_live, has_info, had_live, had_info, has_time, turns, cells, held_count, need, arrivals, blame, reported, link, layout;
+    int32_t rate, power;                       /* rate: 0.1 Hz; -1: not known. power: mW */
     kcg_settings settings;
     uint64_t count[KCG_COUNTS];
-    uint64_t window[4], before[4];             /* live frames, dropped bytes, bytes, CRC errors at the begin of this second, the last */
-    uint64_t base, blame_until, energy;        /* energy: mW s, and the rest in mW ns */
-    int64_t energy_rest, run_time, power;
-    int64_t live_ns, live_bound, info_ns, info_bound, last_info_ns, window_ns, interval;
-    struct { uint64_t end; int64_t bound; } arrival[KCG_HELD + 1];
-    int32_t rate;                              /* 0.1 Hz; -1: not known */
+    uint32_t window[4];                        /* live frames, dropped bytes, bytes, CRC errors at the begin of this second */
+    uint32_t base, blame_until;                /* positions in the stream: compared by their difference */
+    uint64_t energy;                           /* mW s, and the rest in mW ns */
+    int64_t energy_rest, run_time;
+    int64_t live_ns, live_bound, info_bound, last_info_ns, window_ns, interval;
+    int64_t arrival_bound[KCG_HELD + 1];
+    uint32_t arrival_end[KCG_HELD + 1];
     uint32_t generation;                       /* grows with each change of live and info, and of whether they are there */
     uint8_t live[KCG_BODY], info[KCG_BODY], held[KCG_HELD + KCG_LONGEST];
-    uint8_t has_live, has_info, had_live, had_info, has_time, turns, cells, held_count, need, arrivals, blame, reported;
 } kcg_esc;
 
 typedef struct {
+    uint16_t place_in_heap, alive;
+    uint8_t page, pages_to_send, cycle_deferred, why;
     int64_t last, cycle_due, deferred, since;  /* KCG_NEVER: no cycle, nothing deferred */
-    uint64_t pages_to_send;
-    uint16_t place_in_heap;
-    uint8_t alive, page, cycle_deferred, why, placed;
 } kcg_sending;
 
-typedef struct { uint64_t end; uint8_t is_info, layout, length, body[KCG_BODY]; } kcg_found;
+typedef struct { uint32_t end; uint8_t is_info, layout, length, body[KCG_BODY]; } kcg_found;
 
 typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;
     kcg_sending *sending;
     uint64_t *last;                            /* bits of the last frame of each page, of messages that are sent on change */
-    uint8_t *last_known, *report;              /* report: ESCs with events to be followed, oldest first */
+    uint8_t *page, *report;                    /* of each page of all messages: its last frame is known, it is to follow; ESCs with events to be followed, oldest first */
     uint16_t *heap, *pending;                  /* messages by their next deadline; those to be handed over */
     uint32_t pendings, taken, heaped, reports;
-    int64_t gateway[KCG_OF_GATEWAY_COUNT];     /* states and counters, written by the owner, in the order of tables.GATEWAY */
-    int64_t second, next_expiry;
     uint32_t mask;                             /* events that end a step and are reported */
-    uint8_t stopping, again;
-    /* the read that is being taken */
-    uint32_t found_count, found_at;
-    int read_esc;
-    uint64_t read_end;
+    int read_esc;                              /* the read that is being taken; -1: none */
+    uint32_t found_count, found_at, read_end;
     int64_t read_now, read_shown, read_bound;
+    int64_t second, next_expiry;
+    int64_t gateway[KCG_OF_GATEWAY_COUNT];     /* states and counters, written by the owner, in the order of tables.GATEWAY */
+    uint8_t stopping, again;
     kcg_found found[KCG_FOUND];
 } kcg;
 
+/* What kcg_init needs; each structure's size is a multiple of 8. */
+#define KCG_SIZE(messages, escs, pages, words) \
+    (sizeof(kcg) + (escs) * (sizeof(kcg_esc) + 1) + (messages) * (sizeof(kcg_sending) + 2 * sizeof(uint16_t)) + (pages) + (words) * sizeof(uint64_t))
 size_t kcg_size(const kcg_plan *plan);
 /* memory: kcg_size bytes, aligned for int64_t. */
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now);

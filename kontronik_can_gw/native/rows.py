@@ -38,9 +38,9 @@ Signal = _structure(
     high=_i64, error=_u64, not_available=_u64,
 )  # fmt: skip
 Message = _structure(
-    "Message", id=_u32, length=_u8, words=_u8, flags=_u8, triggers=_u8, pages=_u8, crc_at=_u8, alive_modulus=_u8, fd_flags=_u8,
-    first_signal=_u16, signals=_u16, data_id=_u16, first_page=_u16, first_word=_u32, first_esc=_u32, escs=_u32, cycle=_i64, delay=_i64,
-    phase=_i64,
+    "Message", id=_u32, length=_u8, words=_u8, flags=_u8, triggers=_u8, pages=_u8, crc_at=_u8, escs=_u8, fd_flags=_u8,
+    first_signal=_u16, signals=_u16, data_id=_u16, first_page=_u16, last_alive=_u16, first_word=_u32, first_esc=_u32, cycle=_i64,
+    delay=_i64, phase=_i64,
 )  # fmt: skip
 Settings = _structure(
     "Settings", timeout=_i64, crc_errors=_u32, poles=_u32, gear_numerator=_u32, gear_denominator=_u32, cells=_u8, reserved=_u8 * 7

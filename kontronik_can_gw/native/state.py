@@ -13,7 +13,6 @@ from kontronik_can_gw.native.tables import COUNTS, GATEWAY
 _STREAM = COUNTS.index("long_run_bytes") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""
 _COUNT = {name: COUNTS.index(name) for name in ("losses", "late_frames", "suspect_frames")}
-_LINK, _LAYOUT = COUNTS.index("link_state"), COUNTS.index("layout")
 
 
 class NativeDrawn:
@@ -116,8 +115,8 @@ _READ: dict[str, Callable[[NativeEsc], Any]] = {
     "last_live": lambda esc: esc.reading(2),
     "last_info": lambda esc: esc.reading(3),
     "device": lambda esc: esc.protocol.value("device_raw", esc.reading(3)),
-    "link": lambda esc: LinkState(esc._state.count[_LINK]),
-    "layout": lambda esc: esc._state.count[_LAYOUT],
+    "link": lambda esc: LinkState(esc._state.link),
+    "layout": lambda esc: esc._state.layout,
     "cells": lambda esc: esc._state.cells,
     "frame_rate": lambda esc: None if esc._state.rate < 0 else esc._state.rate,
     "live_ns": lambda esc: esc._state.live_ns if esc._state.has_time else None,

@@ -29,10 +29,11 @@ WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
 COUNTS = (
     "bytes", "live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds", "dropped_noise", "dropped_crc",
-    "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes", "link_state", "layout", "losses", "late_frames", "suspect_frames",
-    "live_frames", "info_frames", "dropped_bytes",
+    "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes", "losses", "late_frames", "suspect_frames",
+    "link_state", "layout", "live_frames", "info_frames", "dropped_bytes",
 )  # fmt: skip
-"""Of kcg_esc.count, in its order; the last three are sums."""
+"""Of kcg_esc.count, in its order; the last ones are states and sums."""
+STORED_COUNTS = COUNTS.index("link_state")
 GATEWAY = (
     "escs_ok", "gateway_state", "can_state", "esc_count", "sent_frames", "replaced_frames", "send_failures", "received_frames",
     "bus_off_count", "dropped_frames", "id_conflicts", "started_ns",
@@ -46,6 +47,7 @@ MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""
 MAX_POLES = MAX_GEAR = 0xFFFF
 MAX_CELLS = 0xFF
+MAX_ALIVE = 1 << 16
 _DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
@@ -119,10 +121,9 @@ class Tables:
             Message(
                 plan.can_id | (EXTENDED if plan.extended else 0),
                 *(plan.length, words, flags, traits.triggers, len(plan.pages)),
-                crc.pieces[0].at // 8 if crc else 0,
-                traits.alive_modulus,
-                *(int(plan.fd), first, len(self.signals) - first, plan.data_id & 0xFFFF),
-                *(self.pages, first_word, first_esc, len(plan.escs)),
+                *(crc.pieces[0].at // 8 if crc else 0, len(plan.escs), int(plan.fd)),
+                *(first, len(self.signals) - first, plan.data_id & 0xFFFF, self.pages),
+                *(max(0, traits.alive_modulus - 1), first_word, first_esc),
                 *(plan.cycle_ns, plan.delay_ns, phase),
             )
         )
@@ -144,7 +145,7 @@ class Tables:
         row.error, row.not_available = signal.error & _M64, signal.not_available & _M64
         if signal.role is Role.ALIVE:
             row.kind, row.div = OF_ALIVE, alive_modulus(signal, has_crc)
-            if row.div > 255:
+            if row.div > MAX_ALIVE:
                 raise NotInCore(
                     f"{plan.name}.{signal.name}: an alive counter of {signal.length} bits"
                 )

@@ -76,10 +76,11 @@ def layout(chance: random.Random, escs: Sequence[EscSettings]) -> Layout:
 def protected(chance: random.Random, escs: Sequence[EscSettings]) -> Msg:
     """A message with an alive counter and perhaps a CRC of AUTOSAR E2E profile 1."""
     prefix = f"Esc{chance.randint(1, len(escs))}" if len(escs) > 1 else ""
-    signals = [Sig("Alive", 8, 4), Sig(f"{prefix}BatteryVoltage", 16, 16, unit="V", factor="0.01")]
+    voltage = Sig(f"{prefix}BatteryVoltage", 24, 16, unit="V", factor="0.01")
+    signals = [Sig("Alive", 8, chance.choice((2, 4, 8, 16))), voltage]
     if chance.random() < 0.7:
         signals.append(Sig("Crc8", 0, 8))
-    return Msg("Protected", 0x7F0, chance.randint(4, 8), signals)
+    return Msg("Protected", 0x7F0, chance.randint(5, 8), signals)
 
 
 def stream(chance: random.Random) -> bytes:
