@@ -3,7 +3,7 @@
 ``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.core import Core, Follower, PythonCore
@@ -12,12 +12,14 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.id_conflicts import IdConflicts
 from kontronik_can_gw.native.load import make_core
-from kontronik_can_gw.output import Output
+from kontronik_can_gw.output import NEVER, Output
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 
+Call = tuple[int, int, int, bytes, int | None]
+"""A call of the core: time, kind as in a capture, ESC, bytes, since when they can have come."""
 MakeOutput = Callable[[Sequence[EscTelemetry], GatewayStatus, int], Output]
 """ESCs, gateway and time to an output that begins then."""
 
@@ -178,7 +180,11 @@ class Gateway:
 
     def next_deadline(self) -> int:
         """When ``advance`` is to be called at the latest."""
-        due = self.core.next_deadline()
+        return min(self.core.next_deadline(), self.outputs_deadline())
+
+    def outputs_deadline(self) -> int:
+        """The same, of the outputs alone."""
+        due = NEVER
         for output in self._outputs:
             due = min(due, output.next_deadline())
         return due
@@ -200,6 +206,13 @@ class Gateway:
 
     def not_sent(self, now: int) -> None:
         """The frames that were taken last were thrown away. The gateway itself need not know; who records it does."""
+
+    def prepare_turns(self, _now: int) -> bool:
+        """Turns in C follow. True: what they do is to be given to ``turned``."""
+        return False
+
+    def turned(self, calls: Iterable[Call], frames: int) -> None:
+        """The core was called like this by turns in C, and as many frames were taken. The gateway itself need not know, either."""
 
     def take_link_changes(self) -> list[int]:
         """ESCs whose link state, layout or device changed since the last call."""

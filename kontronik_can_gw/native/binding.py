@@ -100,6 +100,8 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "kcg_gateway": (_p, _p),
     "kcg_set_mask": (None, _p, _u32),
     "kcg_pending": (_u32, _p),
+    "kcg_turn": (None, _p),
+    "kcg_turns_size": (_u32,),
 }
 
 
@@ -135,7 +137,7 @@ class Handle:
     ) -> None:
         if tables.wire not in ("", library.kcg_wire().decode()):
             raise NotInCore(f"fields on the wire: {tables.wire}")
-        self._library = library
+        self.library = library
         self._on_event = on_event
         self._kept = [
             self._array(Message, tables.messages),
@@ -152,9 +154,9 @@ class Handle:
         size = library.kcg_size(c.byref(self._plan))
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)
-        self._core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
+        self.core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
         begin = c.addressof(self._memory)
-        at = library.kcg_escs(self._core) - begin, library.kcg_gateway(self._core) - begin
+        at = library.kcg_escs(self.core) - begin, library.kcg_gateway(self.core) - begin
         self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, at[0])
         self.gateway = (_i64 * len(GATEWAY)).from_buffer(self._memory, at[1])
         self._frames = (Frame * _MAX_FRAMES)()
@@ -164,14 +166,15 @@ class Handle:
     def _array(kind: Any, rows: Sequence[Any]) -> Any:
         return (kind * max(1, len(rows)))(*rows)
 
-    def _follow(self, found: int, now: int) -> None:
+    def follow(self, found: int, now: int) -> None:
+        """Give ``on_event`` what a call of the core returned, and what else there is."""
         while found >= 0:
             self._on_event(found >> 8, found & 0xFF, now)
-            found = self._library.kcg_next_event(self._core)
+            found = self.library.kcg_next_event(self.core)
 
     def report_only(self, events: int) -> None:
         """Give ``on_event`` these alone: bits of telemetry.Event."""
-        self._library.kcg_set_mask(self._core, events)
+        self.library.kcg_set_mask(self.core, events)
 
     def _check(self, esc: int, now: int) -> None:
         """What a damaged capture may hold never reaches the core."""
@@ -183,72 +186,72 @@ class Handle:
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         """As Core.receive."""
         self._check(esc, now)
-        receive, core = self._library.kcg_receive, self._core
+        receive, core = self.library.kcg_receive, self.core
         for begin in range(0, len(data) or 1, _MAX_READ):
             part = data[begin : begin + _MAX_READ] if len(data) > _MAX_READ else data
             while (found := receive(core, esc, part, len(part), now, since)) >= _AGAIN:
-                self._follow(found & ~_AGAIN, now)
-            self._follow(found, now)
+                self.follow(found & ~_AGAIN, now)
+            self.follow(found, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         """As Core.port."""
         self._check(esc, now)
-        self._follow(self._library.kcg_port(self._core, esc, is_open, now), now)
+        self.follow(self.library.kcg_port(self.core, esc, is_open, now), now)
 
     def expire(self, now: int) -> None:
         """As Core.expire."""
         self._check(0, now)
-        self._follow(self._library.kcg_expire(self._core, now), now)
+        self.follow(self.library.kcg_expire(self.core, now), now)
 
     def advance(self, now: int) -> None:
         """As Core.advance."""
         self._check(0, now)
-        self._follow(self._library.kcg_advance(self._core, now), now)
+        self.follow(self.library.kcg_advance(self.core, now), now)
 
     def next_deadline(self) -> int:
         """As Core.next_deadline."""
-        found: int = self._library.kcg_next_deadline(self._core)
+        found: int = self.library.kcg_next_deadline(self.core)
         return found
 
     def apply(self, esc: int, settings: EscSettings) -> None:
         """As Core.apply."""
         self._check(esc, 0)
-        self._library.kcg_apply(self._core, esc, c.byref(nearest_settings(settings)))
+        self.library.kcg_apply(self.core, esc, c.byref(nearest_settings(settings)))
 
     def gateway_changed(self, now: int) -> None:
         """As Core.gateway_changed."""
-        self._library.kcg_gateway_changed(self._core, 0, now)
+        self.library.kcg_gateway_changed(self.core, 0, now)
 
     def repeat(self, now: int) -> None:
         """As Core.repeat."""
         self._check(0, now)
-        self._library.kcg_repeat(self._core, now)
+        self.library.kcg_repeat(self.core, now)
 
     def stop(self, now: int) -> None:
         """As Core.stop."""
-        self._library.kcg_stop(self._core, now)
+        self.library.kcg_stop(self.core, now)
 
     @property
     def is_pending(self) -> bool:
         """As Core.is_pending."""
-        return bool(self._library.kcg_pending(self._core))
+        return bool(self.library.kcg_pending(self.core))
 
     def take(self, now: int) -> list[CanFrame]:
         """As Core.take."""
         frames: list[CanFrame] = []
-        library, core, raw = self._library, self._core, self._raw
+        library, core = self.library, self.core
         while count := library.kcg_take(core, now, self._frames, _MAX_FRAMES):
-            for at in range(0, count * _FRAME_SIZE, _FRAME_SIZE):
-                number, length, flags, page = _head(raw, at)
-                begin = at + 8
-                frames.append(
-                    _new(
-                        CanFrame,
-                        (
-                            *(number & ~EXTENDED, bytes(raw[begin : begin + length])),
-                            *(number >= EXTENDED, flags != 0, page, False, False),
-                        ),
-                    )
-                )
+            frames += frames_in(self._raw, 0, count)
             library.kcg_sent(core, now, count)
         return frames
+
+
+def frames_in(raw: memoryview, begin: int, count: int) -> list[CanFrame]:
+    """As CanFrames: ``count`` of kcg_frame in memory from ``begin`` on."""
+    frames = []
+    for at in range(begin, begin + count * _FRAME_SIZE, _FRAME_SIZE):
+        number, length, flags, page = _head(raw, at)
+        data = bytes(raw[at + 8 : at + 8 + length])
+        of = (number & ~EXTENDED, data, number >= EXTENDED, flags != 0, page, False, False)
+        frames.append(_new(CanFrame, of))
+    return frames

@@ -1036,6 +1036,11 @@ int64_t kcg_next_deadline(kcg *g)
     return due;
 }
 
+int kcg_expires(const kcg *g, int64_t now)
+{
+    return now >= g->next_expiry;
+}
+
 void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
 {
     kcg_esc *e = &g->esc[esc];

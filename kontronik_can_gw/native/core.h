@@ -52,7 +52,7 @@ enum {
     KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED] */
     KCG_OF_ALIVE    /* the message's alive counter, up to `div` */
 };
-enum { KCG_ESCS_OK = 0, KCG_STARTED = 11, KCG_OF_GATEWAY_COUNT = 12 }; /* of kcg.gateway; the others are the owner's */
+enum { KCG_ESCS_OK = 0, KCG_SENT_FRAMES = 4, KCG_STARTED = 11, KCG_OF_GATEWAY_COUNT = 12 }; /* of kcg.gateway; the others are the owner's */
 enum { KCG_U8, KCG_I8, KCG_U16, KCG_I16, KCG_U32 };
 enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
 /* Counters of a stream, then what is counted like them. Twin: deframer.Counters. */
@@ -153,6 +153,7 @@ int kcg_advance(kcg *g, int64_t now);
 int kcg_port(kcg *g, int esc, int is_open, int64_t now);
 int kcg_next_event(kcg *g);
 int64_t kcg_next_deadline(kcg *g);
+int kcg_expires(const kcg *g, int64_t now); /* true where kcg_receive and kcg_advance would first let something expire */
 void kcg_apply(kcg *g, int esc, const kcg_settings *settings);
 void kcg_gateway_changed(kcg *g, int each_second, int64_t now);
 void kcg_repeat(kcg *g, int64_t now);

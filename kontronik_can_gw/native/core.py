@@ -11,6 +11,7 @@ from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import Tables
+from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import PythonSlot, Slot, Slots, SlotSettings
@@ -73,6 +74,19 @@ class NativeCore:
 
     def next_deadline(self) -> int:
         return min(self._handle.next_deadline(), self.slots.next_deadline())
+
+    def turns(self) -> Turns:
+        """Whole turns of a loop with this core."""
+        return Turns(self._handle.library, self._handle.core, len(self.escs))
+
+    def follow(self, found: int, now: int) -> None:
+        """Follow an event that a turn came back with, and what else there is."""
+        self._handle.follow(found, now)
+
+    @property
+    def reports_live(self) -> bool:
+        """True while somebody follows each live frame."""
+        return bool(self._followers)
 
     @property
     def is_pending(self) -> bool:

@@ -22,7 +22,7 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.id_locks import IdLocks
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.open_can import open_can
-from kontronik_can_gw.runtime.poller import Poller, StuckCheck
+from kontronik_can_gw.runtime.poller import Poller, PortInput, StuckCheck
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.transmitter import Transmitter
@@ -61,7 +61,8 @@ class CanLink:
         self._is_proven = False
         """A frame was taken since the interface failed last."""
         self._drained = True
-        self._stuck = StuckCheck()
+        self._noted = PortInput()
+        self._stuck = StuckCheck(self._noted)
         if (fd := self.controller.fileno()) is not None:
             poller.register(fd, self.hear)
 
@@ -79,6 +80,21 @@ class CanLink:
     @property
     def is_open(self) -> bool:
         return self.port is not None
+
+    @property
+    def plain_socket(self) -> int | None:
+        """The descriptor of a socket that frames can be handed to as long as it takes them; None while more is to be done than that."""
+        port = self.port
+        is_plain = (
+            port is not None
+            and port.is_socket
+            and not port.gone
+            and self._is_proven
+            and self.transmitter.is_idle
+            and not self.controller.is_off
+            and port.state is self._gateway.status.can_state
+        )
+        return port.fileno() if is_plain and port is not None else None
 
     def open(self, now: int, wait: bool) -> None:
         """Open the interface. RunError where that fails, unless ``wait``: then it is tried again.
@@ -124,7 +140,7 @@ class CanLink:
         self._retry.due = None
         self.transmitter.forget_failures()
         self.controller.is_off = False
-        self._stuck = StuckCheck()
+        self._stuck = StuckCheck(self._noted)
         if (fd := port.fileno()) is not None:
             self._poller.register(fd, self.serve)
         self._receive_ids = None
@@ -209,7 +225,7 @@ class CanLink:
 
     def serve(self, now: int, events: int = select.POLLIN) -> None:
         """The port is readable, or can be sent to again."""
-        self._stuck.served = True
+        self._noted.served = True
         if self.port is None:
             return
         if events & select.POLLOUT:

@@ -29,6 +29,8 @@ Received = list[tuple[CanFrame, int | None]]
 class CanPort(ABC):
     """An open interface that is up."""
 
+    is_socket = False
+    """True where ``fileno`` is a socket that takes struct can_frame and canfd_frame."""
     reports_full = True
     """False where a send that fails for want of room and one on a dead adapter look the same."""
 

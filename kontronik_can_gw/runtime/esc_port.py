@@ -8,9 +8,10 @@ from pathlib import Path
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.esc_log import EscLog
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.poller import Poller, StuckCheck
+from kontronik_can_gw.runtime.poller import Poller, PortInput, StuckCheck
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
     NoPort,
@@ -40,6 +41,7 @@ class EscPort:
         conditions: FaultLog,
         lost: "set[EscPort]",
         clock: Callable[[], int] = time.monotonic_ns,
+        noted: PortInput | None = None,
     ) -> None:
         self.path = path
         self.port: SerialPort | None = None
@@ -55,16 +57,12 @@ class EscPort:
         self._poller = poller
         self._conditions = conditions
         self._clock = clock
-        self._empty_ns = 0
-        """The port was empty then."""
-        self._undrained_ns: int | None = None
-        """The last read left something, which came after this."""
+        self._noted = noted or PortInput()
         self._retry = Retry(MAX_RETRY_NS)
         self.log = EscLog(index, gateway, conditions)
         self._counted: dict[str, int] = {}
-        self._stuck = StuckCheck()
+        self._stuck = StuckCheck(self._noted)
         self._lost_since: int | None = None
-        self._proven = False
 
     @property
     def name(self) -> str:
@@ -96,18 +94,18 @@ class EscPort:
             unplugged = isinstance(error, NoPort) and self.reopened >= 0
             self._failed(str(error), now, quiet=unplugged)
             return
-        self._empty_ns, self._undrained_ns = self._clock(), None
+        noted = self._noted
+        noted.empty_ns, noted.undrained_ns, noted.is_plain = self._clock(), NEVER, False
         port.discard()  # what came before we listened has no time
         self.port = port
         self.identity = port.identity()
         self.reopened += 1
         self._lost_since = None
-        self._proven = False
         self._lost.discard(self)
         self.log.await_telemetry(now)
         self._counted = port.line_errors()
-        self._stuck = StuckCheck()
-        self._poller.register(port.fileno(), self.serve)
+        self._stuck = StuckCheck(noted)
+        self._poller.register(port.fileno(), self.serve, esc=self._index)
         self._gateway.port(self._index, True, now)
         said = f"{self.name}: {port.path} is open"
         if self._conditions.is_on(self.log.port_condition):
@@ -132,28 +130,27 @@ class EscPort:
 
     def serve(self, now: int, _events: int = 0) -> None:
         """The port is readable."""
-        self._stuck.served = True
-        if self.port is None:
+        noted, port = self._noted, self.port
+        noted.served = True
+        if port is None:
             return
         try:
-            data = self.port.read()
+            data = port.read()
         except PortLost as error:
-            path = self.port.path
             self.close()
-            self._failed(f"{path}: lost ({error}).", now)
+            self._failed(f"{port.path}: lost ({error}).", now)
             return
         if data:
-            if not self._proven:
+            if not noted.is_plain:
                 # a port that goes as soon as it has come is tried more and more seldom
-                self._proven = True
+                noted.is_plain = True
                 self._retry.succeeded()
-            since = self._undrained_ns
-            if since is None:
-                since = max(self._empty_ns, self._poller.before)
+            since = noted.undrained_ns
+            if since == NEVER:
+                since = max(noted.empty_ns, self._poller.before)
             # nothing came faster than the wire allows
-            self._undrained_ns = (
-                None if self.port.drained else min(now, since + len(data) * self._protocol.byte_ns)
-            )
+            passed = since + len(data) * self._protocol.byte_ns
+            noted.undrained_ns = NEVER if port.drained else min(now, passed)
             self._gateway.receive_bytes(self._index, data, now, since)
 
     def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:

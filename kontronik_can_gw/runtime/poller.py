@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.output import NEVER
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (select.POLLIN, POLLOUT)."""
@@ -28,18 +29,32 @@ class Waiting(Protocol):
         """True while a read would find something."""
 
 
-class StuckCheck:
-    """Whether a port is served: ``served`` is set by who reads it."""
+class PortInput:
+    """What is noted while a port is read; the core in C has its own with the same attributes (native/turns.py).
+
+    ``empty_ns``: the port was empty then. ``undrained_ns``: the last read left something, which came after this; NEVER: it left
+    nothing. ``is_plain``: what comes is to be read and nothing else. ``served``: it was read since this was set to False.
+    """
 
     def __init__(self) -> None:
+        self.empty_ns, self.undrained_ns = 0, NEVER
+        self.is_plain = False
         self.served = True
+
+
+class StuckCheck:
+    """Whether a port is served."""
+
+    def __init__(self, noted: PortInput) -> None:
+        self._noted = noted
+        noted.served = True
         self._seen_waiting = False
 
     def is_stuck(self, port: Waiting | None) -> bool:
         """True if something has waited since the last call but one and nothing was read."""
-        waiting = port is not None and not self.served and port.waits_to_be_read
+        waiting = port is not None and not self._noted.served and port.waits_to_be_read
         stuck = waiting and self._seen_waiting
-        self.served, self._seen_waiting = False, waiting
+        self._noted.served, self._seen_waiting = False, waiting
         return stuck
 
 
@@ -47,43 +62,74 @@ class Poller:
     """A poll object. A descriptor that hung up counts as readable, and as writable where that is watched.
 
     ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
+    ``late``: by how much more than its pause the last turn and the wait took. ``changes`` grows with each change of what is watched.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
         self.now = self.before = clock()
+        self.late = 0
+        self.changes = 0
         self._poll = select.poll()
-        self._watched: dict[int, tuple[Handler, int]] = {}
+        self._watched: dict[int, tuple[Handler, int, int | None]] = {}
+        self._closed: set[int] = set()
+        """Watched, but closed by a driver: they would stay readable."""
 
-    def register(self, fd: int, handler: Handler, events: int = select.POLLIN) -> None:
-        """Watch a descriptor; one that is watched, for something else from now on."""
+    def register(
+        self, fd: int, handler: Handler, events: int = _IN, esc: int | None = None
+    ) -> None:
+        """Watch a descriptor; one that is watched, for something else from now on. ``esc``: it is this one's port."""
         self._poll.register(fd, events)
-        self._watched[fd] = (handler, events)
+        self._watched[fd] = (handler, events, esc)
+        self._closed.discard(fd)
+        self.changes += 1
 
     def unregister(self, fd: int) -> None:
         """Watch it no longer. KeyError if it was not watched."""
         del self._watched[fd]
+        self.changes += 1
         with contextlib.suppress(KeyError):
             self._poll.unregister(fd)
 
-    def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
-        """Wait until something happens, ``pause_ns`` is over (rounded up to a millisecond), or a signal comes; then ask what is ready.
+    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+        """Wait until something happens, ``due`` has come (rounded up to a millisecond), or a signal comes; then ask what is ready.
 
-        Returns handlers of what there is, with what.
+        ``last``: time of the last turn. Returns handlers of what there is, with what.
         """
-        if pause_ns > 0:
-            self._poll.poll(-(-pause_ns // MS))
+        pause = due - self._clock()
+        if pause > 0:
+            self._poll.poll(-(-pause // MS))
+        else:
+            pause = 0
         self.before, self.now = self.now, self._clock()
-        happened = self._poll.poll(0)
+        self.late = self.now - last - pause
+        return self.handlers(self._poll.poll(0))
+
+    def handlers(self, happened: list[tuple[int, int]]) -> list[tuple[Handler, int]]:
+        """Of descriptors and what poll says of them."""
         watched = self._watched
         return [
             (watched[fd][0], bits if bits == _IN else self._events(fd, bits))
             for fd, bits in happened
         ]
 
+    def watched(self) -> list[tuple[int, int, int | None]]:
+        """The descriptors that are watched, for what, and whose port each is."""
+        return [
+            (fd, events, esc)
+            for fd, (_, events, esc) in self._watched.items()
+            if fd not in self._closed
+        ]
+
+    def follow(self, before: int, now: int, late: int) -> None:
+        """Another has waited and asked."""
+        self.before, self.now, self.late = before, now, late
+
     def _events(self, fd: int, bits: int) -> int:
-        if bits & select.POLLNVAL:  # a driver has closed it: it would stay readable
+        if bits & select.POLLNVAL:
             self._poll.unregister(fd)
+            self._closed.add(fd)
+            self.changes += 1
         readable = select.POLLIN if bits & ~select.POLLOUT else 0
         writable = select.POLLOUT if bits & ~select.POLLIN else 0
         return self._watched[fd][1] & (readable | writable)

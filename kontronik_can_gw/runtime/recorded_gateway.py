@@ -1,12 +1,12 @@
 """A gateway whose every call is handed to a recorder: played again in their order they give the same frames (capture/replay.py)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway import Call, Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.signals.plan import Layout
 
@@ -97,6 +97,16 @@ class RecordedGateway(Gateway):
     def not_sent(self, now: int) -> None:
         self._put(now, Kind.NOT_SENT, 0, b"", 0, None)
 
+    def turned(self, calls: Iterable[Call], frames: int) -> None:
+        self._counters = (self._counters[0] + frames, *self._counters[1:])
+        for now, kind, esc, data, came in calls:
+            self._put(now, kind, esc, data, 0, came)
+
+    def prepare_turns(self, _now: int) -> bool:
+        self._note_line_errors(_now)
+        self._note_counters(_now)
+        return True
+
     def _note_line_errors(self, now: int) -> None:
         for esc, (state, known) in enumerate(zip(self.escs, self._line_errors, strict=True)):
             if state.line_errors != known:
@@ -112,11 +122,14 @@ class RecordedGateway(Gateway):
         flags: int = 0,
         came: int | None = None,
     ) -> None:
+        self._note_counters(now)
+        self._put(now, kind, esc, data, flags, came)
+
+    def _note_counters(self, now: int) -> None:
         counters = self._counters_now()
         if counters != self._counters:
             self._counters = counters
             self._put(now, Kind.COUNTERS, 0, counters_data(counters), 0, None)
-        self._put(now, kind, esc, data, flags, came)
 
     def _counters_now(self) -> tuple[int, ...]:
         s = self.status

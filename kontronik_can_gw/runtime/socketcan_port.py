@@ -50,6 +50,8 @@ _SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
 class SocketCanPort(CanPort):
     """A raw socket that is bound to an interface. ``close`` is called at the end: what else it takes to give the interface back."""
 
+    is_socket = True
+
     def __init__(self, opened: socket.socket, close: Callable[[], object]) -> None:
         super().__init__()
         self._socket = opened

@@ -45,6 +45,11 @@ class Transmitter:
         limit = self._gateway.core.shortest_timeout_ns
         return min(MAX_LATE_NS, limit)
 
+    @property
+    def is_idle(self) -> bool:
+        """True while nothing waits, and nothing was refused lately."""
+        return not (len(self.queue) or self.is_stalled) and self._busy_since is None
+
     def put(self, frames: Sequence[CanFrame]) -> None:
         """Let frames wait to be sent."""
         if self.queue.put_all(frames):

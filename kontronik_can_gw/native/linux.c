@@ -1,0 +1,198 @@
+/* The core at work on Linux: turns of the gateway's loop, as long as nothing but plain reads of ESCs and frames that are due are to be
+   done. Twins: runtime/loop.py (Loop.turn), poller.py, serial_port.py and esc_port.py (what is read, and since when it can have come),
+   socketcan_port.py (what is sent). Everything else is the loop's, whose own turn follows at once with what is ready. */
+#define _GNU_SOURCE
+#include <errno.h>
+#include <poll.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "linux.h"
+
+#define MS INT64_C(1000000)
+#define BYTE_NS (11 * INT64_C(1000000000) / 115200)
+enum { AT_ONCE = 64, CLASSIC_SIZE = 16, FD_SIZE = 72, READ_SIZE = 4096, MAX_READS = KCG_READ / READ_SIZE };
+
+static int64_t now_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return t.tv_sec * INT64_C(1000000000) + t.tv_nsec;
+}
+
+/* Record a call of the core. There is room: a read asked for it, and for that of the turn. */
+static void note(kcg_turns *t, int kind, int esc, const uint8_t *data, uint32_t size, int64_t came)
+{
+    if (!t->records)
+        return;
+    kcg_entry e = {t->now, came, size, (uint8_t)kind, (uint8_t)esc, {0, 0}};
+    memcpy(t->ring + t->recorded, &e, sizeof e);
+    if (size)
+        memcpy(t->ring + t->recorded + sizeof e, data, size);
+    t->recorded += (uint32_t)(sizeof e + (size + 7) / 8 * 8);
+}
+
+static int has_room(const kcg_turns *t, size_t size)
+{
+    return !t->records || sizeof t->ring - t->recorded >= size + 2 * sizeof(kcg_entry);
+}
+
+/* What has come; -1 where the port has gone. */
+static int read_port(int fd, uint8_t *data)
+{
+    int size = 0;
+    for (int k = 0; k < MAX_READS; k++) {
+        ssize_t got = read(fd, data + size, READ_SIZE);
+        if (got <= 0)
+            return size || (got < 0 && (errno == EAGAIN || errno == EINTR)) ? size : -1;
+        size += (int)got;
+        if (got < READ_SIZE)
+            break;
+    }
+    return size;
+}
+
+/* Take what has come from an ESC; an event to be followed, -1: none, -2: it is the loop's. */
+static int serve(kcg_turns *t, int fd, kcg_input *in)
+{
+    int size = has_room(t, KCG_READ) ? read_port(fd, t->data) : -1;
+    if (size < 0)
+        return -2;
+    in->served = 1;
+    if (!size)
+        return -1;
+    int64_t since = in->undrained != KCG_DRAINED ? in->undrained : in->empty > t->asked ? in->empty : t->asked;
+    int64_t passed = since + size * BYTE_NS;
+    in->undrained = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked after the turn */
+    note(t, KCG_NOTE_BYTES, in->esc, t->data, (uint32_t)size, since);
+    return kcg_receive(t->core, in->esc, t->data, (size_t)size, t->now, since);
+}
+
+/* Hand frames to the bus; how many it took. */
+static uint32_t hand_over(kcg_turns *t, uint32_t count)
+{
+    struct mmsghdr m[AT_ONCE];
+    struct iovec v[AT_ONCE];
+    uint8_t pages[AT_ONCE];
+    uint32_t sent = 0;
+    while (sent < count) {
+        uint32_t n = count - sent < AT_ONCE ? count - sent : AT_ONCE;
+        if (now_ns() - t->now > t->max_turn) /* they have become old while they were made */
+            break;
+        memset(m, 0, n * sizeof *m);
+        for (uint32_t i = 0; i < n; i++) {
+            kcg_frame *f = &t->frames[sent + i];
+            pages[i] = f->page, f->page = 0;
+            v[i].iov_base = f, v[i].iov_len = f->flags ? FD_SIZE : CLASSIC_SIZE;
+            m[i].msg_hdr.msg_iov = &v[i], m[i].msg_hdr.msg_iovlen = 1;
+        }
+        int went = sendmmsg(t->bus, m, n, MSG_DONTWAIT);
+        for (uint32_t i = 0; i < n; i++)
+            t->frames[sent + i].page = pages[i];
+        sent += went > 0 ? (uint32_t)went : 0;
+        if (went != (int)n)
+            break;
+    }
+    kcg_gateway(t->core)[KCG_SENT_FRAMES] += sent;
+    return sent;
+}
+
+/* What is pending goes to the bus; 0 where it did not take all: `frames` has the others. */
+static int transmit(kcg_turns *t)
+{
+    uint32_t count;
+    while ((count = kcg_take(t->core, t->now, t->frames, KCG_OUT))) {
+        kcg_sent(t->core, t->now, count);
+        t->taken += count;
+        uint32_t sent = hand_over(t, count);
+        if (sent < count) {
+            t->unsent = count - sent;
+            memmove(t->frames, t->frames + sent, t->unsent * sizeof *t->frames);
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Ask what is ready: of what is not, everything comes after this; what is has come since it was asked before. (A read may leave what the
+   kernel has further back; poll, not epoll, asks it to pass that on.) */
+static int ask(kcg_turns *t)
+{
+    t->before = t->asked;
+    t->asked = now_ns();
+    int ready = poll(t->fds, t->count, 0);
+    for (uint32_t i = 0; i < t->count; i++) {
+        if (ready < 0)
+            t->fds[i].revents = 0; /* it is ready the next time, too */
+        if (t->input_of[i] < 0)
+            continue;
+        kcg_input *in = &t->inputs[t->input_of[i]];
+        if (ready >= 0 && !t->fds[i].revents)
+            in->undrained = KCG_DRAINED;
+        else if (in->undrained == KCG_DRAINED)
+            in->undrained = in->empty > t->before ? in->empty : t->before;
+    }
+    return ready;
+}
+
+/* True where all that is ready is an ESC's port with bytes to be read. */
+static int only_bytes(const kcg_turns *t)
+{
+    for (uint32_t i = 0; i < t->count; i++)
+        if (t->fds[i].revents && (t->input_of[i] < 0 || t->fds[i].revents != POLLIN || !t->inputs[t->input_of[i]].is_plain))
+            return 0;
+    return 1;
+}
+
+/* Wait for the next turn; false where it is the loop's. */
+static int wait_for_turn(kcg_turns *t, int ready)
+{
+    int64_t due = kcg_next_deadline(t->core), wake = t->now + t->period, begun = now_ns(), limit = MS * 3600000;
+    if (t->due < due)
+        due = t->due;
+    if (wake < due)
+        due = wake;
+    int64_t last = t->now, pause = due > begun && !ready ? due - begun : 0;
+    if (pause)
+        ready = poll(t->fds, t->count, (int)(((pause < limit ? pause : limit) + MS - 1) / MS));
+    t->now = now_ns();
+    t->late = t->now - last - pause;
+    return ready >= 0 && t->late <= t->max_late && t->now < t->due && !kcg_expires(t->core, t->now) && only_bytes(t);
+}
+
+/* One turn; false where something is left of it. */
+static int turn(kcg_turns *t)
+{
+    for (uint32_t i = 0; i < t->count; i++) {
+        if (!t->fds[i].revents)
+            continue;
+        t->found = serve(t, t->fds[i].fd, &t->inputs[t->input_of[i]]);
+        if (t->found != -1)
+            return 0;
+    }
+    note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
+    t->found = kcg_advance(t->core, t->now);
+    return t->found < 0 && transmit(t);
+}
+
+void kcg_turn(kcg_turns *t)
+{
+    int ready = 0, goes_on = 1;
+    t->found = -1;
+    t->unsent = t->taken = t->recorded = t->turns = 0;
+    while (goes_on && wait_for_turn(t, ready)) {
+        goes_on = turn(t) && t->now < t->leave && has_room(t, KCG_RING / 2);
+        ready = ask(t);
+        t->turns++;
+        t->late = t->asked - t->now;
+    }
+    if (goes_on)
+        ask(t);
+}
+
+uint32_t kcg_turns_size(void)
+{
+    return sizeof(kcg_turns);
+}

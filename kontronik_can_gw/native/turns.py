@@ -1,0 +1,93 @@
+"""Whole turns of the loop in C (linux.c), by ctypes: the structures of linux.h, and what is left of a turn."""
+
+import ctypes as c
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.native.binding import Frame, frames_in
+from kontronik_can_gw.output import NEVER
+
+_MAX_FRAMES, _READ, _RING, _MAX_FDS = 256, 1 << 14, 1 << 18, 1024
+_ENTRY = struct.Struct("=qqIBBxx")
+_u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_int64
+
+
+class Input(c.Structure):
+    """kcg_input: as poller.PortInput."""
+
+    _fields_ = (
+        *((name, _i64) for name in ("empty_ns", "undrained_ns")),
+        *((name, _u8) for name in ("is_plain", "served", "esc")),
+        ("reserved", _u8 * 5),
+    )
+
+
+class _PollFd(c.Structure):
+    _fields_ = (("fd", c.c_int), ("events", c.c_short), ("revents", c.c_short))
+
+
+class _Turns(c.Structure):
+    """kcg_turns."""
+
+    _fields_ = (
+        *((name, c.c_void_p) for name in ("core", "inputs")),
+        *((name, _i64) for name in ("now", "asked", "before", "late")),
+        *((name, _i64) for name in ("due", "leave", "period", "max_late", "max_turn")),
+        *((name, _i32) for name in ("bus", "found")),
+        *((name, _u32) for name in ("count", "unsent", "taken", "turns", "records", "recorded")),
+        ("fds", _PollFd * _MAX_FDS),
+        ("input_of", _i16 * _MAX_FDS),
+        ("frames", Frame * _MAX_FRAMES),
+        ("data", _u8 * _READ),
+        ("ring", _u8 * _RING),
+    )
+
+
+class Turns:
+    """Turns of a loop whose core is in C. ``state``: kcg_turns, of which the owner sets times, socket and limits before ``run``."""
+
+    def __init__(self, library: Any, core: Any, escs: int) -> None:
+        self.inputs: Any = (Input * escs)()
+        for esc, one in enumerate(self.inputs):
+            one.esc, one.undrained_ns = esc, NEVER
+        self.state = _Turns(core=core, inputs=c.addressof(self.inputs))
+        assert library.kcg_turns_size() == c.sizeof(self.state)
+        self._run = library.kcg_turn
+        self._address = c.byref(self.state)
+        self._raw = memoryview(self.state).cast("B")
+
+    def watch(self, descriptors: Sequence[tuple[int, int, int | None]]) -> bool:
+        """(descriptor, what to wait for, ESC whose port it is) from now on. False: more than there is room for."""
+        if len(descriptors) > _MAX_FDS:
+            return False
+        state = self.state
+        state.count = len(descriptors)
+        for place, (fd, events, esc) in enumerate(descriptors):
+            state.fds[place] = _PollFd(fd, events, 0)
+            state.input_of[place] = -1 if esc is None else esc
+        return True
+
+    def run(self) -> None:
+        """Turn until there is something for the loop."""
+        self._run(self._address)
+
+    def ready(self) -> list[tuple[int, int]]:
+        """The descriptors that are ready, with what happened."""
+        fds, count = self.state.fds, self.state.count
+        return [(fds[n].fd, fds[n].revents) for n in range(count) if fds[n].revents]
+
+    def unsent(self) -> list[CanFrame]:
+        """The frames that the bus did not take, in their order."""
+        return frames_in(self._raw, _Turns.frames.offset, self.state.unsent)
+
+    def entries(self) -> Iterator[tuple[int, int, int, bytes, int | None]]:
+        """What was recorded: (time, kind, ESC, data, since when it can have come), in its order."""
+        at, raw = _Turns.ring.offset, self._raw
+        end = at + self.state.recorded
+        while at < end:
+            now, came, size, kind, esc = _ENTRY.unpack_from(raw, at)
+            at += _ENTRY.size
+            yield now, kind, esc, bytes(raw[at : at + size]), None if came == NEVER else came
+            at += -(-size // 8) * 8
