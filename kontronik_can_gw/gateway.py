@@ -43,7 +43,8 @@ class Gateway:
         if packs_at_once:
             self.core = PythonCore(escs, layout, now, silent_on_loss, packs_at_once)
         else:
-            self.core, self.why_python = make_core(escs, layout, now, silent_on_loss)
+            slots = 0 if canopen is None else canopen.pdos
+            self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
         self.escs, self.status = self.core.escs, self.core.status
         self.nodes: Nodes | None = None
         if canopen is not None:

@@ -117,7 +117,6 @@ class PythonSlot:
         self._started = True
         self._last_ns = -NEVER
         self._last_watched = -1
-        self.is_news = True
         if (settings := self._settings) is not None:
             self.triggers = settings.plan.triggers
             self._restart_timer(settings, now)
@@ -190,6 +189,7 @@ class PythonSlot:
     def _rest(self) -> None:
         """Nothing is due."""
         self.triggers = 0
+        self.is_news = False
         self._timer_due = self._deferred_until = NEVER
         self._owner.pending.pop(self.number, None)
         self._set_due()

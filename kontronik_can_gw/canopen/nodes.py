@@ -18,6 +18,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import is_reset_of_all
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
+from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.reception import FrameTaker, routes
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.stream import EscStream
@@ -42,6 +43,12 @@ class CanopenSetup:
     settings: tuple[NodeSettings, ...]
     stored: tuple[Stored, ...]
     escs: tuple[EscSettings, ...] = ()
+
+    @property
+    def pdos(self) -> int:
+        """Number of transmit PDOs of a node."""
+        indices = {entry.index for entry in self.eds.entries}
+        return len(indices.intersection(range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)))
 
     def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
         """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""

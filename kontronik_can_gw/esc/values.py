@@ -43,6 +43,7 @@ class Kind(Enum):
     RATE = "events a second"
     STATE = "a state of the link"
     GATEWAY = "of the gateway itself"
+    OBJECT = "as only an object of a CANopen node shows it"
 
 
 class Divisor(Enum):

@@ -48,7 +48,8 @@ class Plan(c.Structure):
         *((name, _p) for name in ("message", "signal", "piece", "pair", "constant")),
         *((name, _p) for name in ("esc_of", "listener", "first_listener")),
         ("words", _u32),
-        *((name, _u16) for name in ("messages", "escs", "pages")),
+        *((name, _u16) for name in ("messages", "escs", "pages", "slots")),
+        ("watched", _p),
     )
 
 
@@ -102,6 +103,13 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "kcg_pending": (_u32, _p),
     "kcg_turn": (None, _p),
     "kcg_turns_size": (_u32,),
+    "kcg_slot_start": (None, _p, _u32, _i64),
+    "kcg_slot_changed": (None, _p, _u32, _i64),
+    "kcg_slot_stop": (None, _p, _u32),
+    "kcg_slot_news": (None, _p, _u32, _i64),
+    "kcg_slot_send": (None, _p, _u32, _i64),
+    "kcg_slot_is_news": (c.c_int, _p, _u32),
+    "kcg_slot_sent": (_u64, _p, _u32),
 }
 
 
@@ -139,18 +147,25 @@ class Handle:
             raise NotInCore(f"fields on the wire: {tables.wire}")
         self.library = library
         self._on_event = on_event
+        self.messages = self._array(Message, tables.messages)
+        self.signals = self._array(Signal, tables.signals)
+        self.pieces = self._array(Piece, tables.pieces)
+        self.watched = self._array(_u64, tables.watched)
         self._kept = [
-            self._array(Message, tables.messages),
-            self._array(Signal, tables.signals),
-            self._array(Piece, tables.pieces),
+            self.messages,
+            self.signals,
+            self.pieces,
             self._array(Pair, tables.pairs),
             self._array(_u64, tables.constants),
             self._array(_u16, tables.esc_of),
             self._array(_u16, tables.listeners),
             self._array(_u16, tables.first_listeners),
         ]
-        counts = (len(tables.constants), len(tables.messages), len(tables.settings), tables.pages)
-        self._plan = Plan(*(c.addressof(table) for table in self._kept), *counts)
+        slots = len(tables.watched)
+        messages = len(tables.messages) - slots
+        counts = (len(tables.constants), messages, len(tables.settings), tables.pages, slots)
+        addresses = (c.addressof(table) for table in self._kept)
+        self._plan = Plan(*addresses, *counts, c.addressof(self.watched))
         size = library.kcg_size(c.byref(self._plan))
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)

@@ -10,8 +10,8 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 _LIMIT_S = 120
 SOURCES = tuple(FOLDER / name for name in ("core.h", "linux.h", "core.c", "linux.c"))
-FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_FOUND=512")
-"""With CAN FD and floats, for reads of 16 KiB."""
+FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_SLOTS=1", "-DKCG_FOUND=512")
+"""With CAN FD, floats and slots, for reads of 16 KiB."""
 
 
 def shared_object() -> Path:

@@ -53,7 +53,7 @@ def test_both_cores_are_equal_over_many_more_layouts(library: Any, group: int) -
 
 
 @pytest.mark.parametrize(
-    "options", ["", "-DKCG_SLICES=0 -DKCG_LEGACY=0", "-DKCG_SLICES=1 -DKCG_FOUND=1"]
+    "options", ["", "-DKCG_SLICES=0 -DKCG_LEGACY=0", "-DKCG_SLICES=1 -DKCG_FOUND=1 -DKCG_SLOTS=1"]
 )
 def test_it_builds_for_a_small_machine(tmp_path: Path, options: str) -> None:
     built(tmp_path / "core.so", *STRICT, "-Os", *options.split())
@@ -86,7 +86,7 @@ def test_no_byte_outside_its_memory_and_nothing_undefined(tmp_path: Path) -> Non
 
 def test_an_object_with_other_tables_or_none_at_all_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(WrongObject, match="made of other sources"):
-        load(built(tmp_path / "small.so", "-DKCG_DATA=8"))
+        load(built(tmp_path / "small.so", "-DKCG_DATA=8", "-DKCG_SLOTS=1"))
     (tmp_path / "text.so").write_text("no object" * 100)
     with pytest.raises(WrongObject, match=r"text\.so: .*invalid ELF header"):
         load(tmp_path / "text.so")
