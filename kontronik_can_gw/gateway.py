@@ -3,7 +3,7 @@
 ``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.core import Core, Follower, PythonCore
@@ -18,14 +18,15 @@ from kontronik_can_gw.signals.plan import Layout
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 
-Call = tuple[int, int, int, bytes, int | None]
-"""A call of the core: time, kind as in a capture, ESC, bytes, since when they can have come."""
 MakeOutput = Callable[[Sequence[EscTelemetry], GatewayStatus, int], Output]
 """ESCs, gateway and time to an output that begins then."""
 
 
 class Gateway:
     """One gateway: several ESCs in, one CAN bus out. ``canopen`` None: no CANopen nodes; a layout without messages: only nodes."""
+
+    is_recorded = False
+    """True where each call is to be known (runtime/recorded_gateway.py)."""
 
     def __init__(
         self,
@@ -38,10 +39,11 @@ class Gateway:
         packs_at_once: bool = False,
     ) -> None:
         self.core: Core
-        self.why_python = ""
-        """Why the core is the one in Python although the one in C was asked for; empty else."""
+        self.why_python: str
+        """Why the core is the one in Python; empty with the one in C."""
         if packs_at_once:
             self.core = PythonCore(escs, layout, now, silent_on_loss, packs_at_once)
+            self.why_python = "a capture of 0.5.0 is replayed"
         else:
             slots = 0 if canopen is None else canopen.pdos
             self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
@@ -179,13 +181,9 @@ class Gateway:
         for output in self._outputs:
             output.advance(now)
 
-    def next_deadline(self) -> int:
+    def next_deadline(self, with_core: bool = True) -> int:
         """When ``advance`` is to be called at the latest."""
-        return min(self.core.next_deadline(), self.outputs_deadline())
-
-    def outputs_deadline(self) -> int:
-        """The same, of the outputs alone."""
-        due = NEVER
+        due = self.core.next_deadline() if with_core else NEVER
         for output in self._outputs:
             due = min(due, output.next_deadline())
         return due
@@ -207,13 +205,6 @@ class Gateway:
 
     def not_sent(self, now: int) -> None:
         """The frames that were taken last were thrown away. The gateway itself need not know; who records it does."""
-
-    def prepare_turns(self, _now: int) -> bool:
-        """Turns in C follow. True: what they do is to be given to ``turned``."""
-        return False
-
-    def turned(self, calls: Iterable[Call], frames: int) -> None:
-        """The core was called like this by turns in C, and as many frames were taken. The gateway itself need not know, either."""
 
     def take_link_changes(self) -> list[int]:
         """ESCs whose link state, layout or device changed since the last call."""

@@ -1,15 +1,16 @@
 #!/bin/sh
-# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|test-all|release
+# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|test-all|wheels|release
 #   demo      the project
 #   lint      and its test tools
 #   test      and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and small tools that
 #             some tests look through the eyes of
 #   test-all  and User Mode Linux in any case, systemd, a browser, an MQTT broker, the CANopen masters of others (tests/foreign)
-#   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
+#   wheels    as `lint`, and cross compilers and qemu-user
+#   release   as `test` and `wheels`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
-what=${1:?demo, lint, test, test-all or release}
+what=${1:?demo, lint, test, test-all, wheels or release}
 cd "$(dirname "$0")/.."
 venv=.venv/bin/python
 new_enough='import sys; sys.exit(sys.version_info < (3, 11))'
@@ -156,6 +157,12 @@ install_vm() { # $1: uml or qemu
 # With a C compiler the core in C is built when the project is installed; without one the core in Python runs.
 install_compiler() { command -v cc >/dev/null || command -v gcc >/dev/null || install_programs "a C compiler" gcc=gcc,libc6-dev; }
 
+install_cross_compilers() {
+    install_programs "compilers for other machines" x86_64-linux-gnu-gcc=gcc-x86-64-linux-gnu,libc6-dev-amd64-cross \
+        aarch64-linux-gnu-gcc=gcc-aarch64-linux-gnu,libc6-dev-arm64-cross \
+        arm-linux-gnueabihf-gcc=gcc-arm-linux-gnueabihf,libc6-dev-armhf-cross qemu-arm=qemu-user
+}
+
 [ -x "$venv" ] && "$venv" -c "$new_enough" 2>/dev/null || make_venv
 case $what in
     demo) install_project demo . ;;
@@ -171,6 +178,7 @@ case $what in
         install_programs "systemd and a broker" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients
         tests/foreign/install.sh || say "tests with the masters named above are left out"
         ;;
-    release) install_compiler; install_project test '.[test]'; install_vcan; install_vm uml; install_vm qemu ;;
-    *) die "$what: demo, lint, test, test-all or release" ;;
+    wheels) install_project test '.[test]'; install_cross_compilers ;;
+    release) install_compiler; install_project test '.[test]'; install_vcan; install_vm uml; install_vm qemu; install_cross_compilers ;;
+    *) die "$what: demo, lint, test, test-all, wheels or release" ;;
 esac

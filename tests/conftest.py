@@ -48,7 +48,7 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     """Which core every gateway of the test gets."""
     from kontronik_can_gw.native import load
 
-    monkeypatch.setenv(load.CORE, request.param)
+    monkeypatch.setenv(load.PURE, str(int(request.param == "Python")))
     load.library.cache_clear()
     found, why = load.library()
     if found is None and request.param == "C":

@@ -55,11 +55,12 @@ STEPS = {
     "hour": "python tests/hour/hour_programme.py",
     "mutants": "python tests/mutants/mutants.py --compare tests/mutants/version_0_5_0.json",
     "put-in": "python tests/mutants/put_in_faults.py",
+    "wheels": "python tests/native/wheels.py {scratch}",
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
     "test-all": (("faults",), ("tools", "masters")),
-    "release": (("qemu", "soak", "hour", "mutants", "put-in"),),
+    "release": (("qemu", "soak", "hour", "mutants", "put-in", "wheels"),),
 }
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
 """Of one step: the two that CI runs end within its 90 minutes whatever happens."""
@@ -71,6 +72,10 @@ NEEDS = {
     **dict.fromkeys(("vcan", "masters"), (("ip", "candump", "vcan"), ENABLE_VCAN)),
     **dict.fromkeys(("faults", "soak"), (("linux.uml",), ENABLE_UML)),
     "qemu": (("qemu-system-x86_64",), "sudo tests/vm/setup.sh qemu"),
+    "wheels": (
+        ("aarch64-linux-gnu-gcc", "arm-linux-gnueabihf-gcc", "qemu-arm"),
+        "sudo apt-get install gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user",
+    ),
 }
 """What a step needs besides Python, "vcan" being a kernel with one, and the line that enables it."""
 

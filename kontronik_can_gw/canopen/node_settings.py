@@ -10,7 +10,9 @@ from kontronik_can_gw.canopen.storage import APPLICATION, Stored
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 
 _SELF_START_OFF = 4
-_MIN_TIMEOUT_MS, _MAX_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
+# whatever the limits of an EDS are
+_MIN_TIMEOUT_MS, _MAX_TIMEOUT_MS = 20, 60_000
+_MAX_CELLS = 0xFF
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
         pole_pairs=max(1, held[1]),
         gear=Fraction(held[2] or 1, held[3] or 1),
         timeout_ns=min(max(_MIN_TIMEOUT_MS, held[4]), _MAX_TIMEOUT_MS) * MS,
-        cell_count=held[7],
+        cell_count=min(held[7], _MAX_CELLS),
         crc_error_threshold=held[8],
     )
 

@@ -28,6 +28,7 @@ from kontronik_can_gw.desk.doctor.service import Unit, unit_of
 from kontronik_can_gw.desk.doctor.system import System
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
+from kontronik_can_gw.native.load import in_words, make_core
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.runtime.store import parameter_file
@@ -128,6 +129,8 @@ def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
         load += bits_per_second(nodes) / config.can.bitrate
     findings.say("config", "ok", file=config.file, outputs=", ".join(words))
     findings.say("config.bus_load", "ok", load=load, kilobits=config.can.bitrate // 1000)
+    core, why = make_core(loaded.escs, loaded.layout, 0, silent=False)
+    findings.say("config.core", "python" if why else "ok", core=in_words(core.language, why))
 
 
 def _warnings(findings: Findings, config: Config, loaded: Loaded) -> None:

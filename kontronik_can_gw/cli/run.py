@@ -101,8 +101,9 @@ class _Run:
 
     def _opened(self) -> "Loop":
         """The loop with everything open. The parsed DBC is freed at the end of this method."""
-        from kontronik_can_gw.runtime import realtime
+        from kontronik_can_gw.native.load import in_words
         from kontronik_can_gw.runtime.loop import Loop
+        from kontronik_can_gw.runtime.native_poller import poller_for
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
         loaded = load_all(self._args.config, _parameter_store)
@@ -111,13 +112,7 @@ class _Run:
         config = loaded.config
         need_descriptors(2 * len(config.esc))
         wait = self._args.wait or config.run.wait_for_devices
-        if config.run.realtime_priority is not None:
-            try:
-                realtime.begin(config.run.realtime_priority)
-            except RunError as error:
-                if not wait:
-                    raise
-                log.error("%s Running without.", error)  # late frames are better than none
+        _begin_realtime(config.run.realtime_priority, wait)
         gateway, recorder = self._gateway(loaded)
         try:
             statistics = Statistics(config.statistics_path or default_file())
@@ -136,12 +131,12 @@ class _Run:
             statistics=statistics,
             program=self._program,
             recorder=recorder,
+            poller=poller_for(gateway),
         )
         # first, because a damaged file is moved aside by now and must be reported
         _say_parameters(loaded)
         loop.open()
-        if gateway.why_python:
-            log.warning("core in Python: %s", gateway.why_python)
+        log.info("%s", in_words(gateway.core.language, gateway.why_python))
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         self._loop = loop
@@ -160,6 +155,20 @@ class _Run:
         from kontronik_can_gw.gateway import Gateway
 
         return Gateway(loaded.escs, loaded.layout, now, silent, loaded.canopen), None
+
+
+def _begin_realtime(priority: int | None, wait: bool) -> None:
+    """RunError where the priority is not granted, unless ``wait``: then the gateway runs without."""
+    from kontronik_can_gw.runtime import realtime
+
+    if priority is None:
+        return
+    try:
+        realtime.begin(priority)
+    except RunError as error:
+        if not wait:
+            raise
+        log.error("%s Running without.", error)  # late frames are better than none
 
 
 def _parameter_store(folder: Path) -> "ParameterStore":

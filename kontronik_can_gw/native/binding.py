@@ -8,14 +8,14 @@ from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.native.compile import source_number
+from kontronik_can_gw.native.objects import source_number
 from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
 from kontronik_can_gw.native.tables import (
     END_OF_TIME,
     GATEWAY,
     STORED_COUNTS,
     Tables,
-    nearest_settings,
+    held_settings,
 )
 
 HELD, BODY, LONGEST = 43, 33, 44
@@ -102,6 +102,7 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "kcg_set_mask": (None, _p, _u32),
     "kcg_pending": (_u32, _p),
     "kcg_turn": (None, _p),
+    "kcg_watch": (c.c_int, _p),
     "kcg_turns_size": (_u32,),
     "kcg_slot_start": (None, _p, _u32, _i64),
     "kcg_slot_changed": (None, _p, _u32, _i64),
@@ -231,7 +232,7 @@ class Handle:
     def apply(self, esc: int, settings: EscSettings) -> None:
         """As Core.apply."""
         self._check(esc, 0)
-        self.library.kcg_apply(self.core, esc, c.byref(nearest_settings(settings)))
+        self.library.kcg_apply(self.core, esc, c.byref(held_settings(settings)))
 
     def gateway_changed(self, now: int) -> None:
         """As Core.gateway_changed."""

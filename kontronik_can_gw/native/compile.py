@@ -1,30 +1,24 @@
-"""Compiles the core in C. At the installation hatch_build.py calls it; it imports nothing that is not in the standard library."""
+"""Compiles the core in C: hatch_build.py at the installation, ``python -m kontronik_can_gw.native.compile`` after an edit."""
 
-import platform
+import os
 import shutil
 import subprocess
-import zlib
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-FOLDER = Path(__file__).parent
+from kontronik_can_gw.native.objects import OPTIONS, sealed, shared_object, source_number, sources
+
 _LIMIT_S = 120
-SOURCES = tuple(FOLDER / name for name in ("core.h", "linux.h", "core.c", "linux.c"))
-FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_SLOTS=1", "-DKCG_FOUND=512")
-"""With CAN FD, floats and slots, for reads of 16 KiB."""
-
-
-def shared_object() -> Path:
-    """Where the one for this machine is, or would be."""
-    return FOLDER / f"core-{platform.machine()}.so"
-
-
-def source_number() -> int:
-    """A number of the sources, which an object made of them carries."""
-    found = 0
-    for source in SOURCES:
-        found = zlib.crc32(source.read_bytes(), found)
-    return found & 0x7FFF_FFFF
+_OPTIMISED = ("-O2", *OPTIONS)
+CROSS_COMPILERS = {
+    "x86_64": "x86_64-linux-gnu-gcc",
+    "aarch64": "aarch64-linux-gnu-gcc",
+    "armv7l": "arm-linux-gnueabihf-gcc",
+}
+"""By machine; Debian's gcc, gcc-aarch64-linux-gnu and gcc-arm-linux-gnueabihf."""
+OF_NO_LIBRARY = (*_OPTIMISED, "-nostdlib", "-U_FORTIFY_SOURCE", "-fno-stack-protector", "-lgcc")
+"""Linked with nothing: the process that loads it has a libc, of whichever kind and version."""
 
 
 def compiler() -> str | None:
@@ -32,39 +26,39 @@ def compiler() -> str | None:
     return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
-def compile_core(target: Path, options: Sequence[str] = ("-O2", *FOR_LINUX)) -> str | None:
-    """Make the shared object; None, or why it could not be made, in one line."""
-    program = compiler()
+def compile_core(
+    target: Path, options: Sequence[str] = _OPTIMISED, program: str | None = None
+) -> str | None:
+    """Make the shared object; None, or why it could not be made, in one line. ``program``: the compiler, else the machine's."""
+    program = program or compiler()
     if program is None:
-        return "no C compiler"
-    number = f"-DKCG_SOURCE={source_number()}"
-    command = [
-        program,
-        "-std=c99",
-        "-fwrapv",
-        "-fPIC",
-        "-shared",
-        number,
-        *options,
-    ]
+        return "there was no C compiler at the installation"
+    named = f"at the installation {program} failed"
     part = target.with_name(f"{target.name}.part")
+    command = [program, "-std=c99", "-fwrapv", "-fPIC", "-shared", "-o", str(part)]
+    command += [f"-DKCG_SOURCE={source_number()}"]
+    command += [str(source) for source in sources() if source.suffix == ".c"]
     try:
         done = subprocess.run(
-            [
-                *command,
-                "-o",
-                str(part),
-                *[str(source) for source in SOURCES if source.suffix == ".c"],
-            ],
+            [*command, *options],
             capture_output=True,
             text=True,
+            errors="replace",
             check=False,
             timeout=_LIMIT_S,
+            env=os.environ | {"LC_ALL": "C"},
         )
         if done.returncode:
-            part.unlink(missing_ok=True)
-            return f"{program}: {next(iter(done.stderr.strip().splitlines()), 'failed')}"
+            lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+            return f"{named}: {next((line for line in lines if 'error' in line), lines[0])}"
+        part.write_bytes(sealed(part.read_bytes()))
         part.replace(target)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return f"{program}: {error}"
+        return f"{named}: {error}"
+    finally:
+        part.unlink(missing_ok=True)
     return None
+
+
+if __name__ == "__main__":
+    sys.exit(compile_core(shared_object()))

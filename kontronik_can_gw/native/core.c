@@ -431,6 +431,24 @@ static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t no
 }
 
 #if KCG_FLOATS
+/* n / d, rounded once; both are less than 2^62. */
+static double quotient(int64_t n, int64_t d)
+{
+    const int64_t exact = INT64_C(1) << 53;
+    if (-exact < n && n < exact && d < exact)
+        return (double)n / (double)d;
+    if (n < 0)
+        return -quotient(-n, d);
+    int64_t q = n / d, rest = n % d;
+    double unit = 1;
+    for (; n && q < 4 * exact; unit /= 2) {
+        rest *= 2;
+        q = 2 * q + (rest >= d);
+        rest -= rest >= d ? d : 0;
+    }
+    return (double)(q | (rest != 0)) * unit;
+}
+
 static uint64_t float_bits(const kcg_signal *s, double v)
 {
     double low, high;
@@ -461,15 +479,14 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
         return (uint64_t)(alive % s->div);
     if (!steps(g, s, e, now, &x))
         return s->not_available;
-    if (s->divisor == KCG_BY_CELLS) {
-        if (!e->cells)
-            return s->not_available;
+    if (s->divisor == KCG_BY_CELLS)
         by = e->cells;
-    } else if (s->divisor == KCG_BY_POLES) {
+    else if (s->divisor == KCG_BY_POLES)
         by = e->settings.poles;
-    } else if (s->divisor == KCG_BY_OUTPUT) {
+    else if (s->divisor == KCG_BY_OUTPUT)
         by = (int64_t)e->settings.poles * e->settings.gear_numerator, over = e->settings.gear_denominator;
-    }
+    if (!by)
+        return s->not_available;
     if (s->flags & KCG_TABLE) {
         const kcg_pair *p = g->plan->pair + s->first_pair, *end = p + s->pairs;
         while (p < end && p->number != x)
@@ -486,7 +503,7 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
     if (s->flags & KCG_REAL) {
         double offset;
         memcpy(&offset, &s->add, sizeof offset);
-        double q = (double)(x * s->mul * over) / (double)(s->div * by);
+        double q = quotient(x * s->mul * over, s->div * by);
         return float_bits(s, s->flags & KCG_PLAIN ? q : q + offset);
     }
 #endif

@@ -5,6 +5,7 @@
 #include <errno.h>
 #include <poll.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
@@ -12,8 +13,9 @@
 #include "linux.h"
 
 #define MS INT64_C(1000000)
+#define ASK_ALL (10 * MS) /* how long ago it may be that all ports were asked: by that much values may seem older */
 #define BYTE_NS (11 * INT64_C(1000000000) / 115200)
-enum { AT_ONCE = 64, CLASSIC_SIZE = 16, FD_SIZE = 72, READ_SIZE = 4096, MAX_READS = KCG_READ / READ_SIZE };
+enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72, READ_SIZE = 4096, MAX_READS = KCG_READ / READ_SIZE };
 
 static int64_t now_ns(void)
 {
@@ -63,9 +65,9 @@ static int serve(kcg_turns *t, int fd, kcg_input *in)
     in->served = 1;
     if (!size)
         return -1;
-    int64_t since = in->undrained != KCG_DRAINED ? in->undrained : in->empty > t->asked ? in->empty : t->asked;
+    int64_t since = in->undrained != KCG_DRAINED ? in->undrained : in->asked;
     int64_t passed = since + size * BYTE_NS;
-    in->undrained = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked after the turn */
+    in->undrained = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked at the turn's end */
     note(t, KCG_NOTE_BYTES, in->esc, t->data, (uint32_t)size, since);
     return kcg_receive(t->core, in->esc, t->data, (size_t)size, t->now, since);
 }
@@ -116,62 +118,89 @@ static int transmit(kcg_turns *t)
     return 1;
 }
 
-/* Ask what is ready: of what is not, everything comes after this; what is has come since it was asked before. (A read may leave what the
-   kernel has further back; poll, not epoll, asks it to pass that on.) */
-static int ask(kcg_turns *t)
+int kcg_watch(kcg_turns *t)
+{
+    if (t->epoll >= 0)
+        close(t->epoll);
+    t->epoll = t->count ? epoll_create1(EPOLL_CLOEXEC) : -1;
+    for (uint32_t i = 0; i < t->count && t->epoll >= 0; i++) {
+        struct epoll_event e = {.events = (uint32_t)t->fds[i].events, .data.u32 = i};
+        if (epoll_ctl(t->epoll, EPOLL_CTL_ADD, t->fds[i].fd, &e) < 0)
+            close(t->epoll), t->epoll = -1;
+    }
+    return t->epoll >= 0;
+}
+
+/* What poll has answered, asked at a time: of what is not ready everything comes after it; what is has come since it was asked before. */
+static void note_answer(const struct pollfd *p, kcg_input *in, int64_t asked)
+{
+    if (!p->revents)
+        in->undrained = KCG_DRAINED, in->asked = asked;
+    else if (in->undrained == KCG_DRAINED)
+        in->undrained = in->asked;
+}
+
+/* Ask which of all descriptors are ready. */
+static void ask_all(kcg_turns *t)
 {
     t->before = t->asked;
     t->asked = now_ns();
-    int ready = poll(t->fds, t->count, 0);
-    for (uint32_t i = 0; i < t->count; i++) {
-        if (ready < 0)
-            t->fds[i].revents = 0; /* it is ready the next time, too */
-        if (t->input_of[i] < 0)
-            continue;
-        kcg_input *in = &t->inputs[t->input_of[i]];
-        if (ready >= 0 && !t->fds[i].revents)
-            in->undrained = KCG_DRAINED;
-        else if (in->undrained == KCG_DRAINED)
-            in->undrained = in->empty > t->before ? in->empty : t->before;
-    }
-    return ready;
+    if (poll(t->fds, t->count, 0) < 0)
+        for (uint32_t i = 0; i < t->count; i++)
+            t->fds[i].revents = POLLIN; /* not known: reading tells */
+    for (uint32_t i = 0; i < t->count; i++)
+        if (t->input_of[i] >= 0)
+            note_answer(&t->fds[i], &t->inputs[t->input_of[i]], t->asked);
 }
 
-/* True where all that is ready is an ESC's port with bytes to be read. */
-static int only_bytes(const kcg_turns *t)
+/* Ask what the reads of this turn have left: what the kernel has further back it passes on when poll, not epoll, asks. */
+static void ask_read(kcg_turns *t)
 {
-    for (uint32_t i = 0; i < t->count; i++)
-        if (t->fds[i].revents && (t->input_of[i] < 0 || t->fds[i].revents != POLLIN || !t->inputs[t->input_of[i]].is_plain))
-            return 0;
-    return 1;
+    struct pollfd fds[AT_ONCE];
+    int64_t now = now_ns();
+    for (uint32_t i = 0; i < t->ready; i++)
+        fds[i] = (struct pollfd){t->fds[t->place[i]].fd, POLLIN, 0};
+    if (t->ready && poll(fds, t->ready, 0) >= 0)
+        for (uint32_t i = 0; i < t->ready; i++)
+            note_answer(&fds[i], &t->inputs[t->input_of[t->place[i]]], now);
 }
 
 /* Wait for the next turn; false where it is the loop's. */
-static int wait_for_turn(kcg_turns *t, int ready)
+static int wait_for_turn(kcg_turns *t)
 {
+    struct epoll_event events[AT_ONCE];
     int64_t due = kcg_next_deadline(t->core), wake = t->now + t->period, begun = now_ns(), limit = MS * 3600000;
     if (t->due < due)
         due = t->due;
     if (wake < due)
         due = wake;
-    int64_t last = t->now, pause = due > begun && !ready ? due - begun : 0;
-    if (pause)
-        ready = poll(t->fds, t->count, (int)(((pause < limit ? pause : limit) + MS - 1) / MS));
+    int64_t last = t->now, pause = due > begun ? due - begun : 0;
+    int ready = epoll_wait(t->epoll, events, AT_ONCE, (int)(((pause < limit ? pause : limit) + MS - 1) / MS));
     t->now = now_ns();
     t->late = t->now - last - pause;
-    return ready >= 0 && t->late <= t->max_late && t->now < t->due && !kcg_expires(t->core, t->now) && only_bytes(t);
+    t->ready = 0;
+    if (ready < 0 || t->late > t->max_late || t->now >= t->due || kcg_expires(t->core, t->now))
+        return 0;
+    for (int i = 0; i < ready; i++) {
+        uint32_t place = events[i].data.u32;
+        if (t->input_of[place] < 0 || events[i].events != EPOLLIN || !t->inputs[t->input_of[place]].is_plain)
+            return 0;
+        t->place[t->ready++] = (uint16_t)place;
+    }
+    return 1;
 }
 
 /* One turn; false where something is left of it. */
 static int turn(kcg_turns *t)
 {
-    for (uint32_t i = 0; i < t->count; i++) {
-        if (!t->fds[i].revents)
-            continue;
-        t->found = serve(t, t->fds[i].fd, &t->inputs[t->input_of[i]]);
+    for (uint32_t i = 0; i < t->ready; i++) {
+        uint16_t place = t->place[i];
+        t->found = serve(t, t->fds[place].fd, &t->inputs[t->input_of[place]]);
         if (t->found != -1)
             return 0;
     }
+    if (!t->ready && t->now < kcg_next_deadline(t->core))
+        return 1; /* nothing has come, nothing is due */
     note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
     t->found = kcg_advance(t->core, t->now);
     return t->found < 0 && transmit(t);
@@ -179,17 +208,27 @@ static int turn(kcg_turns *t)
 
 void kcg_turn(kcg_turns *t)
 {
-    int ready = 0, goes_on = 1;
     t->found = -1;
     t->unsent = t->taken = t->recorded = t->turns = 0;
-    while (goes_on && wait_for_turn(t, ready)) {
-        goes_on = turn(t) && t->now < t->leave && has_room(t, KCG_RING / 2);
-        ready = ask(t);
+    for (uint32_t i = 0; i < t->count; i++)
+        if (t->input_of[i] >= 0) {
+            kcg_input *in = &t->inputs[t->input_of[i]];
+            in->asked = in->empty > t->asked ? in->empty : t->asked;
+        }
+    while (wait_for_turn(t)) {
+        int is_done = turn(t) && t->now < t->leave && has_room(t, KCG_RING / 2);
         t->turns++;
-        t->late = t->asked - t->now;
+        if (!is_done) {
+            t->late = 0;
+            break;
+        }
+        if (t->now - t->asked >= ASK_ALL)
+            ask_all(t);
+        else
+            ask_read(t);
     }
-    if (goes_on)
-        ask(t);
+    ask_all(t);
+    t->late += t->asked - t->now;
 }
 
 uint32_t kcg_turns_size(void)

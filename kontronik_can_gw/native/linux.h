@@ -5,13 +5,14 @@
 
 #include "core.h"
 
-enum { KCG_OUT = 256, KCG_READ = 16384, KCG_RING = 1 << 18, KCG_FDS = 1024 };
+enum { KCG_OUT = 256, KCG_READ = 16384, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64 };
 enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 };     /* kinds of entries of a capture */
 
 #define KCG_DRAINED (INT64_C(1) << 62) /* output.NEVER */
 
 typedef struct {        /* of an ESC's port (twin: poller.PortInput) */
     int64_t empty;      /* nothing had come by then */
+    int64_t asked;      /* nothing had come by then, either: asked last */
     int64_t undrained;  /* the last read left something, which came after this; KCG_DRAINED: it left nothing */
     uint8_t is_plain, served, esc, reserved[5];
 } kcg_input;
@@ -23,14 +24,17 @@ typedef struct {
     kcg_input *inputs;
     int64_t now, asked, before, late;    /* the last turn; when was asked what is ready, and the time before; how late that was */
     int64_t due, leave, period, max_late, max_turn; /* the loop's deadline; when to come back; the longest wait; limits of lateness */
-    int32_t bus, found;                  /* descriptor; an event to be followed; below 0: none */
-    uint32_t count, unsent, taken, turns, records, recorded;
+    int32_t epoll, bus, found;           /* descriptors; an event to be followed; below 0: none */
+    uint32_t count, ready, unsent, taken, turns, records, recorded;
     struct pollfd fds[KCG_FDS];
     int16_t input_of[KCG_FDS];            /* place in `inputs`, -1: none of an ESC */
+    uint16_t place[KCG_AT_ONCE];         /* in `fds`, of the `ready` ports of this turn */
     kcg_frame frames[KCG_OUT];
     uint8_t data[KCG_READ], ring[KCG_RING];
 } kcg_turns;
 
+/* `fds` are others: wait for these. 0 where that cannot be. */
+int kcg_watch(kcg_turns *t);
 /* Turn until there is something for the loop; then `fds` says what is ready. */
 void kcg_turn(kcg_turns *t);
 uint32_t kcg_turns_size(void);

@@ -1,4 +1,4 @@
-"""Which core runs: the one in Python, unless the one in C is asked for, its shared object is there, and it can express the layout."""
+"""Which core runs: the one in C where its shared object is there and can express the layout; else the one in Python, and why."""
 
 import os
 from collections.abc import Sequence
@@ -7,14 +7,15 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.core import Core, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.native.objects import fault, shared_object
 from kontronik_can_gw.signals.plan import Layout
 
-CORE = "KONTRONIK_CORE"
-"""Environment variable: C asks for the core in C. (It saves little before it turns the loop too.)"""
+PURE = "KONTRONIK_PURE"
+"""Environment variable: 1 asks for the core in Python."""
 
 
 class Made(NamedTuple):
-    """A core, and in words why it is not the one in C although that was asked for; empty else."""
+    """A core, and in words why it is the one in Python; empty with the one in C."""
 
     core: Core
     why: str
@@ -22,16 +23,12 @@ class Made(NamedTuple):
 
 @cache
 def library() -> tuple[Any, str]:
-    """The shared object where it is asked for; None where it is not or cannot be used, and why."""
-    if os.environ.get(CORE, "") != "C":
-        return None, ""
-    from kontronik_can_gw.native.compile import (
-        shared_object,  # a compiler's driver: not at each start
-    )
-
+    """The shared object; None where it cannot or is not to be used, and why."""
+    if os.environ.get(PURE, "0") not in ("", "0"):
+        return None, f"{PURE} is set"
     path = shared_object()
-    if not path.exists():
-        return None, f"no {path.name} in this installation"
+    if why := fault(path):
+        return None, why
     try:
         # where memory must not be executed, ctypes itself may not load
         from kontronik_can_gw.native.binding import WrongObject, load
@@ -61,3 +58,8 @@ def make_core(
         except NotInCore as error:
             why = str(error)
     return Made(PythonCore(escs, layout, now, silent), why)
+
+
+def in_words(language: str, why: str | None) -> str:
+    """One line for people, as ``core: Python (KONTRONIK_PURE is set)``."""
+    return f"core: {language} ({why})" if why else f"core: {language}"

@@ -1,7 +1,7 @@
 """Compiled messages -> the tables of the core in C (core.h, kcg_plan), in this machine's layout. NotInCore for what it cannot express.
 
-The proofs are here: no product leaves int64, whatever value comes and whatever a master writes to 2100h. What cannot be proven runs on
-the Python core.
+The proofs are here: no product leaves int64, whatever value comes and whatever settings within the limits below. What cannot be proven
+runs on the Python core; settings beyond them that a master writes to 2100h leave the speeds that they divide not available.
 """
 
 import math
@@ -48,8 +48,9 @@ ALL_PAGES = 64
 ALL_ESCS = 255
 MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""
-MAX_POLES = MAX_GEAR = 0xFFFF
-MAX_CELLS = 0xFF
+MAX_POLES = MAX_CELLS = 0xFF
+MAX_GEAR = 0xF_FFFF
+"""Of numerator and denominator of a gear in its lowest terms: 9.81818 has 490909 and 50000."""
 MAX_ROWS = 0xFFFF
 """Of a table that is addressed by 16 bits."""
 MAX_ALIVE = 1 << 16
@@ -250,17 +251,14 @@ def settings_of(esc: EscSettings) -> Any:
     return Settings(timeout, errors, esc.pole_pairs, numerator, denominator, esc.cell_count)
 
 
-def nearest_settings(esc: EscSettings) -> Any:
-    """As ``settings_of``, of settings that a master wrote: beyond the limits the nearest within them."""
-    gear = esc.gear.limit_denominator(MAX_GEAR)
-    if gear.numerator > MAX_GEAR:
-        gear = (
-            1 / (1 / esc.gear).limit_denominator(MAX_GEAR)
-            if esc.gear < MAX_GEAR
-            else Fraction(MAX_GEAR)
-        )
-    poles, cells = min(esc.pole_pairs, MAX_POLES), min(esc.cell_count, MAX_CELLS)
-    return settings_of(replace(esc, gear=gear, pole_pairs=poles, cell_count=cells))
+def held_settings(esc: EscSettings) -> Any:
+    """As ``settings_of``, of settings that come later. Beyond the limits the speeds that they divide are not available."""
+    try:
+        return settings_of(esc)
+    except NotInCore:
+        row = settings_of(replace(esc, pole_pairs=1, gear=Fraction(1)))
+        row.poles = 0
+        return row
 
 
 def _places(protocol: EscProtocol) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -323,7 +321,6 @@ def _scale_float(row: Any, signal: SignalPlan, value: Value) -> None:
     row.add = struct.unpack("<q", struct.pack("<d", float(signal.intercept)))[0]
     if signal.intercept == 0:
         row.flags |= PLAIN
-    exact = 1 << 53
     greatest = max(map(abs, _range(row, value))) * abs(row.mul) * over
-    if signal.numbers is None and max(greatest, row.div * by) >= exact:
-        raise NotInCore("factor leaves 53 bits")
+    if signal.numbers is None and max(greatest, row.div * by) >= _LIMIT // 2:
+        raise NotInCore("factor leaves 63 bits")

@@ -9,7 +9,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.output import NEVER
 
-_MAX_FRAMES, _READ, _RING, _MAX_FDS = 256, 1 << 14, 1 << 18, 1024
+_MAX_FRAMES, _READ, _RING, _MAX_FDS, _AT_ONCE = 256, 1 << 14, 1 << 18, 1024, 64
 _ENTRY = struct.Struct("=qqIBBxx")
 _u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_int64
 
@@ -18,7 +18,7 @@ class Input(c.Structure):
     """kcg_input: as poller.PortInput."""
 
     _fields_ = (
-        *((name, _i64) for name in ("empty_ns", "undrained_ns")),
+        *((name, _i64) for name in ("empty_ns", "asked_ns", "undrained_ns")),
         *((name, _u8) for name in ("is_plain", "served", "esc")),
         ("reserved", _u8 * 5),
     )
@@ -35,10 +35,14 @@ class _Turns(c.Structure):
         *((name, c.c_void_p) for name in ("core", "inputs")),
         *((name, _i64) for name in ("now", "asked", "before", "late")),
         *((name, _i64) for name in ("due", "leave", "period", "max_late", "max_turn")),
-        *((name, _i32) for name in ("bus", "found")),
-        *((name, _u32) for name in ("count", "unsent", "taken", "turns", "records", "recorded")),
+        *((name, _i32) for name in ("epoll", "bus", "found")),
+        *(
+            (name, _u32)
+            for name in ("count", "ready", "unsent", "taken", "turns", "records", "recorded")
+        ),
         ("fds", _PollFd * _MAX_FDS),
         ("input_of", _i16 * _MAX_FDS),
+        ("place", c.c_uint16 * _AT_ONCE),
         ("frames", Frame * _MAX_FRAMES),
         ("data", _u8 * _READ),
         ("ring", _u8 * _RING),
@@ -52,14 +56,14 @@ class Turns:
         self.inputs: Any = (Input * escs)()
         for esc, one in enumerate(self.inputs):
             one.esc, one.undrained_ns = esc, NEVER
-        self.state = _Turns(core=core, inputs=c.addressof(self.inputs))
+        self.state = _Turns(core=core, inputs=c.addressof(self.inputs), epoll=-1)
         assert library.kcg_turns_size() == c.sizeof(self.state)
-        self._run = library.kcg_turn
+        self._run, self._watch = library.kcg_turn, library.kcg_watch
         self._address = c.byref(self.state)
         self._raw = memoryview(self.state).cast("B")
 
     def watch(self, descriptors: Sequence[tuple[int, int, int | None]]) -> bool:
-        """(descriptor, what to wait for, ESC whose port it is) from now on. False: more than there is room for."""
+        """(descriptor, what to wait for, ESC whose port it is) from now on. False: that cannot be."""
         if len(descriptors) > _MAX_FDS:
             return False
         state = self.state
@@ -67,7 +71,11 @@ class Turns:
         for place, (fd, events, esc) in enumerate(descriptors):
             state.fds[place] = _PollFd(fd, events, 0)
             state.input_of[place] = -1 if esc is None else esc
-        return True
+        return bool(self._watch(self._address))
+
+    def close(self) -> None:
+        """Wait for nothing any more."""
+        self.watch(())
 
     def run(self) -> None:
         """Turn until there is something for the loop."""

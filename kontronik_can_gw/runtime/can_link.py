@@ -58,7 +58,7 @@ class CanLink:
         self._own_ids = IdLocks(config, gateway, conditions)
         self._receive_ids: frozenset[int] | None = None
         """What the open port was asked to receive."""
-        self._is_proven = False
+        self.is_proven = False
         """A frame was taken since the interface failed last."""
         self._drained = True
         self._noted = PortInput()
@@ -80,21 +80,6 @@ class CanLink:
     @property
     def is_open(self) -> bool:
         return self.port is not None
-
-    @property
-    def plain_socket(self) -> int | None:
-        """The descriptor of a socket that frames can be handed to as long as it takes them; None while more is to be done than that."""
-        port = self.port
-        is_plain = (
-            port is not None
-            and port.is_socket
-            and not port.gone
-            and self._is_proven
-            and self.transmitter.is_idle
-            and not self.controller.is_off
-            and port.state is self._gateway.status.can_state
-        )
-        return port.fileno() if is_plain and port is not None else None
 
     def open(self, now: int, wait: bool) -> None:
         """Open the interface. RunError where that fails, unless ``wait``: then it is tried again.
@@ -170,7 +155,7 @@ class CanLink:
             self.port = None
 
     def _failed(self, reason: str, now: int) -> None:
-        self._is_proven = False
+        self.is_proven = False
         self._retry.failed(now)
         self.transmitter.clear()
         self._gateway.set_can_state(CanState.DOWN, now)
@@ -262,7 +247,7 @@ class CanLink:
         if answer is None:
             return
         if answer is _OK:
-            if not self._is_proven:
+            if not self.is_proven:
                 self._prove(now)
         elif answer is Sent.FULL:
             self._watch(select.POLLIN | select.POLLOUT)
@@ -277,7 +262,7 @@ class CanLink:
 
     def _prove(self, now: int) -> None:
         """The interface works: a frame was taken."""
-        self._is_proven = True
+        self.is_proven = True
         self._retry.succeeded()
         self._conditions.end(
             self.condition, f"CAN {self.config.channel}: frames are sent again", now

@@ -11,7 +11,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.esc_log import EscLog
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.poller import Poller, PortInput, StuckCheck
+from kontronik_can_gw.runtime.poller import Poller, StuckCheck
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
     NoPort,
@@ -41,7 +41,6 @@ class EscPort:
         conditions: FaultLog,
         lost: "set[EscPort]",
         clock: Callable[[], int] = time.monotonic_ns,
-        noted: PortInput | None = None,
     ) -> None:
         self.path = path
         self.port: SerialPort | None = None
@@ -57,7 +56,7 @@ class EscPort:
         self._poller = poller
         self._conditions = conditions
         self._clock = clock
-        self._noted = noted or PortInput()
+        self._noted = poller.noted(index)
         self._retry = Retry(MAX_RETRY_NS)
         self.log = EscLog(index, gateway, conditions)
         self._counted: dict[str, int] = {}

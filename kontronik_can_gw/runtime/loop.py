@@ -8,7 +8,7 @@ another thread). Threads of their own (worker.py) have the parameter store (stor
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
@@ -19,7 +19,7 @@ from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
-from kontronik_can_gw.runtime.poller import Handler, Poller, PortInput
+from kontronik_can_gw.runtime.poller import Handler, Poller
 from kontronik_can_gw.runtime.snapshot import ProgramFacts
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
@@ -27,8 +27,6 @@ from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.runtime.worker import Handover
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.native.core import NativeCore
-    from kontronik_can_gw.runtime.native_turns import NativeTurns
     from kontronik_can_gw.runtime.recorder import Recorder
     from kontronik_can_gw.runtime.store import ParameterStore
 
@@ -72,17 +70,9 @@ class Loop:
         self._node_changes = 0
         self._stopping = False
         self._poller = poller or Poller(clock)
-        self._turns: NativeTurns | None = None
-        if gateway.core.language == "C" and poller is None and clock is time.monotonic_ns:
-            from kontronik_can_gw.runtime import native_turns
-
-            self._turns = native_turns.NativeTurns(
-                gateway, cast("NativeCore", gateway.core), self._poller
-            )
         self._lost: set[EscPort] = set()
-        inputs = [PortInput() for _ in ports] if self._turns is None else self._turns.inputs
         self.escs = [
-            EscPort(i, path, gateway, self._poller, self.conditions, self._lost, clock, inputs[i])
+            EscPort(i, path, gateway, self._poller, self.conditions, self._lost, clock)
             for i, path in enumerate(ports)
         ]
         self.can = CanLink(can_config, gateway, self._poller, self.conditions, self._esc_at, clock)
@@ -140,8 +130,7 @@ class Loop:
 
     def begin(self) -> None:
         """Start the gateway."""
-        if self._turns is not None:
-            self._turns.begin()
+        self._poller.begin()
         now = self._now = self._clock()
         self.gateway.start(now, self.can.is_open)
         self.can.follow_ids()  # before the boot-up message: a master may ask as soon as it sees it
@@ -151,7 +140,7 @@ class Loop:
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
         period = self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
-        ready = None if self._turns is None else self._turn_in_c(period)
+        ready = self._turn_in_c(period) if self._poller.is_native else None
         is_idle = ready is None
         if ready is None:
             ready = self._poller.wait(self._now, min(self._now + period, self._due))
@@ -170,15 +159,15 @@ class Loop:
             self._due = self._next_deadline()
 
     def _turn_in_c(self, period: int) -> list[tuple[Handler, int]] | None:
-        assert self._turns is not None
+        """Let turns be made in C, as long as these are plain; what is ready then. None where it is not the time for that."""
         if self._lost or self.can.port is None:
             return None
         can, housekeeping = self.can, self._housekeeping
-        due = min(can.due, housekeeping.wake_due, self.gateway.outputs_deadline())
+        due = min(can.due, housekeeping.wake_due, self.gateway.next_deadline(with_core=False))
         leave = min(housekeeping.due, can.controller.due)
         max_turn = can.transmitter.max_turn_ns()
         limits = (max(MIN_HELD_UP_NS, max_turn), max_turn)
-        return self._turns.wait(can, self._now, due, leave, period, limits)
+        return self._poller.turn(can, self._now, due, leave, period, limits)
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
         """Take what has come, do what is due, send what is made of it. Returns the time."""
@@ -214,8 +203,6 @@ class Loop:
             esc.close()
         self.can.close()
         self._poller.close()
-        if self._turns is not None:
-            self._turns.close()
         self._statistics.close()
         if self._recorder is not None:
             self._recorder.close()

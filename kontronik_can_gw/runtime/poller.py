@@ -9,10 +9,13 @@ import contextlib
 import select
 import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.output import NEVER
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.can_link import CanLink
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (select.POLLIN, POLLOUT)."""
@@ -63,7 +66,10 @@ class Poller:
 
     ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
     ``late``: by how much more than its pause the last turn and the wait took. ``changes`` grows with each change of what is watched.
+    ``is_native``: ``turn`` can do something.
     """
+
+    is_native = False
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
@@ -113,6 +119,24 @@ class Poller:
             for fd, bits in happened
         ]
 
+    def noted(self, _esc: int) -> PortInput:
+        """What is noted while an ESC's port is read."""
+        return PortInput()
+
+    def begin(self) -> None:
+        """The loop begins."""
+
+    def turn(
+        self,
+        can: "CanLink",
+        last: int,
+        due: int,
+        leave: int,
+        period: int,
+        limits: tuple[int, int],
+    ) -> list[tuple[Handler, int]] | None:
+        """Nothing: turns are made in C by native_poller.py."""
+
     def watched(self) -> list[tuple[int, int, int | None]]:
         """The descriptors that are watched, for what, and whose port each is."""
         return [
@@ -120,10 +144,6 @@ class Poller:
             for fd, (_, events, esc) in self._watched.items()
             if fd not in self._closed
         ]
-
-    def follow(self, before: int, now: int, late: int) -> None:
-        """Another has waited and asked."""
-        self.before, self.now, self.late = before, now, late
 
     def _events(self, fd: int, bits: int) -> int:
         if bits & select.POLLNVAL:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Call, Gateway
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.signals.plan import Layout
 
@@ -17,8 +17,14 @@ Put = Callable[[int, int, int, bytes, int, int | None], None]
 """(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""
 
 
+Call = tuple[int, int, int, bytes, int | None]
+"""Time, kind, ESC's index, data, time of arrival."""
+
+
 class RecordedGateway(Gateway):
     """What the runtime changes besides, the counters of ``status`` and line errors, is noticed at the next call."""
+
+    is_recorded = True
 
     def __init__(
         self,
@@ -97,15 +103,16 @@ class RecordedGateway(Gateway):
     def not_sent(self, now: int) -> None:
         self._put(now, Kind.NOT_SENT, 0, b"", 0, None)
 
+    def prepare_turns(self, now: int) -> None:
+        """The core is about to be called by turns in C: note what holds by then."""
+        self._note_line_errors(now)
+        self._note_counters(now)
+
     def turned(self, calls: Iterable[Call], frames: int) -> None:
+        """The core was called by turns in C, and as many frames were taken."""
         self._counters = (self._counters[0] + frames, *self._counters[1:])
         for now, kind, esc, data, came in calls:
             self._put(now, kind, esc, data, 0, came)
-
-    def prepare_turns(self, _now: int) -> bool:
-        self._note_line_errors(_now)
-        self._note_counters(_now)
-        return True
 
     def _note_line_errors(self, now: int) -> None:
         for esc, (state, known) in enumerate(zip(self.escs, self._line_errors, strict=True)):

@@ -35,7 +35,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import NotInCore
-from kontronik_can_gw.native.tables import GATEWAY
+from kontronik_can_gw.native.tables import GATEWAY, MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import Slot, SlotSettings
 
@@ -44,10 +44,11 @@ _STEPS = (0, 1_000, 100_000, MS, 2 * MS, 5 * MS, 10 * MS, 10 * MS, 10 * MS, 50 *
 
 
 def settings(chance: random.Random, number: int) -> EscSettings:
+    part = chance.choice((300, MAX_GEAR))
     return EscSettings(
         f"esc{number + 1}",
         chance.choice((1, 2, 7, 14, 255)),
-        Fraction(chance.randint(1, 300), chance.randint(1, 300)),
+        Fraction(chance.randint(1, part), chance.randint(1, part)),
         chance.choice((0, 0, 6, 14)),
         chance.choice((20, 60, 250, 1000)) * MS,
         chance.choice((1, 5, 50)),

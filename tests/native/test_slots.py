@@ -8,7 +8,7 @@ from dialogue import QUIET, Bench, info, live, tpdo
 from kontronik_can_gw.core import Follower
 from kontronik_can_gw.esc.telemetry import MS, Event
 from kontronik_can_gw.native import load
-from kontronik_can_gw.native.compile import shared_object
+from kontronik_can_gw.native.objects import shared_object
 
 ERROR_CODE = 0x603F0010
 
@@ -17,7 +17,7 @@ ERROR_CODE = 0x603F0010
 def in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     if not shared_object().exists():
         pytest.skip("no core in C: sudo apt-get install gcc libc6-dev, and install again")
-    monkeypatch.setenv(load.CORE, "C")
+    monkeypatch.delenv(load.PURE, raising=False)
     load.library.cache_clear()
     yield
     load.library.cache_clear()

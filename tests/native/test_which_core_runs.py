@@ -1,12 +1,15 @@
-"""The core in C runs where it is asked for and can; where it cannot, the one in Python does, and the gateway says why."""
+"""The core in C runs where it can; where it cannot, the one in Python does, and the gateway says why."""
 
 import builtins
+import os
 import stat
-from collections.abc import Iterator
+import struct
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -19,8 +22,9 @@ from kontronik_can_gw.esc.kontronik import LiveData, codec, encode
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import compile as compiling
-from kontronik_can_gw.native import load
+from kontronik_can_gw.native import load, objects
 from kontronik_can_gw.native.compile import compile_core
+from kontronik_can_gw.native.objects import sealed
 from kontronik_can_gw.native.tables import MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
 
@@ -34,8 +38,8 @@ VOLTAGE = 'BatteryVoltage : 0|16@1+ ({},0) [0|0] "V"'
 
 
 @pytest.fixture(autouse=True)
-def asked_for(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv(load.CORE, "C")
+def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv(load.PURE, raising=False)
     load.library.cache_clear()
     yield
     load.library.cache_clear()
@@ -43,8 +47,13 @@ def asked_for(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture
 def built() -> None:
-    if not compiling.shared_object().exists():
+    if not objects.shared_object().exists():
         pytest.skip("no core in C: sudo apt-get install gcc libc6-dev, and install again")
+
+
+def layout_of(signal: str, more: str = "") -> Layout:
+    database = parse_database((HEAD.format(signal) + more).encode(), "t.dbc")
+    return prepare(database, "t.dbc", (EscSettings(),), DbcSettings())[1]
 
 
 def why(**settings: object) -> str:
@@ -55,29 +64,84 @@ def why(**settings: object) -> str:
 
 
 @pytest.mark.usefixtures("built")
-def test_it_is_the_one_in_c_where_that_is_asked_for() -> None:
+@pytest.mark.parametrize("pure", [None, "", "0"])
+def test_it_is_the_one_in_c(monkeypatch: pytest.MonkeyPatch, pure: str | None) -> None:
+    if pure is not None:
+        monkeypatch.setenv(load.PURE, pure)
     assert why() == ""
 
 
-def test_it_is_the_one_in_python_where_nothing_is_asked_for(
+def test_it_is_the_one_in_python_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(load.PURE, "1")
+    assert why() == "KONTRONIK_PURE is set"
+
+
+def of_another_machine(whole: bytes) -> bytes:
+    return sealed(whole[:18] + b"\xfe\xca" + whole[20:-4])
+
+
+def in_another_word_length(whole: bytes) -> bytes:
+    return sealed(whole[:4] + bytes((whole[4] ^ 3,)) + whole[5:-4])
+
+
+@pytest.mark.usefixtures("built")
+@pytest.mark.parametrize(
+    ("made_of", "said"),
+    [
+        (lambda _: None, "no core-other.so in this installation"),
+        (lambda _: b"", "core-other.so: cut off or damaged"),
+        (lambda whole: whole[:-1], "core-other.so: cut off or damaged"),
+        (lambda whole: whole[:8192], "core-other.so: cut off or damaged"),
+        (lambda whole: whole[:4096] + bytes(4096) + whole[8192:], "core-other.so: cut off or damaged"),
+        (lambda whole: whole[:-4], "core-other.so: cut off or damaged"),
+        (of_another_machine, "core-other.so: built for another machine"),
+        (in_another_word_length, "core-other.so: built for another machine"),
+        (lambda whole: sealed(whole[:64] + bytes(9)), "core-other.so: "),
+    ],
+)  # fmt: skip
+def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_python_runs(
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv(load.CORE)
-    gateway = Gateway([EscSettings()], EMPTY, 0)
-    assert (type(gateway.core), gateway.why_python) == (PythonCore, "")
-
-
-@pytest.mark.parametrize("content", [None, "no object, but long enough to look like one" * 9])
-def test_without_an_object_for_this_machine_the_one_in_python_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str | None
+    made_of: Callable[[bytes], bytes | None],
+    said: str,
 ) -> None:
     path = tmp_path / "core-other.so"
-    if content is not None:
-        path.write_text(content)
-    monkeypatch.setattr(compiling, "shared_object", lambda: path)
-    said = why()
-    begin = "no core-other.so in this installation" if content is None else "core-other.so: "
-    assert said.startswith(begin) and "\n" not in said
+    if (content := made_of(objects.shared_object().read_bytes())) is not None:
+        path.write_bytes(content)
+    monkeypatch.setattr(load, "shared_object", lambda: path)
+    monkeypatch.setattr(objects, "NOT_BUILT", tmp_path / "not_built.txt")
+    found = why()
+    assert found.startswith(said) and "\n" not in found and len(found) < 200
+
+
+def test_what_the_installation_said_is_why_there_is_no_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(load, "shared_object", lambda: tmp_path / "core-other.so")
+    monkeypatch.setattr(objects, "NOT_BUILT", tmp_path / "not_built.txt")
+    (tmp_path / "not_built.txt").write_text("there was no C compiler at the installation\n")
+    found = why()
+    assert (
+        load.in_words("Python", found)
+        == "core: Python (there was no C compiler at the installation)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("machine", "largest", "name"),
+    [
+        ("aarch64", 1 << 63, "core-aarch64.so"),
+        ("aarch64", 1 << 31, "core-armv7l.so"),
+        ("armv6l", 1 << 31, "core-armv6l.so"),
+        ("x86_64", 1 << 31, "core-i686.so"),
+    ],
+)
+def test_a_process_of_32_bits_has_an_object_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, machine: str, largest: int, name: str
+) -> None:
+    monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine=machine))
+    monkeypatch.setattr(sys, "maxsize", largest - 1)
+    assert objects.shared_object().name == name
 
 
 @pytest.mark.usefixtures("built")
@@ -100,13 +164,31 @@ def test_a_gear_beyond_its_limits_runs_in_python() -> None:
     assert f"parts above {MAX_GEAR}" in why(gear=Fraction(MAX_GEAR + 1))
 
 
+SPEEDS = 'MotorSpeed : 0|32@1+ (1,0) [0|0] "rpm" Car\n SG_ OutputSpeed : 32|32@1+ (1,0) [0|0] "rpm"'
+NOT_AVAILABLE = 0xFFFF_FFFF
+
+
 @pytest.mark.usefixtures("built")
-def test_what_a_master_writes_beyond_its_limits_is_the_nearest_within() -> None:
-    gateway = Gateway([EscSettings()], EMPTY, 0)
-    gears = Fraction(100_000, 7), Fraction(42857143, 5_000_000), Fraction(1, 10**9), Fraction(10**9)
-    for gear in gears:
-        gateway.core.apply(0, EscSettings(gear=gear, pole_pairs=100_000, cell_count=300))
-    assert gateway.escs[0].settings.gear == 10**9
+def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available() -> None:
+    gateway = Gateway([EscSettings(pole_pairs=7)], layout_of(SPEEDS), 0)
+    assert gateway.core.language == "C"
+    for now, (poles, gear, motor, output) in enumerate(
+        (
+            (7, Fraction(490_909, 50_000), 10_000, 1_019),
+            (7, Fraction(1, MAX_GEAR + 1), NOT_AVAILABLE, NOT_AVAILABLE),
+            (7, Fraction(MAX_GEAR + 2, 2), NOT_AVAILABLE, NOT_AVAILABLE),
+            (100_000, Fraction(1), NOT_AVAILABLE, NOT_AVAILABLE),
+            (7, Fraction(5), 10_000, 2_000),
+        )
+    ):
+        given = EscSettings(pole_pairs=poles, gear=gear)
+        gateway.core.apply(0, given)
+        assert gateway.escs[0].settings == given
+        time = now * SECOND // 10
+        live = encode(LiveData(electrical_speed=70_000), codec.Layout.V4)
+        gateway.receive_bytes(0, live, time, time)
+        (frame,) = gateway.take_frames(time)
+        assert struct.unpack("<2I", frame.data) == (motor, output), given
 
 
 @pytest.mark.usefixtures("built")
@@ -128,9 +210,7 @@ def test_another_esc_protocol_runs_in_python(monkeypatch: pytest.MonkeyPatch) ->
     ],
 )
 def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str) -> None:
-    database = parse_database((HEAD.format(signal) + more).encode(), "t.dbc")
-    layout = prepare(database, "t.dbc", (EscSettings(),), DbcSettings())[1]
-    gateway = Gateway([EscSettings()], layout, 0)
+    gateway = Gateway([EscSettings()], layout_of(signal, more), 0)
     assert isinstance(gateway.core, PythonCore) and gateway.why_python
 
 
@@ -146,12 +226,14 @@ def test_the_losses_of_a_later_part_go_on() -> None:
 def test_a_compiler_that_fails_is_said_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program = tmp_path / "cc"
-    program.write_text("#!/bin/sh\necho 'cannot find crti.o' >&2\nexit 1\n")
+    program, target = tmp_path / "cc", tmp_path / "core.so"
+    program.write_text("#!/bin/sh\nprintf 'In file:\\nfatal error: \\377' >&2\nexit 1\n")
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setattr(compiling, "compiler", lambda: str(program))
-    assert compile_core(tmp_path / "core.so") == f"{program}: cannot find crti.o"
+    said = f"at the installation {program} failed: "
+    assert compile_core(target) == f"{said}fatal error: \ufffd"
     program.unlink()
-    assert "No such file" in str(compile_core(tmp_path / "core.so"))
+    assert "No such file" in str(compile_core(target))
     monkeypatch.setattr(compiling, "compiler", lambda: None)
-    assert compile_core(tmp_path / "core.so") == "no C compiler"
+    assert compile_core(target) == "there was no C compiler at the installation"
+    assert not target.exists()

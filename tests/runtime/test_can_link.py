@@ -302,12 +302,12 @@ def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
     bench.port.answer = Sent.BUSY
     bench.can.transmitter.queue.put_all([CanFrame(0x100, b"held")])
     bench.can.transmit(bench.now)
-    bench.can._is_proven = False
+    bench.can.is_proven = False
     bench.can.transmitter.clear()
     later = bench.now + SECOND
     bench.gateway.take_frames(bench.now)
     bench.can.transmit(later)
-    assert not bench.can._is_proven
+    assert not bench.can.is_proven
     assert bench.can.transmitter._busy_since is None
 
 

@@ -281,6 +281,13 @@ def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path
 # --- the screen
 
 
+@pytest.mark.parametrize(("reason", "said"), [(None, "core: C"), ("no", "core: Python (no)")])
+def test_the_core_that_runs_is_named(reason: str | None, said: str) -> None:
+    document = heard(1).document()
+    document["gateway"] |= {"core": "Python" if reason else "C", "core_reason": reason}
+    assert said in words(judged(document)).splitlines()
+
+
 def test_nothing_that_a_terminal_might_obey_comes_from_a_file(tmp_path: Path) -> None:
     evil = "\x1b[2J\x1b]0;x\x07\r\n\x9b[31m\u202e"
     document = heard().document(log_lines=[evil])

@@ -27,7 +27,7 @@ from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.poller import Handler, Poller
+from kontronik_can_gw.runtime.poller import Handler, Poller, PortInput
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
@@ -234,12 +234,13 @@ class World:
         self.there = True
         self.blind: set[int] = set()
         self.handlers: dict[int, Handler] = {}
+        self.late = 0
         self.poller = cast("Poller", FakePoller(self))
 
     def clock(self) -> int:
         return self.now
 
-    def register(self, fd: int, handler: Handler, _events: int = 1) -> None:
+    def register(self, fd: int, handler: Handler, _events: int = 1, esc: int | None = None) -> None:
         self.handlers[fd] = handler
 
     def unregister(self, fd: int) -> None:
@@ -248,10 +249,11 @@ class World:
     def close(self) -> None:
         pass
 
-    def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
-        if pause_ns > 0:
-            self.now = max(self.now, min(self.now + -(-pause_ns // MS) * MS, *self._arrivals()))
+    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+        pause = max(0, due - self.now)
+        self.now = max(self.now, min(self.now + -(-pause // MS) * MS, *self._arrivals()))
         self.now += self.hold_up()
+        self.late = self.now - last - pause
         self.before, self.looked = self.looked, self.now
         self.looks.append(self.now)
         ready = [(wire.fileno(), wire.waits_to_be_read) for wire in self.wires]
@@ -272,10 +274,18 @@ class World:
 class FakePoller:
     """The World as the loop's poller: it has a clock of the same name."""
 
+    is_native = False
+
     def __init__(self, world: World) -> None:
         self._world = world
         self.register, self.unregister = world.register, world.unregister
         self.wait, self.close = world.wait, world.close
+
+    def noted(self, _esc: int) -> PortInput:
+        return PortInput()
+
+    def begin(self) -> None:
+        pass
 
     @property
     def now(self) -> int:
@@ -284,6 +294,10 @@ class FakePoller:
     @property
     def before(self) -> int:
         return self._world.before
+
+    @property
+    def late(self) -> int:
+        return self._world.late
 
 
 def loop_in(

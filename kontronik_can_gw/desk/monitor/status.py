@@ -30,6 +30,7 @@ from kontronik_can_gw.desk.monitor.lines import (
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.native.load import in_words
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
@@ -213,6 +214,7 @@ def _head(seen: Seen, document: Document, width: int | None) -> Iterator[Text]:
     yield line(first, f"{heard}, up {duration(process['uptime_s'])}")
     memory = f"{process['rss_bytes'] // 1_000_000} MB"
     yield line((f"process {process['pid']}, {memory}, {where}", FAINT))
+    yield line((in_words(gateway["core"], gateway["core_reason"]), FAINT))
 
 
 def _can_lines(document: Document) -> Iterator[Text]:

@@ -1,0 +1,115 @@
+"""Turns of the loop in C, while the core is there, too, and nothing but plain reads and frames that are due is to be done."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, cast
+
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.poller import Handler, Poller, PortInput
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.core import NativeCore
+    from kontronik_can_gw.runtime.can_link import CanLink
+    from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+
+
+def poller_for(gateway: Gateway) -> Poller:
+    """The one that suits the gateway's core."""
+    return NativePoller(gateway) if gateway.core.language == "C" else Poller()
+
+
+class NativePoller(Poller):
+    """A poller that can turn. ``count``: turns in C so far."""
+
+    is_native = True
+
+    def __init__(self, gateway: Gateway, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(clock)
+        self.count = 0
+        self._gateway = gateway
+        self._core = cast("NativeCore", gateway.core)
+        self._turns = self._core.turns()
+        self._seen_changes = -1
+        self._fits = True
+        self._signals: tuple[int, int] | None = None
+
+    def noted(self, esc: int) -> PortInput:
+        return cast(PortInput, self._turns.inputs[esc])
+
+    def begin(self) -> None:
+        """A signal is followed when C is left: let it wake that, at whatever moment it comes."""
+        if threading.current_thread() is threading.main_thread():
+            self._signals = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+            signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
+            self.register(self._signals[0], self._signalled)
+
+    def close(self) -> None:
+        super().close()
+        self._turns.close()
+        if self._signals is not None:
+            signal.set_wakeup_fd(-1)
+            for fd in self._signals:
+                os.close(fd)
+            self._signals = None
+
+    def _signalled(self, _now: int, _events: int) -> None:
+        assert self._signals is not None
+        os.read(self._signals[0], 4096)
+
+    def turn(
+        self,
+        can: "CanLink",
+        last: int,
+        due: int,
+        leave: int,
+        period: int,
+        limits: tuple[int, int],
+    ) -> list[tuple[Handler, int]] | None:
+        """Turn until something is to be done that is the loop's; the handlers of what is ready then.
+
+        None where it is not the time for that. ``last``: the last turn; ``due``: what the loop has to do apart from the core;
+        ``leave``: when to come back in any case; ``period``: how long a wait is at most; ``limits``: how late a turn, and the sending of
+        its frames, may be. All in ns.
+        """
+        gateway = self._gateway
+        if self._core.reports_live or gateway.frames_wait:
+            return None
+        if (bus := _plain_socket(can, gateway)) is None or not self._watches():
+            return None
+        turns = self._turns
+        state = turns.state
+        state.now, state.asked, state.before, state.bus = last, self.now, self.before, bus
+        state.due, state.leave, state.period = due, leave, period
+        state.max_late, state.max_turn = limits
+        recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
+        if recorded is not None:
+            recorded.prepare_turns(last)
+        state.records = recorded is not None
+        turns.run()
+        self.count += state.turns
+        self.before, self.now, self.late = state.before, state.asked, state.late
+        if recorded is not None:
+            recorded.turned(turns.entries(), state.taken)
+        if state.found >= 0:
+            self._core.follow(state.found, state.now)
+        if state.unsent:
+            can.transmitter.put(turns.unsent())
+        return self.handlers(turns.ready())
+
+    def _watches(self) -> bool:
+        if self._seen_changes != self.changes:
+            self._seen_changes = self.changes
+            self._fits = self._turns.watch(self.watched())
+        return self._fits
+
+
+def _plain_socket(can: "CanLink", gateway: Gateway) -> int | None:
+    """The interface's socket, while frames can be handed to it without further ado."""
+    port = can.port
+    is_plain = can.is_proven and can.transmitter.is_idle and not can.controller.is_off
+    if port is None or not is_plain or port.state is not gateway.status.can_state:
+        return None
+    return port.fileno() if port.is_socket else None

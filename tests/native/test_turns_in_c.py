@@ -1,0 +1,160 @@
+"""A loop that turns in C, with pseudo terminals and a local socket: what it records, replayed by the core in Python, gives what it sent."""
+
+import os
+import random
+import socket
+import struct
+import threading
+import time
+import tty
+from collections.abc import Iterator, Sequence
+
+import pytest
+from equality import layout, settings, stream
+
+from kontronik_can_gw.capture.format import Entry, Kind
+from kontronik_can_gw.capture.replay import Replay
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.native import load
+from kontronik_can_gw.runtime import can_link
+from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.native_poller import NativePoller
+from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
+
+_HEAD = struct.Struct("=IBBBB")
+
+
+class LocalBus(socket.socket):
+    """One end of a local socket pair, which has no options of CAN."""
+
+    def setsockopt(self, *_: object) -> None:
+        pass
+
+
+class World:
+    """A loop with recorder, its ESCs' wires, and what comes out. ``is_slow``: the bus takes what is sent only now and then."""
+
+    def __init__(self, seed: int, is_slow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.chance = chance = random.Random(seed)
+        self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
+        self.layout = layout(chance, self.escs)
+        self.is_slow = is_slow
+        pairs = [os.openpty() for _ in self.escs]
+        for _, terminal in pairs:
+            tty.setraw(terminal)
+        self.wires = [wire for wire, _ in pairs]
+        self.entries: list[Entry] = []
+        ours, self.bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 if is_slow else 1 << 20)
+        port = LocalBus(fileno=ours.detach())
+        monkeypatch.setattr(can_link, "open_can", lambda _: SocketCanPort(port, port.close))
+        self.gateway = RecordedGateway(self.put, self.escs, self.layout, time.monotonic_ns())
+        self.begun = self.gateway.status.started_ns
+        self.poller = NativePoller(self.gateway)
+        ports = [os.ttyname(terminal) for _, terminal in pairs]
+        self.loop = Loop(self.gateway, ports, CanConfig(channel="lo", fd=True), poller=self.poller)
+        if not is_slow:  # then nothing is dropped, however slow the machine is
+            monkeypatch.setattr(self.loop.can.transmitter, "max_turn_ns", lambda: 3600 * SECOND)
+        for _, terminal in pairs:
+            os.close(terminal)
+        self.received: list[tuple[int, bytes]] = []
+
+    def put(
+        self, now: int, kind: int, esc: int, data: bytes, flags: int, came: int | None = None
+    ) -> None:
+        self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
+
+    def feed(self, turns: int) -> None:
+        """Bytes of all ESCs in pieces of any size, at any time, until there were ``turns`` turns in C; then the wires are cut."""
+        chance = self.chance
+        data = dict.fromkeys(self.wires, b"")
+        for _ in range(100_000):
+            if self.poller.count >= turns:
+                break
+            for wire, rest in data.items():
+                size = chance.choice((1, 10, 40, 40, 44, 80, 400))
+                rest = rest or stream(chance)
+                os.write(wire, rest[:size])
+                data[wire] = rest[size:]
+            time.sleep(chance.choice((0, 0, 0.0003, 0.002)))
+        for wire in self.wires:
+            os.close(wire)
+        self.loop.stop()
+
+    def receive(self) -> None:
+        while data := self.bus.recv(72):
+            can_id, length, *_ = _HEAD.unpack_from(data)
+            assert len(data) in (16, 72)
+            self.received.append((can_id, data[8 : 8 + length]))
+            if self.is_slow and self.chance.random() < 0.02:
+                time.sleep(0.01)
+
+    def run(self, turns: int) -> None:
+        threads = [
+            threading.Thread(target=self.receive),
+            threading.Thread(target=self.feed, args=(turns,)),
+        ]
+        self.loop.open()
+        for thread in threads:
+            thread.start()
+        self.loop.run()
+        for thread in threads:
+            thread.join()
+        self.bus.close()
+
+    def replayed(self, monkeypatch: pytest.MonkeyPatch) -> list[CanFrame]:
+        monkeypatch.setenv(load.PURE, "1")
+        load.library.cache_clear()
+        gateway = Gateway(self.escs, self.layout, self.begun)
+        assert gateway.core.language == "Python"
+        replay = Replay(gateway)
+        frames = [timed.frame for timed in replay.follow(self.entries)]
+        assert replay.rejected == 0
+        return frames
+
+
+@pytest.fixture(autouse=True)
+def _core_in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv(load.PURE, raising=False)
+    load.library.cache_clear()
+    if load.library()[0] is None:
+        pytest.skip(f"the core in C: {load.library()[1]}")
+    yield
+    load.library.cache_clear()
+
+
+def on_the_wire(frames: Sequence[CanFrame]) -> list[tuple[int, bytes]]:
+    return [(f.can_id | (EXTENDED if f.extended else 0), f.data) for f in frames]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_sent_is_what_a_replay_in_python_sends(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(seed, False, monkeypatch)
+    world.run(200)
+    assert world.poller.count >= 200
+    assert world.received == on_the_wire(world.replayed(monkeypatch))
+    assert len(world.received) == world.gateway.status.sent_frames > 0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_where_the_bus_does_not_take_all_the_newest_values_are_sent(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was replaced is missing; nothing else comes, and nothing twice or in another order of its id."""
+    world = World(seed, True, monkeypatch)
+    world.run(200)
+    status = world.gateway.status
+    assert len(world.received) == status.sent_frames
+    replayed = on_the_wire(world.replayed(monkeypatch))
+    for can_id in {number for number, _ in replayed}:
+        all_of_it = iter([data for number, data in replayed if number == can_id])
+        got = [data for number, data in world.received if number == can_id]
+        assert all(any(data == other for other in all_of_it) for data in got)
+    waiting = len(world.loop.can.transmitter.queue)
+    assert status.sent_frames + status.replaced_frames + waiting == len(replayed)
