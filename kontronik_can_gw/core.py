@@ -5,7 +5,7 @@ Pure, and the way of every value: ``receive`` decodes and marks messages as pend
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from kontronik_can_gw.dbc.messages import Messages, own_ids
 from kontronik_can_gw.esc.stream import EscStream
@@ -14,9 +14,17 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.slots import Slot, Slots
 
 OnEvent = Callable[[int, int, int], None]
 """ESC, bits of telemetry.Event, time."""
+
+
+class Follower(NamedTuple):
+    """``on_event`` is given what happens, as it happens, with at least one of ``events``."""
+
+    events: int
+    on_event: OnEvent
 
 
 class Core(Protocol):
@@ -37,8 +45,7 @@ class Core(Protocol):
     def own_ids(self) -> Mapping[int, Owner]:
         """The ids of the messages (29-bit ones with EXTENDED), and what for."""
 
-    followers: Sequence[OnEvent]
-    """They are given what happens, as it happens."""
+    followers: Sequence[Follower]
     link_changes: list[int]
     """ESCs whose link state, layout or device changed; the owner empties it."""
     shortest_timeout_ns: int
@@ -54,6 +61,9 @@ class Core(Protocol):
 
     def apply(self, esc: int, settings: EscSettings) -> None:
         """Other settings of an ESC from now on."""
+
+    def slot(self, esc: int) -> Slot:
+        """A further slot of an ESC."""
 
     def expire(self, now: int) -> None:
         """What is too old by now goes."""
@@ -78,14 +88,14 @@ class Core(Protocol):
         """True while ``take`` has something to do."""
 
     def take(self, now: int) -> list[CanFrame]:
-        """The frames of the messages that are due, with the values of now, in the order in which they became due."""
+        """The frames of what is due, with the values of now: slots, then messages, each in the order in which they became due."""
 
     def pack(self, now: int) -> None:
         """Make the frames of what is pending, before ``take`` asks for them."""
 
 
 class PythonCore:
-    """The core in plain Python. ``silent``: see Messages."""
+    """The core in plain Python. ``silent``: see Messages. ``packs_at_once``: see Core."""
 
     language = "Python"
 
@@ -95,18 +105,21 @@ class PythonCore:
         layout: Layout,
         now: int,
         silent: bool,
+        packs_at_once: bool = False,
     ) -> None:
         self.escs: list[EscStream] = [EscStream(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
         self.messages = Messages(layout, self.escs, self.status, now, silent)
+        self.slots = Slots(self.escs, self.status, packs_at_once)
+        self.slot = self.slots.add
         self.own_ids = own_ids(layout)
         self.gateway_changed = self.messages.on_gateway_change
         self.repeat = self.messages.repeat
         self.stop = self.messages.stop
         self.shortest_timeout_ns = self._shortest_timeout()
-        self.packs_at_once = False
+        self.packs_at_once = packs_at_once
         self._packed: list[CanFrame] = []
-        self.followers: Sequence[OnEvent] = ()
+        self.followers: Sequence[Follower] = ()
         self.link_changes: list[int] = []
         self._second_ns = now
         self._next_expiry = 0
@@ -148,20 +161,21 @@ class PythonCore:
             self.expire(now)
         if now >= self.messages.schedule.next_due:
             self.messages.advance(now)
+        self.slots.advance(now)
 
     def next_deadline(self) -> int:
         due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
-        return min(due, self.messages.schedule.next_due)
+        return min(due, self.messages.schedule.next_due, self.slots.next_deadline())
 
     def take(self, now: int) -> list[CanFrame]:
-        frames = self.messages.take(now)
+        slots, messages = self.slots.take(now), self.messages.take(now)
         if self._packed:
-            frames, self._packed = self._packed + frames, []
-        return frames
+            messages, self._packed = self._packed + messages, []
+        return slots + messages if slots else messages
 
     @property
     def is_pending(self) -> bool:
-        return bool(self.messages.pending)
+        return bool(self.messages.pending) or self.slots.is_pending
 
     def pack(self, now: int) -> None:
         self._packed += self.messages.take(now)
@@ -178,8 +192,10 @@ class PythonCore:
                 self.messages.on_gateway_change(now)
         if self.packs_at_once:
             self.pack(now)
-        for follow in self.followers:
-            follow(esc, events, now)
+        for wanted, follow in self.followers:
+            if events & wanted:
+                follow(esc, events, now)
+        self.slots.on_event(esc, events, now)  # what followers know may be in one
 
     def _shortest_timeout(self) -> int:
         return min(esc.settings.timeout_ns for esc in self.escs)

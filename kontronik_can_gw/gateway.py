@@ -6,7 +6,7 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.core import Core, PythonCore
+from kontronik_can_gw.core import Core, Follower, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
@@ -42,11 +42,11 @@ class Gateway:
         self.why_python: str
         """Why the core is the one in Python; empty with the one in C."""
         if packs_at_once:
-            self.core = PythonCore(escs, layout, now, silent_on_loss)
-            self.core.packs_at_once = True
+            self.core = PythonCore(escs, layout, now, silent_on_loss, packs_at_once)
             self.why_python = "a capture of 0.5.0 is replayed"
         else:
-            self.core, self.why_python = make_core(escs, layout, now, silent_on_loss)
+            slots = 0 if canopen is None else canopen.pdos
+            self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
         self.escs, self.status = self.core.escs, self.core.status
         self.nodes: Nodes | None = None
         if canopen is not None:
@@ -55,7 +55,7 @@ class Gateway:
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
         )
-        self.core.followers = [output.on_event for output in self._outputs]
+        self.core.followers = [Follower(each.events, each.on_event) for each in self._outputs]
         self.conflicts = IdConflicts(self.core.own_ids, self._outputs)
         self._being_saved: list[tuple[int, Output]] = []
         self._dropped = False
@@ -194,7 +194,7 @@ class Gateway:
         return self.core.is_pending or any(output.frames for output in self._outputs)
 
     def take_frames(self, now: int) -> list[CanFrame]:
-        """The frames to send: those of the outputs, oldest first, then those of the messages that are due, with the values of now."""
+        """The frames to send: those of the outputs, oldest first, then those of the core that are due, with the values of now."""
         frames: list[CanFrame] = []
         for output in self._outputs:
             if output.frames:
@@ -228,4 +228,4 @@ def _nodes(setup: "CanopenSetup", layout: Layout, core: Core, status: GatewaySta
 
     ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
     # settings that come over the bus hold for everything that is sent, the messages too
-    return Nodes(setup, core.escs, status, core.apply, ids)
+    return Nodes(setup, core.escs, status, core.slot, core.apply, ids)

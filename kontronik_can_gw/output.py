@@ -7,6 +7,7 @@ is integer nanoseconds of one monotonic clock.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
 
@@ -24,6 +25,9 @@ class Owner(NamedTuple):
 
 class Output:
     """One way onto the bus. Frames are appended to ``frames``, oldest first; the owner empties it."""
+
+    events = Event.ALL
+    """What ``on_event`` is given: with at least one of these. The fewer, the less the core is interrupted."""
 
     def __init__(self) -> None:
         self.frames: list[CanFrame] = []

@@ -26,6 +26,7 @@ ORDER = (
     ("output",),
     ("signals",),
     ("dbc",),
+    ("slots",),
     ("core",),
     ("native",),
     ("canopen",),

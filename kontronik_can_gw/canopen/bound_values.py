@@ -4,7 +4,7 @@ The one place of CANopen that compiles: packers of values are made once for all 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache, partial
 from typing import Any
@@ -20,8 +20,9 @@ from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Kind
 from kontronik_can_gw.esc.values import Value as EscValue
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.signals.packer import Pack, compile_pack, place
+from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.slots import SlotPlan
 
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 _EVENT_OF_PACE = {
@@ -31,22 +32,6 @@ _EVENT_OF_PACE = {
     Group.GATEWAY: Event.SECOND,
 }
 _MAX_PDOS = 256  # kept; masters can write any
-
-
-@dataclass(frozen=True, slots=True)
-class CompiledPdo:
-    """How a PDO is filled and what causes it."""
-
-    pack: Pack
-    length: int
-    triggers: int
-    """The events (of telemetry.Event) that are news to it."""
-    status_mask: int
-    """Bits of the status objects; 0 where a change of them is not what causes it."""
-    status: Pack | None
-    """Only the status objects at their places."""
-    needs_live: bool
-    """It is not sent while telemetry is lost."""
 
 
 def bits_of(variable: Variable) -> int:
@@ -63,7 +48,7 @@ def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatu
             variable.read = partial(_read, bound, variable.entry, dictionary, esc, gateway)
 
 
-def compile_pdo(mapped: Sequence[Variable], protocol: EscProtocol) -> CompiledPdo:
+def compile_pdo(mapped: Sequence[Variable], protocol: EscProtocol) -> SlotPlan:
     """The packer of a PDO with these objects."""
     if all(variable.bound is not None for variable in mapped):
         return _shared_pdo(tuple(variable.entry for variable in mapped), protocol)
@@ -71,7 +56,7 @@ def compile_pdo(mapped: Sequence[Variable], protocol: EscProtocol) -> CompiledPd
 
 
 @lru_cache(_MAX_PDOS)
-def _shared_pdo(entries: tuple[Entry, ...], protocol: EscProtocol) -> CompiledPdo:
+def _shared_pdo(entries: tuple[Entry, ...], protocol: EscProtocol) -> SlotPlan:
     """Of values only: the same for all nodes."""
     variables = [Variable(entry) for entry in entries]
     for variable in variables:
@@ -165,13 +150,15 @@ def _signal_plan(variable: Variable, at_bit: int) -> SignalPlan:
     )
 
 
-def _compile(mapped: Sequence[Variable]) -> CompiledPdo:
+def _compile(mapped: Sequence[Variable]) -> SlotPlan:
     plan = message_plan("TPDO", 0, mapped)
     is_live = carries_link = False
     status = []
+    only_python = ""
     for variable, signal in zip(mapped, plan.signals, strict=True):
         bound = variable.bound
         if bound is None:
+            only_python = f"{variable.entry.index:04X}h is no value of an ESC"
             if variable.read is not None:
                 # of a service: the error register, the error code
                 status.append(signal)
@@ -185,11 +172,12 @@ def _compile(mapped: Sequence[Variable]) -> CompiledPdo:
         triggers |= _EVENT_OF_PACE[pace]
     if status:
         triggers |= Event.LIVE | Event.LINK | Event.INFO
-    return CompiledPdo(
+    return SlotPlan(
+        message=plan,
         pack=compile_pack(plan),
-        length=plan.length,
         triggers=triggers,
-        status_mask=sum(place(signal.pieces, -1) for signal in status),
-        status=compile_pack(replace(plan, signals=tuple(status))) if status else None,
+        watched=sum(place(signal.pieces, -1) for signal in status),
+        pack_watched=compile_pack(replace(plan, signals=tuple(status))) if status else None,
         needs_live=is_live and not carries_link,
+        only_python=only_python,
     )

@@ -19,6 +19,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.slots import Slots
 
 _UNSIGNED = {
     1: (*((at.SETTINGS, sub) for sub in range(1, 9)), (at.NODE_ID, 1), (at.NODE_ID, 2)),
@@ -117,7 +118,8 @@ def _settings(
 def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     """Defaults that a download would be refused: of single services, then of the PDOs."""
     setup = CanopenSetup(eds, (NodeSettings(node_id),), (Stored(),))
-    node = Nodes(setup, [EscStream(settings, 0)], GatewayStatus(), lambda *_: None).nodes[0]
+    escs, status = [EscStream(settings, 0)], GatewayStatus()
+    node = Nodes(setup, escs, status, Slots(escs, status).add, lambda *_: None).nodes[0]
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():

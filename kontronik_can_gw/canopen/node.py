@@ -73,7 +73,7 @@ class Node:
         )
         self.lss = LssSlave(self.identity, partial(self._send, LSS_ANSWER))
         bind_values(dictionary, esc, gateway)
-        self.tpdos = Tpdos(dictionary, esc, gateway, owner.send, taken)
+        self.tpdos = Tpdos(dictionary, esc.protocol, partial(owner.slot, number), taken)
         self._esc_objects = EscObjects(
             dictionary,
             esc,
@@ -84,7 +84,7 @@ class Node:
             self.nmt.telemetry_lost,
         )
         self.can_faults = CanFaults(self.emergencies, self.nmt, self._returned, self._repeat)
-        self._timers = (self._producer, self.consumer, self.sdo, self.emergencies, self.tpdos)
+        self._timers = (self._producer, self.consumer, self.sdo, self.emergencies)
         dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
         dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS
         dictionary.written = self._on_download
@@ -167,8 +167,6 @@ class Node:
     def on_event(self, events: int, now: int) -> None:
         """Something of the ESC changed: bits of telemetry.Event."""
         self._esc_objects.on_event(events, now)
-        if self.state is NmtState.OPERATIONAL:
-            self.tpdos.on_event(events, now)
         self.set_due()
 
     def advance(self, now: int) -> None:

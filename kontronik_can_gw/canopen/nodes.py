@@ -18,14 +18,16 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import is_reset_of_all
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
+from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.reception import FrameTaker, routes
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.stream import EscStream
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.output import NEVER, Output, Owner
+from kontronik_can_gw.slots import Slot, Slots
 
 SettingsChanged = Callable[[int, EscSettings], None]
 
@@ -42,6 +44,12 @@ class CanopenSetup:
     stored: tuple[Stored, ...]
     escs: tuple[EscSettings, ...] = ()
 
+    @property
+    def pdos(self) -> int:
+        """Number of transmit PDOs of a node."""
+        indices = {entry.index for entry in self.eds.entries}
+        return len(indices.intersection(range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)))
+
     def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
         """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""
         return [esc_settings(self.dictionary(n, esc), esc) for n, esc in enumerate(escs)]
@@ -55,28 +63,34 @@ class CanopenSetup:
     ) -> "Nodes":
         """The nodes as they are after power-on, without a gateway around them: to see their COB-IDs and objects."""
         telemetry = [EscStream(settings, 0) for settings in escs]
-        nodes = Nodes(self, telemetry, GatewayStatus(), lambda _esc, _settings: None, foreign_ids)
+        status = GatewayStatus()
+        slots = Slots(telemetry, status)
+        nodes = Nodes(self, telemetry, status, slots.add, lambda *_: None, foreign_ids)
         nodes.start(0, can_open=True)
         return nodes
 
 
 class Nodes(Output):
-    """One node for each ESC.
+    """One node for each ESC. ``slot`` gives a further slot of the core for an ESC.
 
     ``foreign_ids``: 11-bit ids that the gateway sends otherwise; no PDO may be given one. ``settings_changed`` is called
     with the ESC's index and its new settings when a master writes 2100h.
     """
+
+    events = Event.INFO | Event.LINK | Event.ERRORS
 
     def __init__(
         self,
         setup: CanopenSetup,
         escs: Sequence[EscTelemetry],
         gateway: GatewayStatus,
+        slot: Callable[[int], Slot],
         settings_changed: SettingsChanged,
         foreign_ids: Mapping[int, str] | None = None,
     ) -> None:
         super().__init__()
         self.due = NEVER
+        self.slot = slot
         self.settings_changed = settings_changed
         self._foreign_ids = foreign_ids or {}
         self._routes: dict[int, list[tuple[Node, FrameTaker]]] = {}

@@ -133,7 +133,7 @@ class Bound:
 def _of_link(name: str, read: Callable[[EscTelemetry], int], pace: Group | None = None) -> Value:
     """A counter as the objects show it: since it was reset."""
     return Value(
-        *(name, "", Group.LINK, Kind.COUNT),
+        *(name, "", Group.LINK, Kind.OBJECT),
         read=lambda esc, _gateway, _now: read(esc),
         low=0,
         rolls=True,
@@ -148,7 +148,7 @@ def _age(name: str, stamp: Callable[[EscTelemetry], int | None]) -> Value:
         at = stamp(esc)
         return U16 if at is None else min(max(0, now - at) // MS, U16 - 1)
 
-    return Value(name, "ms", Group.LINK, Kind.AGE, read=read, low=0, high=U16)
+    return Value(name, "ms", Group.LINK, Kind.OBJECT, read=read, low=0, high=U16)
 
 
 def link_status(esc: EscTelemetry, gateway: GatewayStatus, _now: int) -> int:
@@ -166,9 +166,9 @@ def _firmware(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | No
     return None if main is None or sub is None else main << 8 | sub
 
 
-_FIRMWARE = Value("firmware", "", Group.INFO, Kind.BITS, read=_firmware, low=0, high=U16)
+_FIRMWARE = Value("firmware", "", Group.INFO, Kind.OBJECT, read=_firmware, low=0, high=U16)
 _LINK_VALUES = {
-    1: Value("link_status", "", Group.LINK, Kind.STATE, read=link_status, low=0, high=U8),
+    1: Value("link_status", "", Group.LINK, Kind.OBJECT, read=link_status, low=0, high=U8),
     2: _of_link("live_counter", lambda esc: esc.counters.live, Group.LIVE),
     3: _age("data_age", lambda esc: esc.live_ns),
     4: _age("info_age", lambda esc: esc.last_info_ns),

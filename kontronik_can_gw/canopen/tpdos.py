@@ -1,4 +1,4 @@
-"""All transmit PDOs of one node: made from the dictionary, set up at a reset, given events, SYNC and time."""
+"""All transmit PDOs of one node: made from the dictionary, set up at a reset, started, stopped, given SYNC."""
 
 from collections.abc import Callable, Iterator
 
@@ -7,37 +7,31 @@ from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, Taken
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, key
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import COB_ID, COMMUNICATION, MAX_TPDOS
-from kontronik_can_gw.esc.telemetry import EscTelemetry
-from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.output import NEVER
+from kontronik_can_gw.slots import Slot
 
 
 class Tpdos:
-    """Given in ascending numbers, as many as the EDS has."""
+    """Given in ascending numbers, as many as the EDS has. ``slot`` gives a further slot of the core."""
 
     def __init__(
         self,
         dictionary: Dictionary,
-        esc: EscTelemetry,
-        gateway: GatewayStatus,
-        send: Callable[[CanFrame], None],
+        protocol: EscProtocol,
+        slot: Callable[[], Slot],
         taken: Taken,
     ) -> None:
         self._dictionary = dictionary
         self._held_up_ns = -NEVER
         self._tpdos = [
-            Tpdo(number, dictionary, esc, gateway, send, taken)
+            Tpdo(number, dictionary, protocol, slot(), taken)
             for number in range(MAX_TPDOS)
             if dictionary.get(COMMUNICATION + number) is not None
         ]
 
     def __iter__(self) -> Iterator[Tpdo]:
         return iter(self._tpdos)
-
-    @property
-    def due(self) -> int:
-        return min([tpdo.due for tpdo in self._tpdos], default=NEVER)
 
     # --- configuration
 
@@ -82,12 +76,6 @@ class Tpdos:
         for tpdo in self._tpdos:
             tpdo.stop()
 
-    def on_event(self, events: int, now: int) -> None:
-        """Something of the ESC changed: bits of telemetry.Event."""
-        for tpdo in self._tpdos:
-            if events & tpdo.triggers:
-                tpdo.on_event(now)
-
     def on_download(self, variable: Variable, now: int) -> None:
         """An object was written over the bus."""
         for tpdo in self._tpdos:
@@ -106,8 +94,3 @@ class Tpdos:
         """Send once more what is sent on change only."""
         for tpdo in self._tpdos:
             tpdo.repeat(now)
-
-    def advance(self, now: int) -> None:
-        """Let time pass."""
-        for tpdo in self._tpdos:
-            tpdo.advance(now)

@@ -24,6 +24,8 @@ _EVENT_OF_PACE = {
     Group.GATEWAY: Event.NONE,
 }
 
+_CAUSES = Event.LIVE | Event.INFO | Event.LINK | Event.SECOND
+
 
 class Traits:
     """How a message is sent, by its plan; the tables of the core in C are made of the same."""
@@ -146,7 +148,7 @@ class Messages:
         """Of pending messages CYCLE, it is sent in any case, REQUEST, where it is news, or both; REQUEST of those that are missing."""
         self._followers = [
             [
-                [self._followers_of(esc, up, events) for events in range(Event.ALL + 1)]
+                [self._followers_of(esc, up, events) for events in range(_CAUSES + 1)]
                 for up in (False, True)
             ]
             for esc in range(len(escs))
@@ -172,7 +174,7 @@ class Messages:
         """Something of an ESC changed: bits of telemetry.Event."""
         state = self._escs[esc]
         up = state.live is not None
-        at_once, scheduled, paged = self._followers[esc][up][events]
+        at_once, scheduled, paged = self._followers[esc][up][events & _CAUSES]
         if paged and (not up or (events & Event.INFO and state.info is None)):
             for message in paged:
                 message.add_all_pages()  # no further event brings the others

@@ -33,6 +33,8 @@ class EscStream(EscTelemetry):
     def __init__(self, settings: EscSettings, now: int) -> None:
         self.protocol = protocol_named(settings.protocol)
         self.decoder: Decoder = self.protocol.make()
+        errors = self.protocol.by_name.get("operating_errors")
+        self._errors_at = None if errors is None else errors.word
         self.live: Data | None = None
         self.info: Data | None = None
         self.last_live: Data | None = None
@@ -165,6 +167,9 @@ class EscStream(EscTelemetry):
                 bound = self.live_bound_ns
             if self.live is not None:
                 self.drawn.add(self.live, when - before)
+        at, live = self._errors_at, self.live
+        if at is not None and (live is None or live[at] != data[at]):
+            events |= Event.ERRORS
         self.live = self.last_live = data
         self.live_ns, self.live_bound_ns = when, bound
         if self.link is not _OK and self.link is not _DEGRADED:

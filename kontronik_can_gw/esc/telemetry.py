@@ -38,7 +38,9 @@ class Event:
     LINK = 4
     SECOND = 8
     """A second is over: counters and rates are as new as they are to be had."""
-    ALL = 15
+    ERRORS = 16
+    """The operating errors are others than in the live data before, or there was none."""
+    ALL = 31
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ class Kind(Enum):
     RATE = "events a second"
     STATE = "a state of the link"
     GATEWAY = "of the gateway itself"
+    OBJECT = "as only an object of a CANopen node shows it"
 
 
 class Divisor(Enum):
@@ -310,8 +311,7 @@ def _gateway() -> Iterator[Value]:
         yield _of_gateway(name, operator.attrgetter(name), rolls=True)
 
 
-_GATEWAY_VALUES = tuple(_gateway())
-"""The same for all protocols."""
+_GATEWAY_VALUES = tuple(_gateway())  # the same for all protocols
 
 
 def _never(_esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> None:

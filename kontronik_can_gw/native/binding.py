@@ -48,7 +48,8 @@ class Plan(c.Structure):
         *((name, _p) for name in ("message", "signal", "piece", "pair", "constant")),
         *((name, _p) for name in ("esc_of", "listener", "first_listener")),
         ("words", _u32),
-        *((name, _u16) for name in ("messages", "escs", "pages")),
+        *((name, _u16) for name in ("messages", "escs", "pages", "slots")),
+        ("watched", _p),
     )
 
 
@@ -103,6 +104,13 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "kcg_turn": (None, _p),
     "kcg_watch": (c.c_int, _p),
     "kcg_turns_size": (_u32,),
+    "kcg_slot_start": (None, _p, _u32, _i64),
+    "kcg_slot_changed": (None, _p, _u32, _i64),
+    "kcg_slot_stop": (None, _p, _u32),
+    "kcg_slot_news": (None, _p, _u32, _i64),
+    "kcg_slot_send": (None, _p, _u32, _i64),
+    "kcg_slot_is_news": (c.c_int, _p, _u32),
+    "kcg_slot_sent": (_u64, _p, _u32),
 }
 
 
@@ -140,8 +148,15 @@ class Handle:
             raise NotInCore(f"fields on the wire: {tables.wire}")
         self.library = library
         self._on_event = on_event
-        self._kept = [self._array(*table) for table in tables.arrays.values()]
-        self._plan = Plan(*map(c.addressof, self._kept), *tables.counts.values())
+        arrays = {name: self._array(*table) for name, table in tables.arrays.items()}
+        self.messages, self.signals, self.pieces = (
+            arrays[name] for name in ("message", "signal", "piece")
+        )
+        self.watched = self._array(_u64, tables.watched)
+        self._kept = [*arrays.values(), self.watched]
+        self._plan = Plan(
+            *map(c.addressof, arrays.values()), *tables.counts.values(), c.addressof(self.watched)
+        )
         size = library.kcg_size(c.byref(self._plan))
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)

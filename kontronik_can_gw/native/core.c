@@ -9,7 +9,8 @@
 #define LONG_AGO (-(INT64_C(1) << 61))
 enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
 enum { KNOWN = 1, TO_SEND = 2 };             /* of a page: its last frame is known; it follows without an event */
-enum { VOLTAGE_AT = 4, CURRENT_AT = 6, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
+enum { STARTED = 1, NEWS = 2, SEEN = 4 };    /* of a slot: it has changed since its last frame; its watched bits are known */
+enum { VOLTAGE_AT = 4, CURRENT_AT = 6, ERRORS_AT = 24, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
 #define PAGES_OF(m) (KCG_PAGED ? (m)->pages : 1)
 #define WORDS_OF(m) (WORDS == 1 ? 1u : (m)->words) /* of 64 bits, that a frame has */
 
@@ -378,6 +379,8 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
         }
     }
     e->generation++;
+    if (!e->has_live || memcmp(e->live + ERRORS_AT, f->body + ERRORS_AT, 4))
+        events |= KCG_ERRORS;
     memcpy(e->live, f->body, 30);
     e->power = (int32_t)(wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16));
     e->turns = u32(f->body) != 0;
@@ -433,6 +436,7 @@ static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t no
         *x = e->rate;
         return e->rate >= 0;
     case KCG_OF_GATEWAY: *x = g->gateway[s->place]; return 1;
+    case KCG_OF_STATUS: *x = e->link | (g->gateway[KCG_GATEWAY_STATE] == s->place) << 6 | e->has_info << 7; return 1;
     default: *x = (now - g->gateway[KCG_STARTED]) / 1000000; return 1;
     }
     if (s->mask)
@@ -681,6 +685,143 @@ static void request(kcg *g, uint32_t i, int64_t now)
     }
 }
 
+/* --- slots (twin: slots.py) ------------------------------------------------------------------------------------------ */
+
+static int is_slot(const kcg *g, uint32_t i)
+{
+    return KCG_SLOTS && i >= g->plan->messages;
+}
+
+static void restart_timer(kcg *g, uint32_t i, int64_t now)
+{
+    const kcg_message *m = &g->plan->message[i];
+    g->sending[i].cycle_due = m->flags & KCG_EVENT && m->cycle ? now + m->cycle : KCG_NEVER;
+    moved(g, i);
+}
+
+static void slot_news(kcg *g, uint32_t i, int64_t now)
+{
+    kcg_sending *s = &g->sending[i];
+    if (!(s->page & STARTED))
+        return;
+    s->page |= NEWS;
+    if (!(g->plan->message[i].flags & KCG_EVENT) || s->why)
+        return;
+    if (!may_go(g, i, now)) {
+        defer(g, i, s->last + g->plan->message[i].delay);
+        return;
+    }
+    if (s->deferred != KCG_NEVER)
+        s->deferred = KCG_NEVER, moved(g, i);
+    mark(g, i, now, REQUEST);
+}
+
+static int watched_changed(kcg *g, uint32_t i, const uint64_t *bits)
+{
+    uint64_t *last = g->last + g->plan->message[i].first_word, now = *bits & g->plan->watched[i - g->plan->messages];
+    if (g->sending[i].page & SEEN && now == *last)
+        return 0;
+    g->sending[i].page |= SEEN;
+    *last = now;
+    return 1;
+}
+
+static void slot_event(kcg *g, uint32_t i, int events, int64_t now)
+{
+    const kcg_message *m = &g->plan->message[i];
+    const kcg_sending *s = &g->sending[i];
+    uint64_t bits[WORDS];
+    if (!(s->page & STARTED && m->triggers & events) || s->why)
+        return;
+    if (s->deferred == KCG_NEVER && g->plan->watched[i - g->plan->messages]) {
+        pack(g, m, 0, now, 0, bits);
+        if (!watched_changed(g, i, bits))
+            return;
+    }
+    slot_news(g, i, now);
+}
+
+/* Its timer, or what the inhibit time held back, is due. */
+static void slot_due(kcg *g, uint32_t i, int64_t now)
+{
+    kcg_sending *s = &g->sending[i];
+    if (now >= s->cycle_due)
+        restart_timer(g, i, now);
+    s->deferred = KCG_NEVER;
+    moved(g, i);
+    slot_news(g, i, now);
+}
+
+static void slot_sent(kcg *g, uint32_t i, int64_t now)
+{
+    kcg_sending *s = &g->sending[i];
+    g->last[g->plan->message[i].first_word + 1]++;
+    s->page &= STARTED | SEEN;
+    s->why = 0;
+    s->last = now;
+    s->deferred = KCG_NEVER;
+    restart_timer(g, i, now);
+}
+
+#if KCG_SLOTS
+void kcg_slot_start(kcg *g, uint32_t slot, int64_t now)
+{
+    uint32_t i = g->plan->messages + slot;
+    kcg_slot_stop(g, slot);
+    g->sending[i].page = STARTED;
+    g->sending[i].last = LONG_AGO;
+    restart_timer(g, i, now);
+    slot_news(g, i, now);
+}
+
+void kcg_slot_changed(kcg *g, uint32_t slot, int64_t now)
+{
+    uint32_t i = g->plan->messages + slot;
+    if (!(g->plan->message[i].flags & KCG_EVENT))
+        g->sending[i].deferred = KCG_NEVER;
+    restart_timer(g, i, now);
+}
+
+void kcg_slot_stop(kcg *g, uint32_t slot)
+{
+    uint32_t i = g->plan->messages + slot, at = 0;
+    kcg_sending *s = &g->sending[i];
+    s->page = 0;
+    s->cycle_due = s->deferred = KCG_NEVER;
+    moved(g, i);
+    if (!s->why)
+        return;
+    s->why = 0;
+    while (g->pending[at] != i)
+        at++;
+    memmove(g->pending + at, g->pending + at + 1, (--g->pendings - at) * sizeof *g->pending);
+}
+
+void kcg_slot_news(kcg *g, uint32_t slot, int64_t now)
+{
+    slot_news(g, g->plan->messages + slot, now);
+}
+
+void kcg_slot_send(kcg *g, uint32_t slot, int64_t now)
+{
+    uint32_t i = g->plan->messages + slot;
+    if (g->sending[i].page & STARTED && !g->sending[i].why)
+        mark(g, i, now, REQUEST);
+}
+
+int kcg_slot_is_news(const kcg *g, uint32_t slot)
+{
+    return (g->sending[g->plan->messages + slot].page & NEWS) != 0;
+}
+
+uint64_t kcg_slot_sent(const kcg *g, uint32_t slot)
+{
+    return g->last[g->plan->message[g->plan->messages + slot].first_word + 1];
+}
+#endif
+
+/* --- what makes messages pending, their frames ----------------------------------------------------------------------- */
+
 static void on_event(kcg *g, int esc, int events, int64_t now)
 {
     const kcg_plan *plan = g->plan;
@@ -689,6 +830,10 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
     for (int k = plan->first_listener[esc]; k < plan->first_listener[esc + 1]; k++) {
         uint32_t i = plan->listener[k];
         const kcg_message *m = &plan->message[i];
+        if (is_slot(g, i)) {
+            slot_event(g, i, events, now);
+            continue;
+        }
         int hit = m->triggers & events;
         if (e->has_live && m->flags & KCG_EVENT && m->triggers & KCG_LIVE)
             hit &= ~KCG_LINK; /* live frames set the pace */
@@ -749,6 +894,10 @@ static void advance_messages(kcg *g, int64_t now)
         int64_t when = due_of(g, i);
         if (when > now)
             break;
+        if (is_slot(g, i)) {
+            slot_due(g, i, now);
+            continue;
+        }
         if (s->cycle_due == when) {
             s->cycle_due += m->cycle * ((now - when) / m->cycle + 1);
             moved(g, i);
@@ -801,6 +950,8 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     }
     int place = next_place(g, i);
     pack(g, m, place, now, s->alive, bits);
+    if (is_slot(g, i))
+        watched_changed(g, i, bits);
     memset(f, 0, sizeof *f);
     f->page = (uint8_t)place;
     f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
@@ -810,14 +961,21 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
 }
 
-/* By the time since when they are pending, then by their index: as a rule they are in that order. */
+static int goes_before(const kcg *g, uint32_t i, uint32_t other)
+{
+    int64_t since = g->sending[i].since, its = g->sending[other].since;
+    if (is_slot(g, i) != is_slot(g, other))
+        return is_slot(g, i);
+    return since < its || (since == its && i < other);
+}
+
+/* Slots first, each by the time since when they are pending, then by their index: as a rule they are in that order. */
 static void sort_pending(kcg *g)
 {
     for (uint32_t k = 1; k < g->pendings; k++) {
         uint32_t i = g->pending[k];
-        int64_t since = g->sending[i].since;
         uint32_t at = k;
-        for (; at && (g->sending[g->pending[at - 1]].since > since || (g->sending[g->pending[at - 1]].since == since && g->pending[at - 1] > i)); at--)
+        for (; at && goes_before(g, i, g->pending[at - 1]); at--)
             g->pending[at] = g->pending[at - 1];
         g->pending[at] = (uint16_t)i;
     }
@@ -870,6 +1028,10 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
         uint32_t i = g->pending[k];
         const kcg_message *m = &g->plan->message[i];
         kcg_sending *s = &g->sending[i];
+        if (is_slot(g, i)) {
+            slot_sent(g, i, now);
+            continue;
+        }
         int place = next_place(g, i);
         uint8_t *page = &g->page[m->first_page + place];
         if (KCG_PAGED) {
@@ -1074,20 +1236,21 @@ void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
 
 size_t kcg_size(const kcg_plan *p)
 {
-    return KCG_SIZE(p->messages, p->escs, p->pages, p->words);
+    return KCG_SIZE(p->messages + p->slots, p->escs, p->pages, p->words);
 }
 
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now)
 {
     kcg *g = memory;
+    uint32_t messages = (uint32_t)plan->messages + plan->slots;
     memset(memory, 0, kcg_size(plan));
     crc_init();
     g->esc = (kcg_esc *)(g + 1);
     g->sending = (kcg_sending *)(g->esc + plan->escs);
-    g->last = (uint64_t *)(g->sending + plan->messages);
+    g->last = (uint64_t *)(g->sending + messages);
     g->heap = (uint16_t *)(g->last + plan->words);
-    g->pending = g->heap + plan->messages;
-    g->page = (uint8_t *)(g->pending + plan->messages);
+    g->pending = g->heap + messages;
+    g->page = (uint8_t *)(g->pending + messages);
     g->report = g->page + plan->pages;
     g->plan = plan;
     g->gateway[KCG_STARTED] = g->second = now;
@@ -1100,7 +1263,7 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
         e->window_ns = now;
         e->cells = e->settings.cells;
     }
-    for (uint32_t i = 0; i < plan->messages; i++) {
+    for (uint32_t i = 0; i < messages; i++) {
         kcg_sending *s = &g->sending[i];
         s->last = LONG_AGO;
         s->deferred = KCG_NEVER;

@@ -27,6 +27,9 @@
 #ifndef KCG_SLICES
 #define KCG_SLICES 0 /* tables of the CRC-32: none but 64 bytes, 1 (1 kB of RAM) or, for 64-bit machines, 8 (8 kB) */
 #endif
+#ifndef KCG_SLOTS
+#define KCG_SLOTS 0  /* 1: slots (kcg_slot_start ...) */
+#endif
 #ifndef KCG_SOURCE
 #define KCG_SOURCE 0 /* a number of these sources, for kcg_sizes */
 #endif
@@ -37,7 +40,7 @@ enum { KCG_HELD = 43, KCG_BODY = 33, KCG_LONGEST = 44, KCG_PAGES = 64 };
 #define KCG_NEVER INT64_MAX
 
 /* Events of an ESC (telemetry.Event), and states of its link (telemetry.LinkState). */
-enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8 };
+enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8, KCG_ERRORS = 16 };
 enum { KCG_NEVER_SEEN, KCG_SEARCHING, KCG_OK, KCG_DEGRADED, KCG_LOST, KCG_PORT_ERROR };
 
 typedef struct { /* as SocketCAN's struct can_frame and canfd_frame */
@@ -59,7 +62,8 @@ enum {
     KCG_OF_RATE,
     KCG_OF_GATEWAY, /* `place`: index into kcg.gateway */
     KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED] */
-    KCG_OF_ALIVE    /* the message's alive counter, up to `div` */
+    KCG_OF_ALIVE,   /* the message's alive counter, up to `div` */
+    KCG_OF_STATUS   /* link state, bit 6: the gateway's state is `place`, bit 7: info is fresh */
 };
 enum { /* of kcg.gateway; KCG_ESCS_OK is the core's, KCG_STARTED kcg_init's, the others are the owner's */
     KCG_ESCS_OK, KCG_GATEWAY_STATE, KCG_CAN_STATE, KCG_ESC_COUNT, KCG_SENT_FRAMES, KCG_REPLACED_FRAMES, KCG_SEND_FAILURES,
@@ -105,7 +109,8 @@ typedef struct {
     const uint16_t *esc_of;
     const uint16_t *listener, *first_listener; /* of ESC i: listener[first_listener[i]] up to the next one's */
     uint32_t words;                            /* of all constants */
-    uint16_t messages, escs, pages;
+    uint16_t messages, escs, pages, slots;     /* the rows of slots follow those of the messages */
+    const uint64_t *watched;                   /* of each slot: the bits of which only a change is news; 0: each event of `triggers` is */
 } kcg_plan;
 
 typedef struct { /* what is read most comes first: a small machine's instructions reach it in two bytes */
@@ -126,7 +131,7 @@ typedef struct { /* what is read most comes first: a small machine's instruction
 
 typedef struct {
     uint16_t place_in_heap, alive;
-    uint8_t page, pages_to_send, cycle_deferred, why;
+    uint8_t page, pages_to_send, cycle_deferred, why; /* page: of a slot its state */
     int64_t last, cycle_due, deferred, since;  /* KCG_NEVER: no cycle, nothing deferred */
 } kcg_sending;
 
@@ -136,7 +141,7 @@ typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;
     kcg_sending *sending;
-    uint64_t *last;                            /* bits of the last frame of each page, of messages that are sent on change */
+    uint64_t *last;                            /* bits of the last frame of each page, of messages that are sent on change; of a slot the watched ones, and how many were sent */
     uint8_t *page, *report;                    /* of each page of all messages: its last frame is known, it is to follow; ESCs with events to be followed, oldest first */
     uint16_t *heap, *pending;                  /* messages by their next deadline; those to be handed over */
     uint32_t pendings, taken, heaped, reports;
@@ -173,6 +178,16 @@ void kcg_stop(kcg *g, int64_t now);
 /* Frames of what is pending, in their order, `max` at most; they stay pending until kcg_sent says how many of them were taken. */
 uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
+/* Slots (twin: slots.py): messages of one page, ESC and 8 bytes, with KCG_SLOTS, that their owner starts and stops; `cycle` runs from frame to
+   frame. The owner may write a slot's rows of `message`, `signal` and `piece` whenever it is stopped; while it is started, all but the
+   signals, and then calls kcg_slot_changed. */
+void kcg_slot_start(kcg *g, uint32_t slot, int64_t now);
+void kcg_slot_changed(kcg *g, uint32_t slot, int64_t now);
+void kcg_slot_stop(kcg *g, uint32_t slot);
+void kcg_slot_news(kcg *g, uint32_t slot, int64_t now);
+void kcg_slot_send(kcg *g, uint32_t slot, int64_t now);
+int kcg_slot_is_news(const kcg *g, uint32_t slot);
+uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
 uint64_t kcg_count(const kcg_esc *e, int what);
 uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
 /* For a caller that cannot see structures: 0 KCG_SOURCE, then the sizes of signal, message, settings, plan, ESC and frame. */

@@ -3,23 +3,29 @@
 from collections.abc import Sequence
 from typing import Any, cast
 
-from kontronik_can_gw.core import OnEvent
+from kontronik_can_gw.core import Follower
 from kontronik_can_gw.dbc.messages import own_ids
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Handle
+from kontronik_can_gw.native.slots import NativeSlot, reserve
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.slots import Slot, Slots
 
 _OF_ITS_OWN = Event.SECOND | Event.LINK
 """Followed here in any case."""
 
 
 class NativeCore:
-    """As Core. NotInCore where the core in C cannot express the layout or an ESC's settings."""
+    """As Core. NotInCore where the core in C cannot express the layout or an ESC's settings.
+
+    ``slots``: of each ESC in C; further ones, and those with values that C does not know, are in Python and are handed over first.
+    """
 
     language = "C"
 
@@ -30,31 +36,56 @@ class NativeCore:
         layout: Layout,
         now: int,
         silent: bool,
+        slots: int = 0,
     ) -> None:
-        self._handle = Handle(library, Tables(layout, escs, silent), now, self._follow)
+        tables = Tables(layout, escs, silent)
+        self._places = reserve(tables, slots)
+        self._handle = Handle(library, tables, now, self._follow)
         self.status = cast(GatewayStatus, NativeStatus(self._handle.gateway))
         self.status.esc_count = len(escs)
         self.escs = [NativeEsc(*pair) for pair in zip(escs, self._handle.escs, strict=True)]
         self.own_ids: dict[int, Owner] = own_ids(layout)
-        self._followers: Sequence[OnEvent] = ()
-        self._handle.report_only(_OF_ITS_OWN)
+        self._slots = Slots(self.escs, self.status)
+        self._followers: Sequence[Follower] = ()
+        self._choose_events()
         self.link_changes: list[int] = []
         self.shortest_timeout_ns = self._shortest_timeout()
         self.packs_at_once = False
         handle = self._handle
-        self.receive, self.port, self.advance = handle.receive, handle.port, handle.advance
-        self.expire, self.next_deadline = handle.expire, handle.next_deadline
+        self.receive, self.port, self.expire = handle.receive, handle.port, handle.expire
         self.gateway_changed, self.repeat = handle.gateway_changed, handle.repeat
-        self.stop, self.take = handle.stop, handle.take
+        self.stop = handle.stop
 
     @property
-    def followers(self) -> Sequence[OnEvent]:
+    def followers(self) -> Sequence[Follower]:
         return self._followers
 
     @followers.setter
-    def followers(self, given: Sequence[OnEvent]) -> None:
+    def followers(self, given: Sequence[Follower]) -> None:
         self._followers = given
-        self._handle.report_only(Event.ALL if given else _OF_ITS_OWN)
+        self._choose_events()
+
+    def _choose_events(self) -> None:
+        """Be given the events that somebody in Python follows."""
+        events = _OF_ITS_OWN | self._slots.triggers
+        for wanted, _ in self._followers:
+            events |= wanted
+        self.reports_live = bool(events & Event.LIVE)
+        """True while somebody follows each live frame."""
+        self._handle.report_only(events)
+
+    def slot(self, esc: int) -> Slot:
+        places, python = self._places[esc], self._slots.add(esc)
+        place = places.pop(0) if places else None
+        protocol = self.escs[esc].settings.protocol
+        return NativeSlot(self._handle, place, esc, protocol, python, self._choose_events)
+
+    def advance(self, now: int) -> None:
+        self._handle.advance(now)
+        self._slots.advance(now)
+
+    def next_deadline(self) -> int:
+        return min(self._handle.next_deadline(), self._slots.next_deadline())
 
     def turns(self) -> Turns:
         """Whole turns of a loop with this core."""
@@ -65,13 +96,11 @@ class NativeCore:
         self._handle.follow(found, now)
 
     @property
-    def reports_live(self) -> bool:
-        """True while somebody follows each live frame."""
-        return bool(self._followers)
-
-    @property
     def is_pending(self) -> bool:
-        return self._handle.is_pending
+        return self._handle.is_pending or self._slots.is_pending
+
+    def take(self, now: int) -> list[CanFrame]:
+        return self._slots.take(now) + self._handle.take(now)
 
     def apply(self, esc: int, settings: EscSettings) -> None:
         self._handle.apply(esc, settings)
@@ -85,8 +114,10 @@ class NativeCore:
         self.escs[esc].follow(events)
         if events & Event.LINK:
             self.link_changes.append(esc)
-        for follow in self._followers:
-            follow(esc, events, now)
+        for wanted, follow in self._followers:
+            if events & wanted:
+                follow(esc, events, now)
+        self._slots.on_event(esc, events, now)
 
     def _shortest_timeout(self) -> int:
         return min(esc.settings.timeout_ns for esc in self.escs)

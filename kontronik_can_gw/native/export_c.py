@@ -11,7 +11,7 @@ from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.native.compile import FOLDER
+from kontronik_can_gw.native.objects import FOLDER
 from kontronik_can_gw.native.rows import NotInCore, Settings
 from kontronik_can_gw.native.tables import HAS_CRC, REAL, Tables
 from kontronik_can_gw.signals.plan import Layout

@@ -45,15 +45,16 @@ def make_core(
     layout: Layout,
     now: int,
     silent: bool,
+    slots: int = 0,
 ) -> Made:
-    """The core for these ESCs and this layout."""
+    """The core for these ESCs and this layout. ``slots`` of each ESC have room in C."""
     found, why = library()
     if found is not None:
         from kontronik_can_gw.native.core import NativeCore
         from kontronik_can_gw.native.rows import NotInCore
 
         try:
-            return Made(NativeCore(found, escs, layout, now, silent), "")
+            return Made(NativeCore(found, escs, layout, now, silent, slots), "")
         except NotInCore as error:
             why = str(error)
     return Made(PythonCore(escs, layout, now, silent), why)

@@ -11,8 +11,8 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 NOT_BUILT = FOLDER / "not_built.txt"
 """Why the installation made no object; hatch_build.py writes it."""
-OPTIONS = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_FOUND=512", "-DKCG_SLICES=8")
-"""What the objects are built with: CAN FD and floats, for reads of 16 KiB."""
+OPTIONS = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_SLOTS=1", "-DKCG_FOUND=512", "-DKCG_SLICES=8")
+"""What the objects are built with: CAN FD, floats and slots, for reads of 16 KiB."""
 _SEALED = 0x2144_DF1C
 """CRC-32 of anything that its own CRC-32 follows."""
 _IN_32_BITS = {"x86_64": "i686", "aarch64": "armv7l", "armv8l": "armv7l"}

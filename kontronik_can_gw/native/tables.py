@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from ctypes import c_uint16, c_uint64
 from dataclasses import replace
 from fractions import Fraction
+from itertools import accumulate
 from typing import Any
 
 from kontronik_can_gw.dbc.messages import Traits
@@ -19,13 +20,15 @@ from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 (
-    OF_LIVE, OF_INFO, OF_LAST, OF_POWER, OF_COUNT, OF_ENERGY, OF_RUN_TIME, OF_AGE, OF_RATE, OF_GATEWAY, OF_UPTIME, OF_ALIVE
-) = range(12)  # fmt: skip
+    OF_LIVE, OF_INFO, OF_LAST, OF_POWER, OF_COUNT, OF_ENERGY, OF_RUN_TIME, OF_AGE, OF_RATE, OF_GATEWAY, OF_UPTIME, OF_ALIVE,
+    OF_STATUS,
+) = range(13)  # fmt: skip
 WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
 COUNTS = (
@@ -49,6 +52,8 @@ MAX_COUNT = 1 << 48
 MAX_POLES = MAX_CELLS = 0xFF
 MAX_GEAR = 0xF_FFFF
 """Of numerator and denominator of a gear in its lowest terms: 9.81818 has 490909 and 50000."""
+MAX_ROWS = 0xFFFF
+"""Of a table that is addressed by 16 bits."""
 MAX_ALIVE = 1 << 16
 MAX_BITS = 64
 _DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
@@ -85,8 +90,11 @@ class Tables:
         for settings in escs:
             if (wire := protocol_named(settings.protocol).wire) is not None:
                 self.wire = " ".join(codes for codes, _ in wire)
+        self.watched: list[int] = []
+        """Of each slot."""
+        self.listeners_of: list[list[int]] = [[] for _ in escs]
+        """The messages that follow events of each ESC."""
         self._wire = [_places(protocol_named(esc.protocol)) for esc in escs]
-        listeners: list[list[int]] = [[] for _ in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
             raise NotInCore(f"{len(escs)} ESCs, {len(layout.messages)} messages")
@@ -100,11 +108,19 @@ class Tables:
             self._add(plan, silent, starts[index])
             for esc in plan.escs:
                 if self.messages[-1].triggers:
-                    listeners[esc].append(index)
-        self.listeners = [index for each in listeners for index in each]
-        if max(len(self.signals), self.pages, len(self.listeners)) > 0xFFFF:
+                    self.listeners_of[esc].append(index)
+        if max(len(self.signals), self.pages, len(self.listeners)) > MAX_ROWS:
             raise NotInCore(f"{len(self.signals)} signals, {self.pages} pages")
-        self.first_listeners = [sum(map(len, listeners[:n])) for n in range(len(escs) + 1)]
+
+    @property
+    def listeners(self) -> list[int]:
+        """``listeners_of`` all ESCs, one after the other."""
+        return [index for each in self.listeners_of for index in each]
+
+    @property
+    def first_listeners(self) -> list[int]:
+        """Where those of each ESC begin in ``listeners``, and where the last end."""
+        return [*accumulate(map(len, self.listeners_of), initial=0)]
 
     @property
     def arrays(self) -> dict[str, tuple[Any, list[Any]]]:
@@ -123,8 +139,10 @@ class Tables:
     @property
     def counts(self) -> dict[str, int]:
         """The numbers of kcg_plan in its order."""
-        words, messages, escs = map(len, (self.constants, self.messages, self.settings))
-        return {"words": words, "messages": messages, "escs": escs, "pages": self.pages}
+        tables = self.constants, self.messages, self.settings, self.watched
+        words, messages, escs, slots = map(len, tables)
+        counts = {"words": words, "messages": messages - slots, "escs": escs, "pages": self.pages}
+        return counts | {"slots": slots}
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.signals if s.role is Role.CRC), None)
@@ -187,10 +205,11 @@ class Tables:
 
     def _source(self, row: Any, value: Value, esc: int | None) -> None:
         row.divisor = _DIVISORS[value.divisor]
+        name = _NAME_OF.get(value.name, value.name)
         if value.kind in (Kind.WIRE, Kind.BITS):
             if not value.supplied or esc is None:
                 raise NotInCore("not supplied by this ESC's protocol")
-            is_info = value.group is Group.INFO
+            is_info = value.group is Group.INFO or value.last
             row.kind = OF_LAST if value.last else OF_INFO if is_info else OF_LIVE
             row.place, row.wire = self._wire[esc][is_info][value.words[0]]
             row.not_on = sum(1 << device for device in value.not_on)
@@ -204,8 +223,10 @@ class Tables:
             row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
         elif value.kind in _KINDS:
             row.kind = _KINDS[value.kind]
-        elif _COUNT_OF.get(value.name, value.name) in COUNTS:
-            row.kind, row.place = OF_COUNT, COUNTS.index(_COUNT_OF.get(value.name, value.name))
+        elif value.kind is Kind.OBJECT and value.name == "link_status":
+            row.kind, row.place = OF_STATUS, GatewayState.REPLAY
+        elif name in COUNTS and (value.kind is not Kind.OBJECT or value.name in _NAME_OF):
+            row.kind, row.place = OF_COUNT, COUNTS.index(name)
         else:
             raise NotInCore(f"no source {value.name}")
 
@@ -243,7 +264,8 @@ _KINDS = {
     Kind.AGE: OF_AGE,
     Kind.RATE: OF_RATE,
 }
-_COUNT_OF = {"received_bytes": "bytes"}
+_NAME_OF = {"received_bytes": "bytes", "live_counter": "live_frames"}
+"""Of values that are one of COUNTS under another name."""
 
 
 def settings_of(esc: EscSettings) -> Any:

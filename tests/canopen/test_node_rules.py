@@ -43,10 +43,10 @@ def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
     numbers, speed_only = range(1, 5), (254, 0, 0, 0x20000120)
     tpdos = {place: change for n in numbers for place, change in tpdo(n, *speed_only).items()}
     bench = Bench(changes={**QUIET, **tpdos}).start()
-    speeds = range(1, 200)
     bench.now = 10 * MS
-    bench.uart(b"".join(live(electrical_speed=s) for s in speeds[:20]))  # in one read
-    for speed in speeds[20:]:
+    bench.uart(b"".join(live(electrical_speed=s) for s in range(1, 21)))  # in one read: the newest
+    speeds = range(20, 200)
+    for speed in speeds[1:]:
         bench.now += 10 * MS
         bench.uart(live(electrical_speed=speed))
     sent = [(frame.can_id, int.from_bytes(frame.data, "little")) for frame in bench.take()]

@@ -3,6 +3,7 @@
 import random
 from collections.abc import Sequence
 from fractions import Fraction
+from functools import cache
 from itertools import zip_longest
 from typing import Any
 
@@ -18,18 +19,25 @@ from packer_oracle import (
     read,
 )
 
-from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.canopen.bound_values import bits_of, compile_pdo
+from kontronik_can_gw.canopen.dictionary import Variable
+from kontronik_can_gw.canopen.eds import load
+from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core import Follower, PythonCore
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import GATEWAY, MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.slots import Slot, SlotSettings
 
 START = 1_000 * SECOND
 _STEPS = (0, 1_000, 100_000, MS, 2 * MS, 5 * MS, 10 * MS, 10 * MS, 10 * MS, 50 * MS, 260 * MS)
@@ -126,6 +134,60 @@ STATE = (
 )
 
 
+class BothSlots:
+    """A slot of both cores, given the same calls. It carries random objects of the shipped EDS."""
+
+    def __init__(self, chance: random.Random, *both: Slot) -> None:
+        self.chance = chance
+        self.both = both
+        self.settings: SlotSettings | None = self._random()
+        self.started = False
+        self._call("configure", self.settings, START)
+
+    def act(self, now: int) -> None:
+        """Something is done with it: as a rule it is started."""
+        chance, what = self.chance, self.chance.random()
+        if what < 0.3:
+            other = None if chance.random() < 0.3 else self._random()
+            if self.started and self.settings is not None and other is not None:
+                other = other._replace(plan=self.settings.plan)  # only a stopped one is filled anew
+            self.settings = other
+            self._call("configure", other, now)
+        elif what < 0.6 or not self.started:
+            self.started = True
+            self._call("start", now)
+        elif what < 0.7:
+            self.started = False
+            self._call("stop")
+        else:
+            self._call(chance.choice(("news", "send")), now)
+
+    def _call(self, name: str, *arguments: Any) -> None:
+        for slot in self.both:
+            getattr(slot, name)(*arguments)
+
+    def _random(self) -> SlotSettings:
+        chance = self.chance
+        mapped: list[Variable] = []
+        for variable in chance.sample(_mappable(), chance.randint(1, 8)):
+            if sum(map(bits_of, [*mapped, variable])) <= 64:
+                mapped.append(variable)
+        times = (chance.choice((0, 0, 5, 20, 25)) * MS, chance.choice((0, 0, 7, 500)) * MS)
+        plan = compile_pdo(mapped, PROTOCOLS[0])
+        return SlotSettings(plan, chance.randrange(1, 0x700), chance.random() < 0.8, *times)
+
+
+@cache
+def _mappable() -> list[Variable]:
+    eds = load(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
+    found = []
+    for entry in eds.entries:
+        if entry.mappable and (entry.index, entry.sub) in BINDINGS:
+            found.append(Variable(entry))
+            found[-1].bound = BINDINGS[entry.index, entry.sub]
+    return found
+
+
 class Both:
     """Both cores, given the same calls."""
 
@@ -144,12 +206,18 @@ class Both:
             *(self.escs, self.layout, self.now, self.silent),
         )
         self.status = self.python.status
+        slots = chance.choice((0, 1, 3))
         self.native = NativeCore(
             library,
-            *(self.escs, self.layout, self.now, self.silent),
+            *(self.escs, self.layout, self.now, self.silent, slots),
         )
-        self.python.followers = [lambda *event: self.events[0].append(event)]
-        self.native.followers = [lambda *event: self.events[1].append(event)]
+        self.slots = [
+            BothSlots(chance, self.python.slot(esc), self.native.slot(esc))
+            for esc in range(len(self.escs))
+            for _ in range(slots)
+        ]
+        self.python.followers = [Follower(Event.ALL, lambda *event: self.events[0].append(event))]
+        self.native.followers = [Follower(Event.ALL, lambda *event: self.events[1].append(event))]
         self.count = 0
         self._tell()
 
@@ -167,6 +235,9 @@ class Both:
 
     def compare(self) -> None:
         frames, others = self.python.take(self.now), self.native.take(self.now)
+        if any(slot.both[1].why_python for slot in self.slots):  # type: ignore[attr-defined]
+            frames.sort()  # such slots are handed over before the others
+            others.sort()
         assert frames == others, _difference(frames, others)
         self.count += len(frames)
         assert self.events[0] == self.events[1], self.events
@@ -174,6 +245,9 @@ class Both:
             listed.clear()
         assert self.python.link_changes == self.native.link_changes
         assert self.python.next_deadline() == self.native.next_deadline()
+        for slot in self.slots:
+            assert slot.both[0].sent == slot.both[1].sent
+            assert slot.both[0].is_news == slot.both[1].is_news
         for esc, other in zip(self.python.escs, self.native.escs, strict=True):
             for name in STATE:
                 assert getattr(esc, name) == getattr(other, name), name
@@ -203,6 +277,8 @@ class Both:
                     setattr(self.status, name, getattr(other, name))
             self._tell()
             self.call("gateway_changed", self.now)
+        elif what < 0.24 and self.slots:
+            chance.choice(self.slots).act(self.now)
         else:
             self._receive(esc)
         self.call("advance", self.now)

@@ -1,5 +1,7 @@
 """The core in C gives what the core in Python gives; gcc and clang build it without a warning, for a small machine too."""
 
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +69,7 @@ def test_every_source_builds_without_a_warning(tmp_path: Path, program: str) -> 
 
 @pytest.mark.parametrize("program", COMPILERS)
 @pytest.mark.parametrize(
-    "options", ["", "-DKCG_SLICES=0 -DKCG_LEGACY=0", "-DKCG_SLICES=1 -DKCG_FOUND=1"]
+    "options", ["", "-DKCG_SLICES=0 -DKCG_LEGACY=0", "-DKCG_SLICES=1 -DKCG_FOUND=1 -DKCG_SLOTS=1"]
 )
 def test_the_core_builds_for_a_small_machine(tmp_path: Path, program: str, options: str) -> None:
     found = there(program)
@@ -90,4 +92,4 @@ def test_no_byte_outside_its_memory_and_nothing_undefined(tmp_path: Path) -> Non
 
 def test_an_object_with_other_tables_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(WrongObject, match="made of other sources"):
-        load(built(tmp_path / "small.so", "-DKCG_DATA=8"))
+        load(built(tmp_path / "small.so", "-DKCG_DATA=8", "-DKCG_SLOTS=1"))

@@ -1,0 +1,177 @@
+"""Slots of the core in C (core.h, kcg_slot_start ...): their rows in its tables, and each as its owner sees it."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.native.binding import Handle
+from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
+from kontronik_can_gw.native.tables import EVENT, MAX_ROWS, SILENT, Tables
+from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.slots import PythonSlot, SlotPlan, SlotSettings
+
+MAX_SIGNALS = 8
+"""Of a slot."""
+_MAX_PLANS = 256
+"""Kept."""
+
+
+class Place(NamedTuple):
+    """Where a slot's rows are: its number, its message, its first signal and piece."""
+
+    number: int
+    message: int
+    signal: int
+    piece: int
+
+
+def reserve(tables: Tables, slots: int) -> list[list[Place]]:
+    """Add empty rows for ``slots`` of each ESC, or as many as there is room for. Returns the places of each ESC."""
+    count = len(tables.listeners_of)
+    used = max(len(tables.signals), len(tables.messages), len(tables.listeners), tables.pages)
+    slots = min(slots, (MAX_ROWS - used) // (MAX_SIGNALS * count))
+    places = [[_add(tables, esc) for _ in range(slots)] for esc in range(count)]
+    for own, listeners in zip(places, tables.listeners_of, strict=True):
+        listeners[:0] = [place.message for place in own]
+    return places
+
+
+def _add(tables: Tables, esc: int) -> Place:
+    signal, piece = len(tables.signals), len(tables.pieces)
+    place = Place(len(tables.watched), len(tables.messages), signal, piece)
+    tables.messages.append(
+        Message(
+            words=1,
+            pages=1,
+            first_signal=signal,
+            first_page=tables.pages,
+            first_word=len(tables.constants),
+            first_esc=len(tables.esc_of),
+            escs=1,
+        )
+    )
+    tables.signals += [Signal() for _ in range(MAX_SIGNALS)]
+    tables.pieces += [Piece() for _ in range(MAX_SIGNALS)]
+    tables.constants += [0, 0]
+    tables.pages += 1
+    tables.esc_of.append(esc)
+    tables.watched.append(0)
+    return place
+
+
+@lru_cache(_MAX_PLANS)
+def _rows(plan: SlotPlan, protocol: str) -> Tables:
+    """The rows of a slot for ESC 0. NotInCore where the core in C cannot express it."""
+    if plan.only_python:
+        raise NotInCore(plan.only_python)
+    tables = Tables(Layout("", "", (plan.message,)), (EscSettings(protocol=protocol),))
+    if max(len(tables.signals), len(tables.pieces)) > MAX_SIGNALS or tables.pairs:
+        raise NotInCore(f"{len(tables.signals)} values")
+    return tables
+
+
+class NativeSlot:
+    """As Slot: in C where it can be, else ``python`` is at work. ``changed`` is called where that may follow other events."""
+
+    def __init__(
+        self,
+        handle: Handle,
+        place: Place | None,
+        esc: int,
+        protocol: str,
+        python: PythonSlot,
+        changed: Callable[[], None],
+    ) -> None:
+        self.why_python = ""
+        """Why its settings are for the one in Python; empty else."""
+        self._handle = handle
+        self._place = place
+        self._esc = esc
+        self._protocol = protocol
+        self._python = python
+        self._changed = changed
+        self._started = False
+        self._in_c = False
+
+    @property
+    def sent(self) -> int:
+        return self._python.sent + (self._call("sent") if self._place is not None else 0)
+
+    @property
+    def is_news(self) -> bool:
+        return bool(self._call("is_news")) if self._in_c else self._python.is_news
+
+    def configure(self, settings: SlotSettings | None, now: int) -> None:
+        was_in_c, was_in_python = self._in_c, bool(self._python.triggers)
+        self._in_c = settings is not None and self._write(settings)
+        self._python.configure(None if self._in_c else settings, now)
+        if was_in_c and not self._in_c:
+            self._call("stop")
+        elif self._in_c and self._started:
+            self._call("changed" if was_in_c else "start", now)
+        if was_in_python or self._python.triggers:
+            self._changed()
+
+    def start(self, now: int) -> None:
+        self._started = True
+        self._python.start(now)
+        if self._in_c:
+            self._call("start", now)
+        if self._python.triggers:
+            self._changed()
+
+    def stop(self) -> None:
+        self._started = False
+        was_in_python = bool(self._python.triggers)
+        self._python.stop()
+        if self._in_c:
+            self._call("stop")
+        if was_in_python:
+            self._changed()
+
+    def news(self, now: int) -> None:
+        if self._in_c:
+            self._call("news", now)
+        else:
+            self._python.news(now)
+
+    def send(self, now: int) -> None:
+        if self._in_c:
+            self._call("send", now)
+        else:
+            self._python.send(now)
+
+    def _call(self, name: str, *arguments: int) -> int:
+        assert self._place is not None
+        handle = self._handle
+        function = getattr(handle.library, f"kcg_slot_{name}")
+        found: int = function(handle.core, self._place.number, *arguments)
+        return found
+
+    def _write(self, settings: SlotSettings) -> bool:
+        """Write the rows; False where the slot cannot be in C."""
+        plan, place, handle = settings.plan, self._place, self._handle
+        try:
+            if place is None:
+                raise NotInCore("no room")
+            rows = _rows(plan, self._protocol)
+        except NotInCore as error:
+            self.why_python = str(error)
+            return False
+        self.why_python = ""
+        for number, row in enumerate(rows.signals):
+            handle.signals[place.signal + number] = row
+            signal = handle.signals[place.signal + number]
+            signal.first_piece += place.piece
+            if row.esc == 0:
+                signal.esc = self._esc
+        for number, row in enumerate(rows.pieces):
+            handle.pieces[place.piece + number] = row
+        handle.watched[place.number] = plan.watched
+        message: Any = handle.messages[place.message]
+        message.id, message.length = settings.can_id, plan.message.length
+        message.flags = EVENT * settings.by_event | SILENT * plan.needs_live
+        message.triggers, message.signals = plan.triggers, len(rows.signals)
+        message.cycle, message.delay = settings.timer_ns, settings.inhibit_ns
+        return True

@@ -1,0 +1,280 @@
+"""Slots of the core: frames that an output sets up, changes and stops while the core runs, as a CANopen node its transmit PDOs.
+
+What makes a slot's frame pending: events of its ESC, its timer (which each frame sent restarts), its owner. It is packed when it is handed
+over, so the newest wins; the inhibit time is the minimum distance between two. A slot with ``watched`` bits is made pending by events that
+change these only. Slots are handed over before the messages of the layout: in the order in which they became due, then of their number.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import NamedTuple, Protocol
+
+from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.output import NEVER
+from kontronik_can_gw.signals.packer import Pack
+from kontronik_can_gw.signals.plan import MessagePlan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlotPlan:
+    """How a slot is filled and what causes it. ESC 0 of the plan is the slot's."""
+
+    message: MessagePlan
+    """Of up to 64 bits. Its id and send type do not matter."""
+    pack: Pack
+    triggers: int
+    """The events (of telemetry.Event) that are news to it."""
+    watched: int
+    """Bits of which only a change is news; 0: any event of ``triggers`` is."""
+    pack_watched: Pack | None
+    """Only what is in ``watched``."""
+    needs_live: bool
+    """It is not sent while telemetry is lost."""
+    only_python: str = ""
+    """What in it no core in C can know; empty else."""
+
+
+class SlotSettings(NamedTuple):
+    """What a slot sends, and when."""
+
+    plan: SlotPlan
+    can_id: int
+    """11 bits."""
+    by_event: bool
+    """Events and the timer make it pending; else only ``Slot.send`` does."""
+    inhibit_ns: int
+    timer_ns: int
+    """It is sent this long after its last frame at the latest; 0: never for that reason."""
+
+
+class Slot(Protocol):
+    """A slot, as its owner sees it. At first it is stopped and has no settings."""
+
+    @property
+    def sent(self) -> int:
+        """Frames so far."""
+
+    @property
+    def is_news(self) -> bool:
+        """True if what is in it has changed since its last frame."""
+
+    def configure(self, settings: SlotSettings | None, now: int) -> None:
+        """Other settings, or none. A slot that is given some while it is started begins as at its start."""
+
+    def start(self, now: int) -> None:
+        """Send from now on, at once for the first time where it is sent by event."""
+
+    def stop(self) -> None:
+        """Send nothing any more."""
+
+    def news(self, now: int) -> None:
+        """What is in it has changed without an event of the ESC."""
+
+    def send(self, now: int) -> None:
+        """Let it be handed over, whatever its inhibit time is."""
+
+
+class PythonSlot:
+    """A slot in plain Python. ``number``: its place among all."""
+
+    def __init__(self, owner: "Slots", esc: int, number: int) -> None:
+        self.number = number
+        self.sent = 0
+        self.is_news = False
+        self.due = NEVER
+        """When ``advance`` has something to do."""
+        self.triggers = 0
+        """The events that it is to be given."""
+        self._owner = owner
+        self._esc = esc
+        self._escs = (owner.escs[esc],)
+        self._settings: SlotSettings | None = None
+        self._started = False
+        self._last_ns = -NEVER
+        self._last_watched = -1
+        self._timer_due = self._deferred_until = NEVER
+
+    def configure(self, settings: SlotSettings | None, now: int) -> None:
+        before, self._settings = self._settings, settings
+        if not self._started:
+            return
+        if settings is None:
+            self._rest()
+        elif before is None:
+            self.start(now)
+        else:
+            self.triggers = settings.plan.triggers
+            if not settings.by_event:
+                self._deferred_until = NEVER
+            self._restart_timer(settings, now)
+            self._set_due()
+
+    def start(self, now: int) -> None:
+        self._rest()
+        self._started = True
+        self._last_ns = -NEVER
+        self._last_watched = -1
+        if (settings := self._settings) is not None:
+            self.triggers = settings.plan.triggers
+            self._restart_timer(settings, now)
+            self.news(now)
+        self._set_due()
+
+    def stop(self) -> None:
+        self._started = False
+        self._rest()
+
+    def news(self, now: int) -> None:
+        settings = self._settings
+        if not self._started or settings is None:
+            return
+        self.is_news = True
+        if not settings.by_event or self.number in self._owner.pending:
+            return
+        if now >= (until := self._last_ns + settings.inhibit_ns):
+            self._deferred_until = NEVER
+            self._owner.let_go(self, now)
+        elif self._deferred_until == NEVER:
+            self._deferred_until = until
+        self._set_due()
+
+    def send(self, now: int) -> None:
+        if self._started and self._settings is not None:
+            self._owner.let_go(self, now)
+
+    def on_event(self, now: int) -> None:
+        """An event of ``triggers`` happened."""
+        if (settings := self._settings) is None or self.number in self._owner.pending:
+            return
+        if self._deferred_until == NEVER and (pack := settings.plan.pack_watched) is not None:
+            watched = pack(self._escs, self._owner.status, now, 0, 0)
+            if watched == self._last_watched:
+                return
+            self._last_watched = watched
+        self.news(now)
+
+    def advance(self, now: int) -> None:
+        """The timer, or what the inhibit time held back: one of them is due."""
+        if now >= self._timer_due:
+            assert self._settings is not None
+            self._restart_timer(self._settings, now)
+        self._deferred_until = NEVER
+        self.news(now)
+        self._set_due()
+
+    def frame(self, now: int) -> CanFrame | None:
+        """The frame that is handed over now; None while it needs live data and there is none."""
+        settings, escs = self._settings, self._escs
+        assert settings is not None
+        plan = settings.plan
+        if plan.needs_live and escs[0].live is None:
+            return None
+        self.is_news = False
+        self._last_ns = now
+        self._deferred_until = NEVER
+        self._restart_timer(settings, now)
+        self._set_due()
+        bits = plan.pack(escs, self._owner.status, now, 0, 0)
+        self._last_watched = bits & plan.watched
+        self.sent += 1
+        return CanFrame(settings.can_id, bits.to_bytes(plan.message.length, "little"))
+
+    def _restart_timer(self, settings: SlotSettings, now: int) -> None:
+        runs = settings.timer_ns and settings.by_event
+        self._timer_due = now + settings.timer_ns if runs else NEVER
+
+    def _rest(self) -> None:
+        """Nothing is due."""
+        self.triggers = 0
+        self.is_news = False
+        self._timer_due = self._deferred_until = NEVER
+        self._owner.pending.pop(self.number, None)
+        self._set_due()
+
+    def _set_due(self) -> None:
+        due = min(self._timer_due, self._deferred_until)
+        if due != self.due:
+            self.due = due
+            self._owner.moved.add(self._esc)
+
+
+class Slots:
+    """All slots of a core. ``packs_at_once``: as Core."""
+
+    def __init__(
+        self, escs: Sequence[EscTelemetry], status: GatewayStatus, packs_at_once: bool = False
+    ) -> None:
+        self.escs = escs
+        self.status = status
+        self.pending: dict[int, int] = {}
+        """Numbers of the slots that ``take`` hands over, and since when."""
+        self.moved: set[int] = set()
+        """ESCs with slots of which ``due`` changed."""
+        self._packs_at_once = packs_at_once
+        self._packed: list[CanFrame] = []
+        self._slots: list[PythonSlot] = []
+        self._of: list[list[PythonSlot]] = [[] for _ in escs]
+        self._due = [NEVER] * len(escs)
+
+    def add(self, esc: int) -> PythonSlot:
+        """A further slot of an ESC."""
+        slot = PythonSlot(self, esc, len(self._slots))
+        self._slots.append(slot)
+        self._of[esc].append(slot)
+        return slot
+
+    @property
+    def triggers(self) -> int:
+        """The events that ``on_event`` is to be given."""
+        found = Event.NONE
+        for slot in self._slots:
+            found |= slot.triggers
+        return found
+
+    def on_event(self, esc: int, events: int, now: int) -> None:
+        """Something of an ESC changed: bits of telemetry.Event."""
+        for slot in self._of[esc]:
+            if events & slot.triggers:
+                slot.on_event(now)
+
+    def let_go(self, slot: PythonSlot, now: int) -> None:
+        """Let a slot be handed over."""
+        if not self._packs_at_once:
+            self.pending.setdefault(slot.number, now)
+        elif (frame := slot.frame(now)) is not None:
+            self._packed.append(frame)
+
+    def next_deadline(self) -> int:
+        """When ``advance`` has something to do."""
+        while self.moved:
+            esc = self.moved.pop()
+            self._due[esc] = min([slot.due for slot in self._of[esc]])
+        return min(self._due)
+
+    def advance(self, now: int) -> None:
+        """Let time pass."""
+        if now < self.next_deadline():
+            return
+        for slots, due in zip(self._of, self._due, strict=True):
+            if now >= due:
+                for slot in slots:
+                    if now >= slot.due:
+                        slot.advance(now)
+
+    @property
+    def is_pending(self) -> bool:
+        """True while ``take`` has something to do."""
+        return bool(self.pending or self._packed)
+
+    def take(self, now: int) -> list[CanFrame]:
+        """The frames of what is pending."""
+        frames, self._packed = self._packed, []
+        if self.pending:
+            pending, self.pending = self.pending, {}
+            for number, _ in sorted(pending.items(), key=itemgetter(1, 0)):
+                if (frame := self._slots[number].frame(now)) is not None:
+                    frames.append(frame)
+        return frames
