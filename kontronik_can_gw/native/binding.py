@@ -9,14 +9,15 @@ from typing import Any
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.objects import source_number
-from kontronik_can_gw.native.rows import Message, NotInCore, Settings, Signal
-from kontronik_can_gw.native.tables import (
-    END_OF_TIME,
+from kontronik_can_gw.native.rows import (
     GATEWAY,
     STORED_COUNTS,
-    Tables,
-    held_settings,
+    Message,
+    NotInCore,
+    Settings,
+    Signal,
 )
+from kontronik_can_gw.native.tables import END_OF_TIME, Tables, held_settings
 
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256

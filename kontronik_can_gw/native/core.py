@@ -87,6 +87,10 @@ class NativeCore:
     def next_deadline(self) -> int:
         return min(self._handle.next_deadline(), self._slots.next_deadline())
 
+    def deadline_in_python(self) -> int:
+        """The same of what C does not know: the slots in Python."""
+        return self._slots.next_deadline()
+
     def turns(self) -> Turns:
         """Whole turns of a loop with this core."""
         return Turns(self._handle.library, self._handle.core, len(self.escs))

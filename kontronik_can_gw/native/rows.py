@@ -45,3 +45,15 @@ Message = _structure(
 Settings = _structure(
     "Settings", timeout=_i64, crc_errors=_u32, poles=_u32, gear_numerator=_u32, gear_denominator=_u32, cells=_u8, reserved=_u8 * 7
 )  # fmt: skip
+COUNTS = (
+    "bytes", "live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds", "dropped_noise", "dropped_crc",
+    "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes", "losses", "late_frames", "suspect_frames",
+    "link_state", "layout", "live_frames", "info_frames", "dropped_bytes",
+)  # fmt: skip
+"""Of kcg_esc.count, in its order; the last ones are states and sums."""
+STORED_COUNTS = COUNTS.index("link_state")
+GATEWAY = (
+    "escs_ok", "gateway_state", "can_state", "esc_count", "sent_frames", "replaced_frames", "send_failures", "received_frames",
+    "bus_off_count", "dropped_frames", "id_conflicts", "started_ns",
+)  # fmt: skip
+"""Of kcg.gateway, in its order."""

@@ -8,7 +8,7 @@ from kontronik_can_gw.esc.decoder import SECOND_NS, Counters, Data
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState
-from kontronik_can_gw.native.tables import COUNTS, GATEWAY
+from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 
 _STREAM = COUNTS.index("long_run_bytes") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""

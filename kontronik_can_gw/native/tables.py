@@ -21,7 +21,16 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.gateway_status import GatewayState
-from kontronik_can_gw.native.rows import Message, NotInCore, Pair, Piece, Settings, Signal
+from kontronik_can_gw.native.rows import (
+    COUNTS,
+    GATEWAY,
+    Message,
+    NotInCore,
+    Pair,
+    Piece,
+    Settings,
+    Signal,
+)
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
@@ -31,18 +40,6 @@ from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 ) = range(13)  # fmt: skip
 WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
-COUNTS = (
-    "bytes", "live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds", "dropped_noise", "dropped_crc",
-    "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes", "losses", "late_frames", "suspect_frames",
-    "link_state", "layout", "live_frames", "info_frames", "dropped_bytes",
-)  # fmt: skip
-"""Of kcg_esc.count, in its order; the last ones are states and sums."""
-STORED_COUNTS = COUNTS.index("link_state")
-GATEWAY = (
-    "escs_ok", "gateway_state", "can_state", "esc_count", "sent_frames", "replaced_frames", "send_failures", "received_frames",
-    "bus_off_count", "dropped_frames", "id_conflicts", "started_ns",
-)  # fmt: skip
-"""Of kcg.gateway, in its order."""
 ROLLS, CODE_AMID, PLAIN, TABLE, REAL = 1, 2, 4, 8, 16
 EVENT, ON_CHANGE, SILENT, HAS_CRC, OF_THE_GATEWAY, FREE = 1, 2, 4, 8, 16, 32
 ALL_PAGES = 64

@@ -82,7 +82,8 @@ class NativePoller(Poller):
         turns = self._turns
         state = turns.state
         state.now, state.asked, state.before, state.bus = last, self.now, self.before, bus
-        state.due, state.leave, state.period = due, leave, period
+        state.due = min(due, self._core.deadline_in_python())
+        state.leave, state.period = leave, period
         state.max_late, state.max_turn = limits
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
