@@ -51,8 +51,7 @@ MAX_GEAR = 0xF_FFFF
 """Of numerator and denominator of a gear in its lowest terms: 9.81818 has 490909 and 50000."""
 MAX_ROWS = 0xFFFF
 """Of a table that is addressed by 16 bits."""
-MAX_ALIVE = 1 << 16
-MAX_BITS = 64
+MAX_ALIVE, MAX_BITS = 1 << 16, 64
 _DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
