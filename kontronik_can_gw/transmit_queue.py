@@ -36,9 +36,9 @@ class TransmitQueue:
         self._queue: deque[CanFrame] = deque()
         self._queue_has_turn = True
         self.replaced = 0
-        """Frames of slots that were overtaken by a newer one of their id, or cleared."""
+        """Frames of slots that were overtaken by a newer one of their id, or cleared; its owner may set it back to 0."""
         self.dropped = 0
-        """Queued frames that were lost: the queue was full, or cleared."""
+        """Queued frames that were lost: the queue was full, or cleared; likewise."""
 
     def __len__(self) -> int:
         return len(self._slots) + len(self._queue)

@@ -13,6 +13,7 @@
 #include "linux.h"
 
 #define MS INT64_C(1000000)
+#define MAX_FULL (250 * MS) /* how long the bus may take nothing */
 #define ASK_ALL (10 * MS) /* by how much values may seem older, where others come meanwhile, for the sake of fewer questions */
 #define BYTE_NS (11 * INT64_C(1000000000) / 115200)
 enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72, READ_SIZE = 4096, MAX_READS = KCG_READ / READ_SIZE };
@@ -72,15 +73,17 @@ static int serve(kcg_turns *t, int fd, kcg_input *in)
     return kcg_receive(t->core, in->esc, t->data, (size_t)size, t->now, since);
 }
 
-/* Hand frames to the bus; how many it took. */
-static uint32_t hand_over(kcg_turns *t, uint32_t count)
+/* Hand the frames that wait to the bus, as far as it takes them: what sendmmsg answered last, below 0 with errno, or that they are old. */
+static int hand_over(kcg_turns *t)
 {
     struct mmsghdr m[AT_ONCE];
     struct iovec v[AT_ONCE];
     uint8_t pages[AT_ONCE];
     uint32_t sent = 0;
-    while (sent < count) {
-        uint32_t n = count - sent < AT_ONCE ? count - sent : AT_ONCE;
+    int went = 0;
+    errno = 0;
+    while (sent < t->unsent && went >= 0) {
+        uint32_t n = t->unsent - sent < AT_ONCE ? t->unsent - sent : AT_ONCE;
         if (now_ns() - t->now > t->max_turn) /* they have become old while they were made */
             break;
         memset(m, 0, n * sizeof *m);
@@ -90,32 +93,64 @@ static uint32_t hand_over(kcg_turns *t, uint32_t count)
             v[i].iov_base = f, v[i].iov_len = f->flags ? FD_SIZE : CLASSIC_SIZE;
             m[i].msg_hdr.msg_iov = &v[i], m[i].msg_hdr.msg_iovlen = 1;
         }
-        int went = sendmmsg(t->bus, m, n, MSG_DONTWAIT);
+        went = sendmmsg(t->bus, m, n, MSG_DONTWAIT);
         for (uint32_t i = 0; i < n; i++)
             t->frames[sent + i].page = pages[i];
         sent += went > 0 ? (uint32_t)went : 0;
-        if (went != (int)n)
-            break;
     }
     kcg_gateway(t->core)[KCG_SENT_FRAMES] += sent;
-    return sent;
+    t->unsent -= sent;
+    memmove(t->frames, t->frames + sent, t->unsent * sizeof *t->frames);
+    return went;
 }
 
-/* What is pending goes to the bus; 0 where it did not take all: `frames` has the others. */
+/* Be woken, or no longer, when the bus takes frames again. */
+static void watch_room(kcg_turns *t, int is_full)
+{
+    struct epoll_event e = {.events = EPOLLIN | (is_full ? EPOLLOUT : 0u), .data.u32 = t->bus_place};
+    if (t->is_full != (uint32_t)is_full)
+        epoll_ctl(t->epoll, EPOLL_CTL_MOD, t->bus, &e);
+    t->is_full = (uint32_t)is_full;
+}
+
+/* Let a frame wait: in the place of an older one of its id and page. */
+static void put(kcg_turns *t, const kcg_frame *made)
+{
+    uint32_t i = 0;
+    while (i < t->unsent && (t->frames[i].id != made->id || t->frames[i].page != made->page))
+        i++;
+    kcg_gateway(t->core)[KCG_REPLACED_FRAMES] += i < t->unsent;
+    t->unsent += i == t->unsent;
+    t->frames[i] = *made;
+}
+
+/* What is pending goes to the bus, or waits until it takes frames again; false where that is the loop's. */
 static int transmit(kcg_turns *t)
 {
-    uint32_t count;
-    while ((count = kcg_take(t->core, t->now, t->frames, KCG_OUT))) {
+    uint32_t count, before = t->unsent;
+    while (t->unsent <= KCG_OUT - KCG_MADE && (count = kcg_take(t->core, t->now, t->made, KCG_MADE))) {
         kcg_sent(t->core, t->now, count);
         t->taken += count;
-        uint32_t sent = hand_over(t, count);
-        if (sent < count) {
-            t->unsent = count - sent;
-            memmove(t->frames, t->frames + sent, t->unsent * sizeof *t->frames);
-            return 0;
+        for (uint32_t i = 0; i < count; i++) {
+            if (before)
+                put(t, &t->made[i]);
+            else
+                t->frames[t->unsent++] = t->made[i];
         }
     }
-    return 1;
+    if (kcg_pending(t->core))
+        return 0;
+    if (t->unsent && !t->is_full) {
+        uint32_t waiting = t->unsent;
+        int went = hand_over(t), is_full = went < 0 && errno == EAGAIN;
+        if (t->unsent && (!is_full || t->records))
+            return 0;
+        kcg_gateway(t->core)[KCG_SEND_FAILURES] += is_full;
+        if (t->unsent < waiting || !before)
+            t->full_since = t->now;
+        watch_room(t, is_full);
+    }
+    return !t->unsent || t->now - t->full_since < MAX_FULL;
 }
 
 int kcg_watch(kcg_turns *t)
@@ -183,6 +218,10 @@ static int wait_for_turn(kcg_turns *t)
         return 0;
     for (int i = 0; i < ready; i++) {
         uint32_t place = events[i].data.u32;
+        if (place == t->bus_place && t->is_full && events[i].events == EPOLLOUT) {
+            watch_room(t, 0);
+            continue;
+        }
         if (t->input_of[place] < 0 || events[i].events != EPOLLIN || !t->inputs[t->input_of[place]].is_plain)
             return 0;
         t->place[t->ready++] = (uint16_t)place;
@@ -199,8 +238,8 @@ static int turn(kcg_turns *t)
         if (t->found != -1)
             return 0;
     }
-    if (!t->ready && t->now < kcg_next_deadline(t->core))
-        return 1; /* nothing has come, nothing is due */
+    if (!t->ready && t->now < kcg_next_deadline(t->core) && (!t->unsent || t->is_full))
+        return !t->unsent || t->now - t->full_since < MAX_FULL; /* nothing has come, nothing is due */
     note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
     t->found = kcg_advance(t->core, t->now);
     return t->found < 0 && transmit(t);
@@ -211,7 +250,9 @@ void kcg_turn(kcg_turns *t)
     t->found = -1;
     t->unsent = t->taken = t->recorded = t->turns = 0;
     for (uint32_t i = 0; i < t->count; i++)
-        if (t->input_of[i] >= 0) {
+        if (t->fds[i].fd == t->bus) {
+            t->bus_place = i;
+        } else if (t->input_of[i] >= 0) {
             kcg_input *in = &t->inputs[t->input_of[i]];
             in->asked = in->empty > t->asked ? in->empty : t->asked;
         }
@@ -227,6 +268,7 @@ void kcg_turn(kcg_turns *t)
         else
             ask_read(t);
     }
+    watch_room(t, 0);
     ask_all(t);
     t->late += t->asked - t->now;
 }

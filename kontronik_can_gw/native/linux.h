@@ -5,7 +5,7 @@
 
 #include "core.h"
 
-enum { KCG_OUT = 256, KCG_READ = 16384, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64 };
+enum { KCG_OUT = 512, KCG_MADE = 256, KCG_READ = 16384, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64 };
 enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 };     /* kinds of entries of a capture */
 
 #define KCG_DRAINED (INT64_C(1) << 62) /* output.NEVER */
@@ -24,12 +24,13 @@ typedef struct {
     kcg_input *inputs;
     int64_t now, asked, before, late;    /* the last turn; when was asked what is ready, and the time before; how late that was */
     int64_t due, leave, period, max_late, max_turn; /* the loop's deadline; when to come back; how often all are to be asked; limits of lateness */
+    int64_t full_since;                  /* the bus takes nothing */
     int32_t epoll, bus, found;           /* descriptors; an event to be followed; below 0: none */
-    uint32_t count, ready, unsent, taken, turns, records, recorded;
+    uint32_t count, ready, unsent, taken, turns, records, recorded, bus_place, is_full;
     struct pollfd fds[KCG_FDS];
     int16_t input_of[KCG_FDS];            /* place in `inputs`, -1: none of an ESC */
     uint16_t place[KCG_AT_ONCE];         /* in `fds`, of the `ready` ports of this turn */
-    kcg_frame frames[KCG_OUT];
+    kcg_frame frames[KCG_OUT], made[KCG_MADE]; /* those that wait; those of this turn */
     uint8_t data[KCG_READ], ring[KCG_RING];
 } kcg_turns;
 

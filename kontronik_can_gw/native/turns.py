@@ -9,7 +9,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.output import NEVER
 
-_MAX_FRAMES, _READ, _RING, _MAX_FDS, _AT_ONCE = 256, 1 << 14, 1 << 18, 1024, 64
+_OUT, _MADE, _READ, _RING, _MAX_FDS, _AT_ONCE = 512, 256, 1 << 14, 1 << 18, 1024, 64
 _ENTRY = struct.Struct("=qqIBBxx")
 _u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_int64
 
@@ -35,15 +35,20 @@ class _Turns(c.Structure):
         *((name, c.c_void_p) for name in ("core", "inputs")),
         *((name, _i64) for name in ("now", "asked", "before", "late")),
         *((name, _i64) for name in ("due", "leave", "period", "max_late", "max_turn")),
+        ("full_since", _i64),
         *((name, _i32) for name in ("epoll", "bus", "found")),
         *(
             (name, _u32)
-            for name in ("count", "ready", "unsent", "taken", "turns", "records", "recorded")
+            for name in (
+                *("count", "ready", "unsent", "taken", "turns", "records", "recorded"),
+                *("bus_place", "is_full"),
+            )
         ),
         ("fds", _PollFd * _MAX_FDS),
         ("input_of", _i16 * _MAX_FDS),
         ("place", c.c_uint16 * _AT_ONCE),
-        ("frames", Frame * _MAX_FRAMES),
+        ("frames", Frame * _OUT),
+        ("made", Frame * _MADE),
         ("data", _u8 * _READ),
         ("ring", _u8 * _RING),
     )

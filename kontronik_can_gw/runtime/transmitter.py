@@ -125,4 +125,6 @@ class Transmitter:
 
     def _count_losses(self) -> None:
         status, queue = self._status, self.queue
-        status.replaced_frames, status.dropped_frames = queue.replaced, queue.dropped
+        status.replaced_frames += queue.replaced
+        status.dropped_frames += queue.dropped
+        queue.replaced = queue.dropped = 0

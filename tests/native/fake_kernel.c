@@ -11,8 +11,9 @@
 
 typedef struct {
     int64_t (*now)(void);
-    void (*wait)(int64_t until, int all); /* until something has come; then the process may stand still */
-    int (*ready)(int fd);
+    void (*wait)(int64_t until, int for_room); /* until something has come; then the process may stand still */
+    void (*look)(void);
+    int (*ready)(int fd);                 /* for what */
     int (*size)(int fd, int most);        /* how many bytes a read gives: `data` then has them */
     int (*send)(const uint8_t *frame, int size); /* 0: it is not taken */
 } kernel;
@@ -49,22 +50,28 @@ int fake_close(int fd)
 
 int fake_epoll_ctl(int epoll, int what, int fd, struct epoll_event *e)
 {
-    (void)epoll, (void)what;
-    watched[count].fd = fd;
-    watched[count++].e = *e;
+    int i = 0;
+    (void)epoll;
+    while (what == EPOLL_CTL_MOD ? watched[i].fd != fd : i < count)
+        i++;
+    count += i == count;
+    watched[i].fd = fd, watched[i].e = *e;
     return 0;
 }
 
 int fake_epoll_wait(int epoll, struct epoll_event *events, int most, int ms)
 {
-    int found = 0;
+    int found = 0, for_room = 0;
     (void)epoll;
-    k.wait(k.now() + (int64_t)ms * 1000000, 0);
-    for (int i = 0; i < count && found < most; i++)
-        if (k.ready(watched[i].fd)) {
-            events[found] = watched[i].e;
-            events[found++].events = EPOLLIN;
-        }
+    for (int i = 0; i < count; i++)
+        for_room |= (watched[i].e.events & EPOLLOUT) != 0;
+    k.wait(k.now() + (int64_t)ms * 1000000, for_room);
+    for (int i = 0; i < count && found < most; i++) {
+        uint32_t ready = (uint32_t)k.ready(watched[i].fd) & watched[i].e.events;
+        events[found] = watched[i].e;
+        events[found].events = ready;
+        found += ready != 0;
+    }
     return found;
 }
 
@@ -73,9 +80,9 @@ int fake_poll(struct pollfd *fds, nfds_t n, int ms)
     int found = 0;
     (void)ms;
     if (n == (nfds_t)count)
-        k.wait(0, 1);
+        k.look();
     for (nfds_t i = 0; i < n; i++) {
-        fds[i].revents = k.ready(fds[i].fd) ? POLLIN : 0;
+        fds[i].revents = (short)(k.ready(fds[i].fd) & fds[i].events);
         found += fds[i].revents != 0;
     }
     return found;

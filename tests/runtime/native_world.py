@@ -28,6 +28,7 @@ class _Kernel(c.Structure):
     _fields_ = (
         ("now", c.CFUNCTYPE(c.c_int64)),
         ("wait", c.CFUNCTYPE(None, c.c_int64, c.c_int)),
+        ("look", c.CFUNCTYPE(None)),
         ("ready", c.CFUNCTYPE(c.c_int, c.c_int)),
         ("size", c.CFUNCTYPE(c.c_int, c.c_int, c.c_int)),
         ("send", c.CFUNCTYPE(c.c_int, c.POINTER(c.c_uint8), c.c_int)),
@@ -52,12 +53,12 @@ class FakeNativePoller(NativePoller):
         self._world = world
         self._data = (c.c_uint8 * (1 << 16)).in_dll(library(), "fake_data")
         kinds: list[Any] = [kind for _, kind in _Kernel._fields_]
-        calls = (world.clock, self._wait, self._is_ready, self._read, self._send)
+        calls = (world.clock, world.pass_until, world.look, world.ready, self._read, self._send)
         self._kernel = _Kernel(*(kind(call) for kind, call in zip(kinds, calls, strict=True)))
         library().fake_use(c.byref(self._kernel))
 
     def register(self, fd: int, handler: Handler, events: int = 1, esc: int | None = None) -> None:
-        self._world.register(fd, handler)
+        self._world.register(fd, handler, events)
         if fd >= 1000:  # the others are real ones
             self._watched[fd] = (handler, events, esc)
             self.changes += 1
@@ -72,15 +73,6 @@ class FakeNativePoller(NativePoller):
         self.before, self.now = self._world.before, self._world.looked
         self.late = self._world.late
         return ready
-
-    def _wait(self, until: int, asks: int) -> None:
-        if asks:
-            self._world.look()
-        else:
-            self._world.pass_until(until)
-
-    def _is_ready(self, fd: int) -> int:
-        return int(fd in self._world.ready())
 
     def _read(self, fd: int, most: int) -> int:
         data = self._world.wires[fd - 1000].read(most)

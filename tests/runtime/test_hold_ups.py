@@ -4,6 +4,7 @@ import random
 from bisect import bisect_left
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import TYPE_CHECKING, cast
 
 import pytest
 from hypothesis import Phase, given, settings
@@ -15,6 +16,9 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.signals.plan import Layout
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.native_poller import NativePoller
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 
@@ -234,3 +238,31 @@ def test_bytes_that_came_while_an_interface_was_tried_again_are_as_old_as_that(
     run(loop, world, world.now + 50 * MS)
     loop.close()
     assert {number for _, number, _ in values(world)} == {len(wire.frames)}
+
+
+def test_a_bus_that_is_slower_than_what_comes_has_the_newest_values_in_order(
+    monkeypatch: pytest.MonkeyPatch, core_language: str
+) -> None:
+    """Four ESCs whose frames come together; the kernel takes six frames in advance. In C hardly a turn comes back for it."""
+    world = World(4)
+    start, end = world.now, world.now + 3 * SECOND
+    world.bus.frame_ns = 1_900_000
+    for number, wire in enumerate(world.wires):
+        wire.stream(start + number * 100_000, end, 10 * MS)
+    loop = begin(monkeypatch, world, *[EscSettings(f"esc{n + 1}") for n in range(4)])
+    turns = 0
+    while world.now < end + 100 * MS:
+        loop.turn()
+        turns += 1
+    status = loop.gateway.status
+    assert len(world.bus.sent) == status.sent_frames
+    assert status.send_failures > 100
+    for esc in range(4):
+        numbers = [shown(frame)[0] for _, frame in world.bus.sent if frame.can_id == 0x100 + esc]
+        numbers = [number for number in numbers if number != NOT_AVAILABLE]
+        assert numbers == sorted(numbers)
+        assert numbers[-1] == len(world.wires[esc].frames)
+        assert len(set(numbers)) > 0.7 * len(world.wires[esc].frames)
+    if core_language == "C":
+        assert turns < 0.1 * cast("NativePoller", loop._poller).count
+    loop.close()

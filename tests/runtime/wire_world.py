@@ -4,6 +4,7 @@ Time goes on only where the loop waits, and where a test says that the process i
 """
 
 import os
+import select
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from typing import cast
@@ -165,6 +166,10 @@ class Bus:
         self.clock_error = 0
         """Of the times that are told."""
         self.answer = Sent.OK
+        self.frame_ns = 0
+        """How long a frame takes on the bus; not 0: the kernel takes six in advance."""
+        self._out: list[int] = []
+        """When each frame that the kernel has is out."""
         self.on_send: Callable[[CanFrame], None] = lambda _frame: None
         self._world = world
 
@@ -200,7 +205,17 @@ class Bus:
         while self.receive():
             pass
 
+    @property
+    def room_at(self) -> int:
+        """When the socket is writable: less than half of what the kernel takes is in it."""
+        return self._out[-3] if len(self._out) > 2 else 0
+
     def send(self, frame: CanFrame) -> Sent:
+        if self.frame_ns:
+            self._out = [at for at in self._out if at > self._world.now]
+            if len(self._out) == 6:
+                return Sent.FULL
+            self._out.append(max([self._world.now, *self._out[-1:]]) + self.frame_ns)
         if self.answer is Sent.OK:
             self.sent.append((self._world.now, frame))
             self.on_send(frame)
@@ -237,14 +252,17 @@ class World:
         self.there = True
         self.blind: set[int] = set()
         self.handlers: dict[int, Handler] = {}
+        self._events: dict[int, int] = {}
         self.late = 0
         self.poller = cast("Poller", FakePoller(self))
 
     def clock(self) -> int:
         return self.now
 
-    def register(self, fd: int, handler: Handler, _events: int = 1, esc: int | None = None) -> None:
-        self.handlers[fd] = handler
+    def register(
+        self, fd: int, handler: Handler, events: int = select.POLLIN, esc: int | None = None
+    ) -> None:
+        self.handlers[fd], self._events[fd] = handler, events
 
     def unregister(self, fd: int) -> None:
         del self.handlers[fd]
@@ -254,14 +272,22 @@ class World:
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         pause = max(0, due - self.now)
-        self.pass_until(self.now + -(-pause // MS) * MS)
+        self.pass_until(
+            self.now + -(-pause // MS) * MS, self._events.get(CAN_FD, 0) & select.POLLOUT
+        )
         self.look()
         self.late = self.now - last - pause
-        return [(self.handlers[fd], 1) for fd in self.ready()]
+        found = [(fd, self.ready(fd) & self._events[fd]) for fd in self.handlers]
+        return [(self.handlers[fd], bits) for fd, bits in found if bits]
 
-    def pass_until(self, until: int) -> None:
-        """Time goes by until something comes; then the process may stand still."""
-        self.now = max(self.now, min(until, *self._arrivals()))
+    def pass_until(self, until: int, for_room: int) -> None:
+        """Time goes by until something comes, or the bus takes frames; then the process may stand still."""
+        found = [wire.next_arrival for wire in self.wires if wire.fileno() not in self.blind]
+        if CAN_FD not in self.blind and self.bus.inbox:
+            found.append(self.bus.inbox[0][1])
+        if for_room:
+            found.append(self.bus.room_at)
+        self.now = max(self.now, min([until, *(at for at in found if at is not None)]))
         self.now += self.hold_up()
 
     def look(self) -> None:
@@ -269,17 +295,15 @@ class World:
         self.before, self.looked = self.looked, self.now
         self.looks.append(self.now)
 
-    def ready(self) -> list[int]:
-        """The descriptors that are."""
-        found = [wire.fileno() for wire in self.wires if wire.waits_to_be_read]
-        found += [CAN_FD] * self.bus.waits_to_be_read
-        return [fd for fd in found if fd in self.handlers.keys() - self.blind]
-
-    def _arrivals(self) -> list[int]:
-        found = [wire.next_arrival for wire in self.wires if wire.fileno() not in self.blind]
-        if CAN_FD not in self.blind and self.bus.inbox:
-            found.append(self.bus.inbox[0][1])
-        return [at for at in found if at is not None] or [1 << 62]
+    def ready(self, fd: int) -> int:
+        """What poll says of a descriptor."""
+        if fd in self.blind:
+            return 0
+        if fd == CAN_FD:
+            has_room = self.bus.room_at <= self.now
+            return select.POLLIN * self.bus.waits_to_be_read | select.POLLOUT * has_room
+        found = [wire for wire in self.wires if wire.fileno() == fd and wire.waits_to_be_read]
+        return select.POLLIN * len(found)
 
 
 class FakePoller:
