@@ -12,6 +12,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native.binding import load
 from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import OPTIONS
+from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.native_poller import NativePoller
 from kontronik_can_gw.runtime.poller import Handler
 from kontronik_can_gw.transmit_queue import Sent
@@ -67,6 +68,17 @@ class FakeNativePoller(NativePoller):
         del self._watched[fd]
         self._world.unregister(fd)
         self.changes += 1
+
+    def turn(
+        self,
+        can: CanLink,
+        last: int,
+        due: int,
+        leave: int,
+        period: int,
+        limits: tuple[int, int],
+    ) -> list[tuple[Handler, int]] | None:
+        return super().turn(can, last, min(due, self._world.until), leave, period, limits)
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)

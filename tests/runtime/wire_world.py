@@ -248,6 +248,8 @@ class World:
         self.looks: list[int] = [self.now]
         self.hold_up: Callable[[], int] = lambda: 0
         """How long the process stands still behind a wait, before it looks at the clock, in ns."""
+        self.until = 1 << 62
+        """Turns in C end by then."""
         self.opening_ns = 0
         self.there = True
         self.blind: set[int] = set()
@@ -364,5 +366,7 @@ def loop_in(
 
 
 def run(loop: Loop, world: World, until: int) -> None:
+    world.until = until
     while world.now < until:
         loop.turn()
+    world.until = 1 << 62
