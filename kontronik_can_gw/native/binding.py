@@ -160,7 +160,9 @@ class Handle:
 
     @staticmethod
     def _array(kind: Any, rows: Sequence[Any]) -> Any:
-        return (kind * max(1, len(rows)))(*rows)
+        if not rows or isinstance(rows[0], int):
+            return (kind * max(1, len(rows)))(*rows)
+        return (kind * len(rows)).from_buffer_copy(b"".join(rows))  # of rows it would keep them all
 
     def _follow(self, found: int, now: int) -> None:
         while found >= 0:
