@@ -32,6 +32,7 @@ ON_BOTH_CORES = (
     *("gateway", "golden", "dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
     *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
     *("runtime/test_hold_ups.py", "runtime/test_can_hold_ups.py"),
+    *("runtime/test_esc_input.py", "runtime/test_snapshot.py"),
 )
 """Files and folders of tests of what the core does: they run on the core in C and on the one in Python."""
 

@@ -171,7 +171,9 @@ class Handle:
 
     @staticmethod
     def _array(kind: Any, rows: Sequence[Any]) -> Any:
-        return (kind * max(1, len(rows)))(*rows)
+        if not rows or isinstance(rows[0], int):
+            return (kind * max(1, len(rows)))(*rows)
+        return (kind * len(rows)).from_buffer_copy(b"".join(rows))  # of rows it would keep them all
 
     def follow(self, found: int, now: int) -> None:
         """Give ``on_event`` what a call of the core returned, and what else there is."""

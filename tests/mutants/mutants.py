@@ -252,6 +252,7 @@ def settle() -> None:
         os.execve(
             sys.executable, [sys.executable, *sys.argv], {**os.environ, "PYTHONHASHSEED": "0"}
         )
+    os.environ["KONTRONIK_PURE"] = "1"  # what is mutated is Python
     os.chdir(PROJECT)
     sys.path.insert(0, str(PROJECT))
     warnings.simplefilter("ignore")

@@ -214,7 +214,8 @@ def _head(seen: Seen, document: Document, width: int | None) -> Iterator[Text]:
     yield line(first, f"{heard}, up {duration(process['uptime_s'])}")
     memory = f"{process['rss_bytes'] // 1_000_000} MB"
     yield line((f"process {process['pid']}, {memory}, {where}", FAINT))
-    yield line((in_words(gateway["core"], gateway["core_reason"]), FAINT))
+    if "core" in gateway:  # 0.5.0 had but one
+        yield line((in_words(gateway["core"], gateway["core_reason"]), FAINT))
 
 
 def _can_lines(document: Document) -> Iterator[Text]:
