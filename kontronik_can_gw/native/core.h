@@ -142,7 +142,8 @@ typedef struct {
     kcg_esc *esc;
     kcg_sending *sending;
     uint64_t *last;                            /* bits of the last frame of each page, of messages that are sent on change; of a slot the watched ones, and how many were sent */
-    uint8_t *page, *report;                    /* of each page of all messages: its last frame is known, it is to follow; ESCs with events to be followed, oldest first */
+    uint8_t *page;                             /* of all messages: its last frame is known, it is to follow */
+    uint8_t *report;                           /* ESCs with events to be followed, oldest first */
     uint16_t *heap, *pending;                  /* messages by their next deadline; those to be handed over */
     uint32_t pendings, taken, heaped, reports;
     uint32_t mask;                             /* events that end a step and are reported */
@@ -155,14 +156,15 @@ typedef struct {
     kcg_found found[KCG_FOUND];
 } kcg;
 
-/* What kcg_init needs; each structure's size is a multiple of 8. */
+/* What kcg_init needs: the structures, then what is aligned less. */
 #define KCG_SIZE(messages, escs, pages, words) \
     (sizeof(kcg) + (escs) * (sizeof(kcg_esc) + 1) + (messages) * (sizeof(kcg_sending) + 2 * sizeof(uint16_t)) + (pages) + (words) * sizeof(uint64_t))
 size_t kcg_size(const kcg_plan *plan);
 /* memory: kcg_size bytes, aligned for int64_t. */
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now);
-/* Each returns an event to be followed, ESC << 8 | events of `mask`, or -1; then kcg_next_event until that returns -1. Where
-   kcg_receive returns KCG_AGAIN besides, what has expired is to be followed first, and it is called again with the same bytes. */
+/* Each returns an event to be followed, ESC << 8 | events of `mask`, or -1 (always, as long as `mask` is 0 as at first); then
+   kcg_next_event until that returns -1. Where kcg_receive returns KCG_AGAIN besides, what has expired is to be followed first, and it
+   is called again with the same bytes. */
 enum { KCG_AGAIN = 1 << 30 };
 int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since);
 int kcg_expire(kcg *g, int64_t now);
