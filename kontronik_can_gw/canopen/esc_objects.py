@@ -59,7 +59,7 @@ class EscObjects:
     def on_event(self, events: int, now: int) -> None:
         """Something of the ESC changed: bits of telemetry.Event."""
         live = self._esc.live
-        if events & Event.ERRORS and live is not None and self._errors is not None:
+        if events & Event.STATE and live is not None and self._errors is not None:
             self._emergencies.set_word(self._errors.of(live), now)
         if events & (Event.LINK | Event.INFO) or self._live is (live is None):
             self._follow_link(events, now)

@@ -77,7 +77,7 @@ class Nodes(Output):
     with the ESC's index and its new settings when a master writes 2100h.
     """
 
-    events = Event.INFO | Event.LINK | Event.ERRORS
+    events = Event.LINK | Event.STATE
 
     def __init__(
         self,

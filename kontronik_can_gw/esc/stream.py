@@ -169,7 +169,7 @@ class EscStream(EscTelemetry):
                 self.drawn.add(self.live, when - before)
         at, live = self._errors_at, self.live
         if at is not None and (live is None or live[at] != data[at]):
-            events |= Event.ERRORS
+            events |= Event.STATE
         self.live = self.last_live = data
         self.live_ns, self.live_bound_ns = when, bound
         if self.link is not _OK and self.link is not _DEGRADED:
@@ -189,7 +189,9 @@ class EscStream(EscTelemetry):
         self.last_info_ns, self.info_bound_ns = when, bound
         self.cells = self.settings.cell_count or value("cell_count", data) or 0
         self.device = value("device_raw", data)
-        return Event.INFO | Event.LINK if another else Event.INFO
+        if another:
+            return Event.INFO | Event.LINK | Event.STATE
+        return Event.INFO | Event.STATE if old is None else Event.INFO
 
     def _forget_device(self) -> None:
         self.info = None

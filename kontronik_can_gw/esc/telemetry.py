@@ -38,8 +38,8 @@ class Event:
     LINK = 4
     SECOND = 8
     """A second is over: counters and rates are as new as they are to be had."""
-    ERRORS = 16
-    """The operating errors are others than in the live data before, or there was none."""
+    STATE = 16
+    """The operating errors or the device are others than in the live data or information before, or there was none."""
     ALL = 31
 
 

@@ -340,7 +340,9 @@ static int close_window(kcg_esc *e, int64_t now)
 
 static int accept_info(kcg_esc *e, const uint8_t *body, int64_t when, int64_t bound)
 {
-    int events = KCG_INFO | (e->has_info && memcmp(body, e->info, 2) ? KCG_LINK : 0);
+    int another = memcmp(body, e->info, 2), events = KCG_INFO;
+    if (!e->has_info || another)
+        events |= KCG_NEW_STATE | (e->has_info ? KCG_LINK : 0);
     e->generation++;
     memcpy(e->info, body, KCG_BODY);
     e->has_info = e->had_info = 1;
@@ -380,7 +382,7 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
     }
     e->generation++;
     if (!e->has_live || memcmp(e->live + ERRORS_AT, f->body + ERRORS_AT, 4))
-        events |= KCG_ERRORS;
+        events |= KCG_NEW_STATE;
     memcpy(e->live, f->body, 30);
     e->power = (int32_t)(wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16));
     e->turns = u32(f->body) != 0;

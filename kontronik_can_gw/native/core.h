@@ -40,7 +40,7 @@ enum { KCG_HELD = 43, KCG_BODY = 33, KCG_LONGEST = 44, KCG_PAGES = 64 };
 #define KCG_NEVER INT64_MAX
 
 /* Events of an ESC (telemetry.Event), and states of its link (telemetry.LinkState). */
-enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8, KCG_ERRORS = 16 };
+enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8, KCG_NEW_STATE = 16 };
 enum { KCG_NEVER_SEEN, KCG_SEARCHING, KCG_OK, KCG_DEGRADED, KCG_LOST, KCG_PORT_ERROR };
 
 typedef struct { /* as SocketCAN's struct can_frame and canfd_frame */

@@ -1,4 +1,4 @@
-"""With the core in C the PDOs of ESCs' values are its slots: a live frame does not reach Python."""
+"""With the core in C the PDOs of ESCs' values are its slots: frames of ESCs do not reach Python."""
 
 from collections.abc import Iterator
 
@@ -36,7 +36,7 @@ def followed(bench: Bench) -> list[int]:
     return found
 
 
-def test_live_frames_make_the_default_pdos_and_no_event_but_for_other_errors() -> None:
+def test_frames_make_the_default_pdos_and_no_event_but_for_other_errors() -> None:
     bench = Bench(nodes=8).start()
     nodes = bench.gateway.nodes
     assert nodes is not None
@@ -48,12 +48,13 @@ def test_live_frames_make_the_default_pdos_and_no_event_but_for_other_errors() -
         bench.now += 10 * MS
         for esc in range(8):
             bench.uart(live(electrical_speed=number), esc)
+            bench.uart(info(), esc)
     assert found == []
     assert nodes.next_deadline() == due
     assert nodes.node_states()[7][2] > sent + 25
     assert {frame.can_id for frame in bench.take()} >= {0x181 + esc for esc in range(8)}
     bench.uart(live(operating_errors=1), 3)
-    assert found == [Event.LIVE | Event.ERRORS]
+    assert found == [Event.LIVE | Event.STATE]
 
 
 def test_a_pdo_with_an_object_that_c_does_not_know_is_filled_in_python_while_it_is_sent() -> None:
