@@ -1,4 +1,4 @@
-"""Waiting for many descriptors at once: poll(2) with a handler for each.
+"""Waiting for many descriptors at once, with a handler for each: epoll waits, at a cost that does not grow with them, poll is asked.
 
 What is ready, and what was not at a known time, is asked for once more after each wait: a process that was stopped while it waited is
 answered that nothing has come once the wait's time is over (PEP 475). And by poll, not epoll, which does not ask a terminal whether
@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.esc.telemetry import SECOND
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (select.POLLIN, POLLOUT)."""
@@ -44,7 +44,7 @@ class StuckCheck:
 
 
 class Poller:
-    """A poll object. A descriptor that hung up counts as readable, and as writable where that is watched.
+    """Descriptors that are watched. One that hung up counts as readable, and as writable where that is watched.
 
     ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
     """
@@ -53,11 +53,16 @@ class Poller:
         self._clock = clock
         self.now = self.before = clock()
         self._poll = select.poll()
+        self._epoll = select.epoll()
         self._watched: dict[int, tuple[Handler, int]] = {}
 
     def register(self, fd: int, handler: Handler, events: int = select.POLLIN) -> None:
         """Watch a descriptor; one that is watched, for something else from now on."""
         self._poll.register(fd, events)
+        try:
+            self._epoll.register(fd, events)
+        except FileExistsError:
+            self._epoll.modify(fd, events)
         self._watched[fd] = (handler, events)
 
     def unregister(self, fd: int) -> None:
@@ -65,6 +70,8 @@ class Poller:
         del self._watched[fd]
         with contextlib.suppress(KeyError):
             self._poll.unregister(fd)
+        with contextlib.suppress(OSError):  # it is closed already
+            self._epoll.unregister(fd)
 
     def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
         """Wait until something happens, ``pause_ns`` is over (rounded up to a millisecond), or a signal comes; then ask what is ready.
@@ -72,7 +79,7 @@ class Poller:
         Returns handlers of what there is, with what.
         """
         if pause_ns > 0:
-            self._poll.poll(-(-pause_ns // MS))
+            self._epoll.poll(pause_ns / SECOND, 1)
         self.before, self.now = self.now, self._clock()
         happened = self._poll.poll(0)
         watched = self._watched
@@ -90,3 +97,4 @@ class Poller:
 
     def close(self) -> None:
         self._watched.clear()
+        self._epoll.close()
