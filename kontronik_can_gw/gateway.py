@@ -55,6 +55,8 @@ class Gateway:
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
         )
+        self.has_outputs = bool(self._outputs)
+        """False: nothing but the layout's messages is sent, and no id to receive ever changes."""
         self.core.followers = [Follower(each.events, each.on_event) for each in self._outputs]
         self.conflicts = IdConflicts(self.core.own_ids, self._outputs)
         self._being_saved: list[tuple[int, Output]] = []
@@ -191,16 +193,18 @@ class Gateway:
     @property
     def frames_wait(self) -> bool:
         """True while ``take_frames`` has something to do."""
-        return self.core.is_pending or any(output.frames for output in self._outputs)
+        for output in self._outputs:
+            if output.frames:
+                return True
+        return self.core.is_pending
 
     def take_frames(self, now: int) -> list[CanFrame]:
         """The frames to send: those of the outputs, oldest first, then those of the core that are due, with the values of now."""
-        frames: list[CanFrame] = []
-        for output in self._outputs:
+        frames = self.core.take(now)
+        for output in reversed(self._outputs):
             if output.frames:
-                frames += output.frames
+                frames = output.frames + frames
                 output.frames.clear()
-        frames += self.core.take(now)
         return frames
 
     def not_sent(self, now: int) -> None:
@@ -208,9 +212,9 @@ class Gateway:
 
     def take_link_changes(self) -> list[int]:
         """ESCs whose link state, layout or device changed since the last call."""
-        if not self.core.link_changes:
-            return []
-        changes, self.core.link_changes = self.core.link_changes, []
+        changes = self.core.link_changes
+        if changes:
+            self.core.link_changes = []
         return changes
 
     @property

@@ -3,13 +3,14 @@
 from collections import deque
 from collections.abc import Sequence
 from enum import Enum
-from operator import attrgetter
+from operator import itemgetter
 
 from kontronik_can_gw.frames import CanFrame
 
 QUEUE_LENGTH = 2048
-_slot_of = attrgetter("can_id", "extended", "page")
-_is_queued = attrgetter("queued")
+_place = CanFrame._fields.index
+_slot_of = itemgetter(_place("can_id"), _place("extended"), _place("page"))
+_is_queued = itemgetter(_place("queued"))
 
 
 class Sent(Enum):

@@ -16,7 +16,7 @@
 #define MAX_FULL (250 * MS) /* how long the bus may take nothing */
 #define ASK_ALL (10 * MS) /* by how much values may seem older, where others come meanwhile, for the sake of fewer questions */
 #define BYTE_NS (11 * INT64_C(1000000000) / 115200)
-enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72, READ_SIZE = 4096, MAX_READS = KCG_READ / READ_SIZE };
+enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72 };
 
 static int64_t now_ns(void)
 {
@@ -42,30 +42,13 @@ static int has_room(const kcg_turns *t, size_t size)
     return !t->records || sizeof t->ring - t->recorded >= size + 2 * sizeof(kcg_entry);
 }
 
-/* What has come; -1 where the port has gone. */
-static int read_port(int fd, uint8_t *data)
-{
-    int size = 0;
-    for (int k = 0; k < MAX_READS; k++) {
-        ssize_t got = read(fd, data + size, READ_SIZE);
-        if (got <= 0)
-            return size || (got < 0 && (errno == EAGAIN || errno == EINTR)) ? size : -1;
-        size += (int)got;
-        if (got < READ_SIZE)
-            break;
-    }
-    return size;
-}
-
 /* Take what has come from an ESC; an event to be followed, -1: none, -2: it is the loop's. */
 static int serve(kcg_turns *t, int fd, kcg_input *in)
 {
-    int size = has_room(t, KCG_READ) ? read_port(fd, t->data) : -1;
-    if (size < 0)
+    ssize_t size = has_room(t, KCG_READ) ? read(fd, t->data, KCG_READ) : 0;
+    if (size <= 0)
         return -2;
     in->served = 1;
-    if (!size)
-        return -1;
     int64_t since = in->undrained != KCG_DRAINED ? in->undrained : in->asked;
     int64_t passed = since + size * BYTE_NS;
     in->undrained = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked at the turn's end */

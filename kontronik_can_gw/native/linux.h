@@ -5,7 +5,7 @@
 
 #include "core.h"
 
-enum { KCG_OUT = 512, KCG_MADE = 256, KCG_READ = 16384, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64 };
+enum { KCG_OUT = 512, KCG_MADE = 256, KCG_READ = 4096, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64 };
 enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 };     /* kinds of entries of a capture */
 
 #define KCG_DRAINED (INT64_C(1) << 62) /* output.NEVER */

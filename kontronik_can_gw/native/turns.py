@@ -9,7 +9,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.output import NEVER
 
-_OUT, _MADE, _READ, _RING, _MAX_FDS, _AT_ONCE = 512, 256, 1 << 14, 1 << 18, 1024, 64
+_OUT, _MADE, _READ, _RING, _MAX_FDS, _AT_ONCE = 512, 256, 1 << 12, 1 << 18, 1024, 64
 _ENTRY = struct.Struct("=qqIBBxx")
 _u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_int64
 

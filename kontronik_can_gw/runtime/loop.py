@@ -176,18 +176,24 @@ class Loop:
             handler(now, events)
         if self._lost or can.port is None or now >= can.controller.due:
             now = self._reopen(now)
-        if gateway.nodes is not None:
+        has_outputs = gateway.has_outputs
+        if has_outputs:
             self._saver.save(now)  # first: what it answers belongs to this turn, in a replay too
         gateway.advance(now)
-        can.follow_ids()
+        if has_outputs:
+            self._follow_outputs(now)
         can.transmit(now)
-        if gateway.node_changes != self._node_changes:
-            self._node_changes = gateway.node_changes
-            self._housekeeping.report_nodes(now)
         if changes := gateway.take_link_changes():
             for index in dict.fromkeys(changes):
                 self.escs[index].log.follow_link(now)
         return now
+
+    def _follow_outputs(self, now: int) -> None:
+        """Ids to receive, and the states of nodes, may be others."""
+        self.can.follow_ids()
+        if self.gateway.node_changes != self._node_changes:
+            self._node_changes = self.gateway.node_changes
+            self._housekeeping.report_nodes(now)
 
     def end(self) -> None:
         """A last status is sent and everything is closed."""

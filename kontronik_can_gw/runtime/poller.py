@@ -1,4 +1,4 @@
-"""Waiting for many descriptors at once: poll(2) with a handler for each.
+"""Waiting for many descriptors at once, with a handler for each: epoll waits, at a cost that does not grow with them, poll is asked.
 
 What is ready, and what was not at a known time, is asked for once more after each wait: a process that was stopped while it waited is
 answered that nothing has come once the wait's time is over (PEP 475). And by poll, not epoll, which does not ask a terminal whether
@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
-from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.output import NEVER
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class StuckCheck:
 
 
 class Poller:
-    """A poll object. A descriptor that hung up counts as readable, and as writable where that is watched.
+    """Descriptors that are watched. One that hung up counts as readable, and as writable where that is watched.
 
     ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
     ``late``: by how much more than its pause the last turn and the wait took. ``changes`` grows with each change of what is watched.
@@ -77,6 +77,7 @@ class Poller:
         self.late = 0
         self.changes = 0
         self._poll = select.poll()
+        self._epoll = select.epoll()
         self._watched: dict[int, tuple[Handler, int, int | None]] = {}
         self._closed: set[int] = set()
         """Watched, but closed by a driver: they would stay readable."""
@@ -86,6 +87,10 @@ class Poller:
     ) -> None:
         """Watch a descriptor; one that is watched, for something else from now on. ``esc``: it is this one's port."""
         self._poll.register(fd, events)
+        try:
+            self._epoll.register(fd, events)
+        except FileExistsError:
+            self._epoll.modify(fd, events)
         self._watched[fd] = (handler, events, esc)
         self._closed.discard(fd)
         self.changes += 1
@@ -96,6 +101,8 @@ class Poller:
         self.changes += 1
         with contextlib.suppress(KeyError):
             self._poll.unregister(fd)
+        with contextlib.suppress(OSError):  # it is closed already
+            self._epoll.unregister(fd)
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         """Wait until something happens, ``due`` has come (rounded up to a millisecond), or a signal comes; then ask what is ready.
@@ -104,7 +111,7 @@ class Poller:
         """
         pause = due - self._clock()
         if pause > 0:
-            self._poll.poll(-(-pause // MS))
+            self._epoll.poll(pause / SECOND, 1)
         else:
             pause = 0
         self.before, self.now = self.now, self._clock()
@@ -156,3 +163,4 @@ class Poller:
 
     def close(self) -> None:
         self._watched.clear()
+        self._epoll.close()

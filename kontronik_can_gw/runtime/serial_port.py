@@ -22,7 +22,6 @@ from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.runtime.usb_adapters import Identity, identity_at
 
 READ_SIZE = 4096
-_MAX_READS = 4
 
 _TIOCGICOUNT = 0x545D
 MINI_UART = "brcm,bcm2835-aux-uart"
@@ -86,32 +85,22 @@ class SerialPort:
         return self._fd
 
     def read(self) -> bytes:
-        """What has come. PortLost when the port has gone.
+        """What has come, at most READ_SIZE. PortLost when the port has gone.
 
         A short read does not mean that nothing more waits: the kernel passes on what it has further back only when it is asked again.
         It is asked by poll, which costs a third of a read that finds nothing.
         """
-        found = b""
-        self.drained = False
-        for _ in range(_MAX_READS):
-            try:
-                data = os.read(self._fd, READ_SIZE)
-            except BlockingIOError:
-                self.drained = True
-                break
-            except OSError as error:
-                if found:
-                    break  # it comes again
-                raise PortLost(error.strerror or str(error)) from None
-            if not data:
-                if found:
-                    break
-                raise PortLost("hung up")
-            found += data
-            if not self._poll.poll(0):
-                self.drained = True
-                break
-        return found
+        try:
+            data = os.read(self._fd, READ_SIZE)
+        except BlockingIOError:
+            self.drained = True
+            return b""
+        except OSError as error:
+            raise PortLost(error.strerror or str(error)) from None
+        if not data:
+            raise PortLost("hung up")
+        self.drained = not self._poll.poll(0)
+        return data
 
     def settings_hold(self) -> bool:
         """Whether the port still is as it was set; if not it is set again. (Another program, as stty, can change it at any time.)"""

@@ -60,9 +60,10 @@ class Transmitter:
 
         None where nothing waits or is to be tried, and where frames became late meanwhile: the next turn drops those.
         """
-        if now < self.due != NEVER:
-            return None
-        self.due = NEVER
+        if self.due != NEVER:
+            if now < self.due:
+                return None
+            self.due = NEVER
         frames = self.queue.in_order()
         if not frames:
             if not self.is_stalled:
@@ -70,8 +71,8 @@ class Transmitter:
             return None
         count, answer = port.send_all(frames, self._clock, now + self.max_turn_ns())
         self.queue.remove(frames, count)
-        self._status.sent_frames += count
         if count:
+            self._status.sent_frames += count
             self._busy_since = None
         if answer is not _OK:
             if answer is Sent.LATE:
@@ -81,7 +82,7 @@ class Transmitter:
                 answer = self._busy(port, answer, now)
             if answer is Sent.DOWN or answer is Sent.GONE:
                 return answer
-        if count and self.is_stalled:
+        if self.is_stalled and count:
             self._go_on(now)
         return answer
 

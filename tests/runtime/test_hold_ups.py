@@ -153,7 +153,7 @@ def test_what_waited_beyond_one_read_is_dated_by_its_place_in_the_stream(
     loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=20 * SECOND))
     wire.stream(start, start + 8 * SECOND, 40 * NS_PER_BYTE)  # without a pause: 83 kB
     world.now += 9 * SECOND
-    for _ in range(8):
+    for _ in range(24):
         loop.turn()
     esc = loop.gateway.escs[0]
     loop.close()

@@ -178,16 +178,16 @@ class Deframer:
                 continue
             crc = 0
             for form in forms:
-                if at + form.length > size:
-                    missing = at + form.length - size
+                end = at + form.length
+                if end > size:
+                    missing = end - size
                     break
                 crc = crc32(frame[form.crc_goes_on_over], crc)
                 if crc == form.crc_of(frame)[0]:
                     setattr(counters, form.name, getattr(counters, form.name) + 1)
                     data = _new(form.data_type, form.fields_of(frame))
                     frames.append(_new(Frame, (form, self._base + at, data)))
-                    at += form.length
-                    self._blame_until = 0
+                    at, self._blame_until = end, 0
                     break
             else:
                 counters.crc_errors += 1
