@@ -29,16 +29,6 @@ def test_its_frames_are_those_of_the_core_in_python(tmp_path: Path, seed: int) -
     assert sent == case.expected()
 
 
-@pytest.mark.extended
-@pytest.mark.parametrize("seed", range(6))
-def test_clang_finds_nothing_wrong_with_it_nor_do_its_sanitizers(tmp_path: Path, seed: int) -> None:
-    case = Case(tmp_path, 100 + seed)
-    sanitizers = "-fsanitize=address,undefined,integer", "-fno-sanitize-recover=all"
-    quiet = "-fno-sanitize=unsigned-integer-overflow,implicit-conversion,unsigned-shift-base"
-    sent = case.run(str(case.build(compiler("clang"), "-g", "-O1", *sanitizers, quiet)))
-    assert sent == case.expected()
-
-
 @pytest.mark.parametrize("options", ["-DKCG_LEGACY=0", "-DKCG_DATA=64 -DKCG_FLOATS=1"])
 def test_macros_build_without_a_warning(tmp_path: Path, options: str) -> None:
     bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))

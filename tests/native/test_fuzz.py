@@ -20,11 +20,15 @@ FUZZED = (1, 2, 5)
 pytestmark = pytest.mark.extended
 
 
+def clang() -> str:
+    if shutil.which("clang") is None:
+        pytest.skip("no clang: sudo apt-get install clang")
+    return "clang"
+
+
 @pytest.mark.parametrize("layout", FUZZED)
 def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
     """Any calls, by libFuzzer: nothing outside its memory, nothing undefined, no deadline that does not move on."""
-    if shutil.which("clang") is None:
-        pytest.skip("no clang: sudo apt-get install clang")
     case = Case(tmp_path / "export", layout)
     corpus = tmp_path / "corpus"
     corpus.mkdir()
@@ -40,7 +44,7 @@ def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
         (corpus / str(number)).write_bytes(b"".join(calls))
     program = tmp_path / "fuzz"
     sanitizers = "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"
-    command = ["clang", "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
+    command = [clang(), "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
     sources = [
         str(case.folder / "core.c"),
         str(case.folder / "tables.c"),
@@ -63,3 +67,12 @@ def test_dbc_text(tmp_path: Path) -> None:
     """Changed DBC text: refused in words, or both cores agree."""
     printed = run_sanitized(tmp_path, str(HERE / "fuzz_dbc.py"), str(SECONDS), str(SEED))
     print(printed.splitlines()[-1])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_clang_finds_nothing_wrong_with_it_nor_do_its_sanitizers(tmp_path: Path, seed: int) -> None:
+    case = Case(tmp_path, 100 + seed)
+    sanitizers = "-fsanitize=address,undefined,integer", "-fno-sanitize-recover=all"
+    quiet = "-fno-sanitize=unsigned-integer-overflow,implicit-conversion,unsigned-shift-base"
+    sent = case.run(str(case.build(clang(), "-g", "-O1", *sanitizers, quiet)))
+    assert sent == case.expected()
