@@ -30,7 +30,11 @@ def pytest_collection_finish() -> None:
 TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
     *("gateway", "golden", "dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
-    *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
+    *(
+        "capture/test_replay_is_identical.py",
+        "canopen/test_outages_and_order.py",
+        "canopen/test_dialogues.py",
+    ),
     *("runtime/test_hold_ups.py", "runtime/test_can_hold_ups.py"),
     *("runtime/test_esc_input.py", "runtime/test_snapshot.py"),
 )

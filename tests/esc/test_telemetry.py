@@ -482,14 +482,10 @@ def test_another_layout_is_another_device_of_which_nothing_is_known(
 def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_device_is_not() -> None:
     telemetry = alive()
     read(telemetry, info(Device.KOSMIK), SECOND + 10 * MS)
+    another = Event.INFO | Event.LINK | Event.STATE
     assert read(telemetry, info(Device.KOSMIK, cells=7), SECOND + 20 * MS) == Event.INFO
-    assert (
-        read(telemetry, info(Device.KOLIBRI, cells=12), SECOND + 30 * MS) == Event.INFO | Event.LINK
-    )
-    assert (
-        read(telemetry, info(Device.KOLIBRI, variant=80), SECOND + 40 * MS)
-        == Event.INFO | Event.LINK
-    )
+    assert read(telemetry, info(Device.KOLIBRI, cells=12), SECOND + 30 * MS) == another
+    assert read(telemetry, info(Device.KOLIBRI, variant=80), SECOND + 40 * MS) == another
     assert telemetry.info is not None
     assert (telemetry.info.device, telemetry.info.variant, telemetry.cells) == (
         Device.KOLIBRI,
