@@ -74,6 +74,11 @@ class Replay:
             self.rejected += 1
         return found
 
+    @property
+    def frames_wait(self) -> bool:
+        """True while the next entry decides whether the frames of the last turn were sent."""
+        return bool(self._taken)
+
     def finish(self) -> list[TimedFrame]:
         """Return the frames of the last turn, after the last entry."""
         found, self._taken = self._taken, []

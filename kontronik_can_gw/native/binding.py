@@ -133,8 +133,9 @@ class Handle:
     ) -> None:
         if tables.wire not in ("", library.kcg_wire().decode()):
             raise NotInCore(f"fields on the wire: {tables.wire}")
-        self._library = library
+        self.library = self._library = library
         self._on_event = on_event
+        self.pages = tables.pages
         self._kept = [
             self._array(Message, tables.messages),
             self._array(Signal, tables.signals),
@@ -150,7 +151,7 @@ class Handle:
         size = library.kcg_size(c.byref(self._plan))
         self._memory = (_u64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)
-        self._core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
+        self.core = self._core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
         begin = c.addressof(self._memory)
         at = library.kcg_escs(self._core) - begin, library.kcg_gateway(self._core) - begin
         self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, at[0])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 _LIMIT_S = 120
-SOURCES = (FOLDER / "core.h", FOLDER / "core.c")
+SOURCES = tuple(FOLDER / name for name in ("core.h", "core.c", "offline.h", "offline.c"))
 FOR_LINUX = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_FOUND=512")
 """With CAN FD and floats, for reads of 16 KiB."""
 
@@ -50,7 +50,7 @@ def compile_core(target: Path, options: Sequence[str] = ("-O2", *FOR_LINUX)) -> 
     part = target.with_name(f"{target.name}.part")
     try:
         done = subprocess.run(
-            [*command, "-o", str(part), str(SOURCES[1])],
+            [*command, "-o", str(part), *(str(one) for one in SOURCES if one.suffix == ".c")],
             capture_output=True,
             text=True,
             check=False,

@@ -213,9 +213,9 @@ static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
     hold(e, data + at, size - at);
 }
 
-static void flush(kcg_esc *e)
+static void flush(kcg *g, kcg_esc *e)
 {
-    scan(NULL, e, e->held, e->held_count, 1);
+    scan(g, e, e->held, e->held_count, 1);
     e->held_count = 0;
     e->need = 1;
     e->blame_until = e->base;
@@ -385,7 +385,7 @@ static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
     return (e->has_info || x) && !(e->had_info && not_on >> (e->info[1] >> 2) & 1);
 }
 
-/* The steps of a value; 0 where it is not available. */
+/* The steps of a value before its divisor; 0 where it is not available. */
 static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
 {
     switch (s->kind) {
@@ -413,11 +413,26 @@ static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t no
         *x = e->rate;
         return e->rate >= 0;
     case KCG_OF_GATEWAY: *x = g->gateway[s->place]; return 1;
-    default: *x = (now - g->gateway[KCG_STARTED]) / 1000000; return 1;
+    default: *x = floor_div(now - g->gateway[KCG_STARTED], 1000000); return 1; /* a row may be of just before */
     }
     if (s->mask)
         *x = *x >> s->shift & s->mask;
     return !s->not_on || supplied(e, s->not_on, *x);
+}
+
+int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
+{
+    const kcg_esc *e = s->esc == 255 ? NULL : &g->esc[s->esc];
+    *by = *over = 1;
+    if (!steps(g, s, e, now, x))
+        return 0;
+    if (s->divisor == KCG_BY_CELLS)
+        *by = e->cells;
+    else if (s->divisor == KCG_BY_POLES)
+        *by = e->settings.poles;
+    else if (s->divisor == KCG_BY_OUTPUT)
+        *by = (int64_t)e->settings.poles * e->settings.gear_numerator, *over = e->settings.gear_denominator;
+    return *by != 0; /* the number of cells may not be known */
 }
 
 #if KCG_FLOATS
@@ -445,21 +460,11 @@ static uint64_t float_bits(const kcg_signal *s, double v)
 
 static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive)
 {
-    const kcg_esc *e = s->esc == 255 ? NULL : &g->esc[s->esc];
-    int64_t x, v, by = 1, over = 1;
+    int64_t x, v, by, over;
     if (s->kind == KCG_OF_ALIVE)
         return (uint64_t)(alive % s->div);
-    if (!steps(g, s, e, now, &x))
+    if (!kcg_value(g, s, now, &x, &by, &over))
         return s->not_available;
-    if (s->divisor == KCG_BY_CELLS) {
-        if (!e->cells)
-            return s->not_available;
-        by = e->cells;
-    } else if (s->divisor == KCG_BY_POLES) {
-        by = e->settings.poles;
-    } else if (s->divisor == KCG_BY_OUTPUT) {
-        by = (int64_t)e->settings.poles * e->settings.gear_numerator, over = e->settings.gear_denominator;
-    }
     if (s->flags & KCG_TABLE) {
         const kcg_pair *p = g->plan->pair + s->first_pair, *end = p + s->pairs;
         while (p < end && p->number != x)
@@ -945,7 +950,7 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     }
     g->again = 0;
     if (e->arrivals && now - e->arrival[0].bound > e->settings.timeout)
-        flush(e);
+        flush(NULL, e);
     int64_t bound = since + ((int64_t)size - 1) * BYTE_NS;
     if (bound > now) /* a pseudo terminal is faster than the wire */
         bound = now;
@@ -959,6 +964,12 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     if (size)
         note_arrival(e, g->read_end, bound);
     return kcg_next_event(g);
+}
+
+void kcg_end(kcg *g, int esc)
+{
+    g->found_count = g->found_at = 0;
+    flush(g, &g->esc[esc]);
 }
 
 int kcg_expire(kcg *g, int64_t now)
@@ -979,7 +990,7 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
     kcg_esc *e = &g->esc[esc];
     if (!is_open) {
         uint64_t late = e->count[KCG_N_LATE];
-        flush(e);
+        flush(NULL, e);
         e->count[KCG_N_LATE] = late; /* that it was dropped is said by the link */
         report(g, esc, lose(e, KCG_PORT_ERROR), now);
     } else if (e->count[KCG_N_LINK] == KCG_PORT_ERROR) {

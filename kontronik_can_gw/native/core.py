@@ -40,7 +40,7 @@ class NativeCore:
         self.link_changes: list[int] = []
         self.shortest_timeout_ns = self._shortest_timeout()
         self.packs_at_once = False
-        handle = self._handle
+        self.handle = handle = self._handle
         self.receive, self.port, self.advance = handle.receive, handle.port, handle.advance
         self.expire, self.next_deadline = handle.expire, handle.next_deadline
         self.gateway_changed, self.repeat = handle.gateway_changed, handle.repeat

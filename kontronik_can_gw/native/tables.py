@@ -79,7 +79,7 @@ class Tables:
         for settings in escs:
             if (wire := protocol_named(settings.protocol).wire) is not None:
                 self.wire = " ".join(codes for codes, _ in wire)
-        self._wire = [_places(protocol_named(esc.protocol)) for esc in escs]
+        self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
         listeners: list[list[int]] = [[] for _ in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
@@ -151,35 +151,11 @@ class Tables:
         else:
             assert signal.source is not None
             try:
-                self._source(row, signal.source, signal.esc)
+                bind(row, signal.source, self._wire[signal.esc or 0], signal.esc)
                 self._scale(row, signal, signal.source)
             except NotInCore as error:
                 raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
         self.signals.append(row)
-
-    def _source(self, row: Any, value: Value, esc: int | None) -> None:
-        row.divisor = _DIVISORS[value.divisor]
-        if value.kind in (Kind.WIRE, Kind.BITS):
-            if not value.supplied or esc is None:
-                raise NotInCore("not supplied by this ESC's protocol")
-            is_info = value.group is Group.INFO
-            row.kind = OF_LAST if value.last else OF_INFO if is_info else OF_LIVE
-            row.place, row.wire = self._wire[esc][is_info][value.words[0]]
-            row.not_on = sum(1 << device for device in value.not_on)
-            if value.mask != -1:
-                row.shift, row.mask = value.shift, value.mask
-        elif value.kind is Kind.PRODUCT:
-            row.kind = OF_POWER
-        elif value.name == "uptime":
-            row.kind = OF_UPTIME
-        elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
-            row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
-        elif value.kind in _KINDS:
-            row.kind = _KINDS[value.kind]
-        elif _COUNT_OF.get(value.name, value.name) in COUNTS:
-            row.kind, row.place = OF_COUNT, COUNTS.index(_COUNT_OF.get(value.name, value.name))
-        else:
-            raise NotInCore(f"no source {value.name}")
 
     def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
         flags = 0
@@ -209,6 +185,8 @@ class Tables:
         row.flags = flags
 
 
+Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
+"""Offset after the header and wire type of each word of live data and of info."""
 _KINDS = {
     Kind.INTEGRAL: OF_ENERGY,
     Kind.RUN_TIME: OF_RUN_TIME,
@@ -216,6 +194,32 @@ _KINDS = {
     Kind.RATE: OF_RATE,
 }
 _COUNT_OF = {"received_bytes": "bytes"}
+
+
+def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
+    """Where the steps of a value come from, in a row of Signal. NotInCore where the core does not have it."""
+    row.divisor = _DIVISORS[value.divisor]
+    if value.kind in (Kind.WIRE, Kind.BITS):
+        if not value.supplied or esc is None:
+            raise NotInCore("not supplied by this ESC's protocol")
+        is_info = value.group is Group.INFO
+        row.kind = OF_LAST if value.last else OF_INFO if is_info else OF_LIVE
+        row.place, row.wire = places[is_info][value.words[0]]
+        row.not_on = sum(1 << device for device in value.not_on)
+        if value.mask != -1:
+            row.shift, row.mask = value.shift, value.mask
+    elif value.kind is Kind.PRODUCT:
+        row.kind = OF_POWER
+    elif value.name == "uptime":
+        row.kind = OF_UPTIME
+    elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
+        row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
+    elif value.kind in _KINDS:
+        row.kind = _KINDS[value.kind]
+    elif _COUNT_OF.get(value.name, value.name) in COUNTS:
+        row.kind, row.place = OF_COUNT, COUNTS.index(_COUNT_OF.get(value.name, value.name))
+    else:
+        raise NotInCore(f"no source {value.name}")
 
 
 def settings_of(esc: EscSettings) -> Any:
@@ -242,11 +246,11 @@ def nearest_settings(esc: EscSettings) -> Any:
     return settings_of(replace(esc, gear=gear, pole_pairs=poles, cell_count=cells))
 
 
-def _places(protocol: EscProtocol) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def places_of(protocol: EscProtocol) -> Places:
     """Offset after the header and wire type of each word of live data and of info."""
     if protocol.wire is None:
         raise NotInCore(f"ESC protocol {protocol.name}")
-    found: tuple[list[tuple[int, int]], list[tuple[int, int]]] = ([], [])
+    found: Places = ([], [])
     for places, (codes, _) in zip(found, protocol.wire, strict=True):
         at = 0
         for code in codes:

@@ -100,6 +100,9 @@ class CanLogInput(Input):
         self.others = 0
         """Frames that the layout does not have; complete when it was read to the end."""
 
+    def batches(self) -> Iterator[list[TimedFrame]]:
+        yield from ([frame] for frame in self.frames())
+
     def frames(self) -> Iterator[TimedFrame]:
         self._log.close()
         self._log = CanLog(self._path)
@@ -127,7 +130,7 @@ class CanLogInput(Input):
     def fields(self) -> Sequence[Field]:
         return fields_of_log(self.reader, self.bus.escs)
 
-    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         yield from samples_of_frames(self.frames(), self.reader, self._chosen(chosen))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
