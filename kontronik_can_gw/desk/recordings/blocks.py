@@ -5,12 +5,13 @@ They are the same as samples.py and capture/replay.py give one by one.
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.columns import Values, values_of_fields
 from kontronik_can_gw.desk.recordings.fields import Field
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway, MakeOutput
 from kontronik_can_gw.native.load import library
 from kontronik_can_gw.signals.plan import Layout
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames, Rows
     from kontronik_can_gw.native.player import Player
 
+LATEST_NS = 1 << 63
+"""Later than any time of a recording."""
+DISORDER_NS = SECOND
+"""Frames of several interfaces may stand in a log a little out of order."""
 NO_MESSAGES = Layout("", "", ())
 MakeGateway = Callable[[Sequence[MakeOutput]], Gateway]
 """Outputs besides to a gateway."""
@@ -49,7 +54,8 @@ def player_of(
     return player, gateway
 
 
-class RowBlock(NamedTuple):
+@dataclass(frozen=True)
+class RowBlock:
     """Rows ``begin`` to ``end`` of ``rows``. Their times count from ``origin_ns``; with ``wall_ns`` added they are Unix times."""
 
     rows: "Rows"
@@ -69,7 +75,7 @@ class RowBlock(NamedTuple):
     def between(self, start_ns: int | None, end_ns: int | None) -> "RowBlock":
         """Its rows in a stretch of time; ``end_ns`` included, both count from the origin."""
         begin, end = _between(self.times, start_ns, end_ns, self.origin_ns)
-        return self._replace(begin=self.begin + begin, end=self.begin + end)
+        return replace(self, begin=self.begin + begin, end=self.begin + end)
 
     def values(self) -> Iterator[tuple[int, Values]]:
         """Time and values of each row."""
@@ -88,11 +94,30 @@ def _between(
     return begin, max(begin, end)
 
 
-def frames_between(
-    frames: "Frames", start_ns: int | None, end_ns: int | None, origin_ns: int
-) -> "Frames":
-    """Those in a stretch of time; ``end_ns`` included, both count from the origin."""
-    return frames.part(*_between(frames.times, start_ns, end_ns, origin_ns))
+def time_at(frames: "Frames | list[TimedFrame]", index: int) -> int:
+    """Time of one of the frames, ns."""
+    found: int = frames[index].time_ns if isinstance(frames, list) else frames.times[index]
+    return found
+
+
+def cut(
+    batches: "Iterator[Frames | list[TimedFrame]]",
+    start_ns: int | None,
+    end_ns: int | None,
+    origin_ns: int,
+) -> "Iterator[Frames | list[TimedFrame]]":
+    """The frames from one time to another, both after ``origin_ns``; ``end_ns`` included. No batch is empty."""
+    low = -LATEST_NS if start_ns is None else start_ns + origin_ns
+    high = LATEST_NS if end_ns is None else end_ns + origin_ns
+    for frames in batches:
+        if time_at(frames, 0) > high + DISORDER_NS:
+            return
+        if isinstance(frames, list):
+            found: Any = [one for one in frames if low <= one.time_ns <= high]
+        else:
+            found = frames.part(*_between(frames.times, start_ns, end_ns, origin_ns))
+        if len(found):
+            yield found
 
 
 def timed(frames: "Frames | list[TimedFrame]") -> Iterator[TimedFrame]:

@@ -7,6 +7,7 @@ come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
@@ -28,6 +29,8 @@ __all__ = ["LIVE_RATE", "CanLogInput", "CaptureInput", "DumpInput", "Input", "op
 
 _HEAD = 1 << 16
 _MAX_IDS = 4096
+_BATCH = 256
+"""Frames."""
 
 
 def open_input(
@@ -101,7 +104,9 @@ class CanLogInput(Input):
         """Frames that the layout does not have; complete when it was read to the end."""
 
     def batches(self) -> Iterator[list[TimedFrame]]:
-        yield from ([frame] for frame in self.frames())
+        frames = self.frames()
+        while some := list(islice(frames, _BATCH)):
+            yield some
 
     def frames(self) -> Iterator[TimedFrame]:
         self._log.close()
