@@ -386,7 +386,7 @@ static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
 }
 
 /* The steps of a value before its divisor; 0 where it is not available. */
-static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
+static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
 {
     switch (s->kind) {
     case KCG_OF_LIVE:
@@ -420,7 +420,7 @@ static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t no
     return !s->not_on || supplied(e, s->not_on, *x);
 }
 
-int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
+static inline int value_of(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
 {
     const kcg_esc *e = s->esc == 255 ? NULL : &g->esc[s->esc];
     *by = *over = 1;
@@ -433,6 +433,11 @@ int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_
     else if (s->divisor == KCG_BY_OUTPUT)
         *by = (int64_t)e->settings.poles * e->settings.gear_numerator, *over = e->settings.gear_denominator;
     return *by != 0; /* the number of cells may not be known */
+}
+
+int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
+{
+    return value_of(g, s, now, x, by, over);
 }
 
 #if KCG_FLOATS
@@ -463,7 +468,7 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
     int64_t x, v, by, over;
     if (s->kind == KCG_OF_ALIVE)
         return (uint64_t)(alive % s->div);
-    if (!kcg_value(g, s, now, &x, &by, &over))
+    if (!value_of(g, s, now, &x, &by, &over))
         return s->not_available;
     if (s->flags & KCG_TABLE) {
         const kcg_pair *p = g->plan->pair + s->first_pair, *end = p + s->pairs;
@@ -738,6 +743,12 @@ static uint8_t e2e_crc(const kcg_frame *f, int at, int data_id) /* AUTOSAR E2E p
     return c;
 }
 
+static void put_u64(uint8_t *p, uint64_t v)
+{
+    p[0] = (uint8_t)v, p[1] = (uint8_t)(v >> 8), p[2] = (uint8_t)(v >> 16), p[3] = (uint8_t)(v >> 24);
+    p[4] = (uint8_t)(v >> 32), p[5] = (uint8_t)(v >> 40), p[6] = (uint8_t)(v >> 48), p[7] = (uint8_t)(v >> 56);
+}
+
 static void make_frame(kcg *g, uint16_t i, int64_t now, kcg_frame *f)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -752,8 +763,8 @@ static void make_frame(kcg *g, uint16_t i, int64_t now, kcg_frame *f)
     memset(f, 0, sizeof *f);
     f->page = (uint8_t)place;
     f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
-    for (int k = 0; k < m->length; k++)
-        f->data[k] = (uint8_t)(bits[k / 8] >> k % 8 * 8);
+    for (int k = 0; k < m->words; k++) /* beyond the length they are 0 */
+        put_u64(f->data + k * 8, bits[k]);
     if (m->flags & KCG_HAS_CRC)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
 }
