@@ -7,6 +7,7 @@ import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -55,3 +56,14 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
         pytest.skip(f"the core in C: {why}; sudo apt-get install gcc libc6-dev, and install again")
     yield request.param
     load.library.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def native_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The core in C, optimised, for any layout; no warning of the compiler."""
+    from built import STRICT, built
+
+    from kontronik_can_gw.native.binding import load
+    from kontronik_can_gw.native.compile import FOR_LINUX
+
+    return load(built(tmp_path_factory.mktemp("native") / "core.so", *STRICT, "-O2", *FOR_LINUX))

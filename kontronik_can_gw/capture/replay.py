@@ -79,6 +79,10 @@ class Replay:
         """True while the next entry decides whether the frames of the last turn were sent."""
         return bool(self._taken)
 
+    def go_on(self, taken: list[TimedFrame]) -> None:
+        """Take over from another that played this replay's gateway: the frames of its last turn."""
+        self._taken += taken
+
     def finish(self) -> list[TimedFrame]:
         """Return the frames of the last turn, after the last entry."""
         found, self._taken = self._taken, []

@@ -162,7 +162,7 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
         const uint8_t *e = p + COUNT + (size_t)o->index * ENTRY, *data = p + o->data_at;
         uint32_t kind = e[8], esc = e[10] | (uint32_t)e[11] << 8, length = u32(e + 12), before = o->count;
         uint64_t time = u64(e);
-        if (time >= END_OF_TIME)
+        if (time >= END_OF_TIME || o->last >= END_OF_TIME)
             return KCG_OTHER_ENTRY;
         int64_t now = (int64_t)time > o->last ? (int64_t)time : o->last;
         if (kind == BYTES) {

@@ -150,8 +150,6 @@ class Player(Output):
         state = self._state
         state.last = last_ns
         why = self._library.kcg_play(c.byref(state), self._payload, len(self._payload))
-        if why == _OTHER_ENTRY:
-            state.sure = state.count
         return why == _OTHER_ENTRY, state.last
 
     # --- plain bytes of one ESC
@@ -190,6 +188,8 @@ class Player(Output):
     def take_frames(self, final: bool = False) -> Frames:
         """The frames that are sure: those of the last turn are only by the next entry, or because there is none (``final``)."""
         state = self._state
+        if self._columns is not None:
+            return Frames(self._library, (Frame * 0)(), (_i64 * 0)(), 0, 0)
         sure = state.count if final else state.sure
         found = Frames(self._library, self._frames, self._times, 0, sure)
         if sure:

@@ -13,7 +13,7 @@ from kontronik_can_gw.desk.recordings.columns import Values, values_of_fields
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway, MakeOutput
-from kontronik_can_gw.native.load import library
+from kontronik_can_gw.native import load
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def player_of(
     make: MakeGateway, fields: Sequence[Field] | None, escs: Sequence[EscSettings], now: int
 ) -> "tuple[Player, Gateway] | None":
     """What plays a recording at once, for rows of ``fields`` or for frames (None), and the gateway that it plays. None: Python must."""
-    if library()[0] is None:
+    if load.library()[0] is None:
         return None
     from kontronik_can_gw.native.offline import ColumnOf
     from kontronik_can_gw.native.player import Player

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames
 
 _MS = 1_000_000
+_LATEST_NS = 1 << 61
 Write = Callable[[int, CanFrame, bool], None]
 
 
@@ -67,7 +68,8 @@ class CanLogWriter:
         elif format_ == "candump":
             self.write = _candump(file, wall_start_ns or 0, channel)
             half = 500 + (wall_start_ns or 0)
-            self._at_once = lambda frames, origin_ns: frames.candump(half - origin_ns, channel)
+            if 0 <= half < _LATEST_NS:
+                self._at_once = lambda frames, origin_ns: frames.candump(half - origin_ns, channel)
         elif format_ == "asc":
             self._asc(file, base_ns, None if wall_start_ns is None else start_ns)
         elif format_ == "blf":

@@ -13,7 +13,7 @@ from kontronik_can_gw.desk.recordings.blocks import RowBlock
 from kontronik_can_gw.desk.recordings.columns import Known, Values
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row, rows_of_block
-from kontronik_can_gw.native.load import library
+from kontronik_can_gw.native import load
 from kontronik_can_gw.signals.unpacker import Value
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class _Lines:
                 skip = len(prefix) - len(self._separator)
                 words = [(number, cell(text)[skip:].encode()) for number, text in one.texts]
             cells.append((prefix.encode(), words))
-        return Lines(library()[0], style, cells)
+        return Lines(load.library()[0], style, cells)
 
     def close(self) -> None:
         """Write what has gathered."""
