@@ -32,6 +32,7 @@ TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
     *("gateway", "golden", "dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
     *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
+    *("recordings/test_plain_bytes.py", "recordings/test_tables.py"),
 )
 """Files and folders of tests of what the core does: they run on the core in C and on the one in Python."""
 

@@ -61,13 +61,20 @@ def declare(library: Any, *structures: Any) -> None:
         raise NotInCore("the shared object has other structures")
 
 
+def _address(memory: bytearray) -> int:
+    """Of memory that is there, and is not made longer, while the address is used."""
+    return c.addressof(c.c_char.from_buffer(memory))
+
+
 class Frames:
     """Frames that were sent: ``times`` in ns, which do not decrease."""
 
-    def __init__(self, library: Any, memory: Any, times: Any, begin: int, end: int) -> None:
+    def __init__(
+        self, library: Any, memory: bytearray, times: bytearray, begin: int, end: int
+    ) -> None:
         self._library, self._memory, self._times = library, memory, times
         self._begin, self._end = begin, end
-        self.times = memoryview(times).cast("B").cast("q")[begin:end]
+        self.times = memoryview(times).cast("q")[begin:end]
 
     def __len__(self) -> int:
         return self._end - self._begin
@@ -79,7 +86,7 @@ class Frames:
         )
 
     def __iter__(self) -> Iterator[tuple[int, CanFrame]]:
-        raw = memoryview(self._memory).cast("B")
+        raw = self._memory
         size = c.sizeof(Frame)
         for time_ns, at in zip(
             self.times, range(self._begin * size, self._end * size, size), strict=True
@@ -91,14 +98,16 @@ class Frames:
                 CanFrame(number & ~EXTENDED, data, number >= EXTENDED, flags != 0, page),
             )
 
-    def candump(self, shift_ns: int, channel: str) -> bytes:
+    def candump(self, shift_ns: int, channel: str) -> memoryview:
         """Lines of a candump log, with microseconds of the time and ``shift_ns``."""
+        if not len(self):
+            return memoryview(b"")
         name = channel.encode()
-        out = c.create_string_buffer(len(self) * (len(name) + 190))
-        frames = c.addressof(self._memory) + self._begin * c.sizeof(Frame)
-        times = c.addressof(self._times) + self._begin * 8
-        length = self._library.kcg_candump(frames, times, len(self), shift_ns, name, out)
-        return c.string_at(out, length)
+        out = bytearray(len(self) * (len(name) + 190))
+        frames = _address(self._memory) + self._begin * c.sizeof(Frame)
+        times = _address(self._times) + self._begin * 8
+        write = self._library.kcg_candump
+        return memoryview(out)[: write(frames, times, len(self), shift_ns, name, _address(out))]
 
 
 class ColumnOf(NamedTuple):
@@ -152,7 +161,7 @@ class Rows:
     def addresses(self) -> list[int]:
         """Of the times, then of each column's values and valid bits."""
         every = (self._times, *self._values, *self.valid)
-        return [c.addressof(c.c_char.from_buffer(one)) for one in every]
+        return [*map(_address, every)]
 
 
 class Lines:

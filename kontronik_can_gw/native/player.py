@@ -69,8 +69,10 @@ class Player(Output):
         self._settings = core.escs[0].settings
         self._state.core = handle.core
         if self._columns is None:
-            self._state.room = max(_FRAMES, 2 * handle.pages)
-            self._new_frames()
+            self._state.room = room = max(_FRAMES, 2 * handle.pages)
+            self._frames, self._times = (Frame * room)(), (_i64 * room)()
+            self._state.frame = c.addressof(self._frames)
+            self._state.frame_time = c.addressof(self._times)
             return
         self._state.room = ROWS
         self._state.gateway_ns = now - 100_000_000
@@ -104,12 +106,6 @@ class Player(Output):
         state = self._state
         state.column, state.first = c.addressof(table), c.addressof(self._first)
         state.age, state.ages = c.addressof(self._ages), len(ages)
-
-    def _new_frames(self) -> None:
-        room = self._state.room
-        self._frames, self._times = (Frame * room)(), (_i64 * room)()
-        self._state.frame = c.addressof(self._frames)
-        self._state.frame_time = c.addressof(self._times)
 
     def _new_rows(self) -> None:
         assert self._columns is not None
@@ -189,16 +185,15 @@ class Player(Output):
         """The frames that are sure: those of the last turn are only by the next entry, or because there is none (``final``)."""
         state = self._state
         if self._columns is not None:
-            return Frames(self._library, (Frame * 0)(), (_i64 * 0)(), 0, 0)
+            return Frames(self._library, bytearray(), bytearray(), 0, 0)
         sure = state.count if final else state.sure
-        found = Frames(self._library, self._frames, self._times, 0, sure)
-        if sure:
-            rest = state.count - sure
-            left = self._frames[sure : state.count], self._times[sure : state.count]
-            self._new_frames()
-            self._frames[:rest], self._times[:rest] = left
-            state.count, state.sure = rest, 0
-        return found
+        state.count, state.sure = state.count - sure, 0
+        taken = []
+        for held in (self._frames, self._times):
+            size, begin = c.sizeof(held) // state.room, c.addressof(held)
+            taken.append(bytearray(c.string_at(begin, size * sure)))
+            c.memmove(begin, begin + size * sure, size * state.count)
+        return Frames(self._library, taken[0], taken[1], 0, sure)
 
     @property
     def has_rows(self) -> bool:

@@ -50,7 +50,7 @@ def test_no_byte_outside_its_memory_and_nothing_undefined(tmp_path: Path) -> Non
     script.write_text(
         "import pathlib\nimport equality\nfrom kontronik_can_gw.native.binding import load\n"
         f"library = load(pathlib.Path({str(target)!r}))\n"
-        "print(sum(equality.run(native_library, seed) for seed in range(10)))\n"
+        "print(sum(equality.run(library, seed) for seed in range(10)))\n"
     )
     environment = os.environ | {
         "LD_PRELOAD": " ".join(each.stdout.strip() for each in found),

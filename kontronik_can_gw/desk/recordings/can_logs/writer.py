@@ -47,7 +47,7 @@ class CanLogWriter:
         """Frames that the format does not know, by what they are."""
         self.write: Write
         """Add a frame: its time in ns, the frame, whether it was received."""
-        self._at_once: Callable[[Frames, int], bytes] | None = None
+        self._at_once: Callable[[Frames, int], memoryview] | None = None
         self._file = file
         self.close: Callable[[], object] = lambda: None
         """Write what is held back, and the end. The file stays open."""
