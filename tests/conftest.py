@@ -7,6 +7,7 @@ import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -37,6 +38,7 @@ ON_BOTH_CORES = (
     ),
     *("runtime/test_hold_ups.py", "runtime/test_can_hold_ups.py"),
     *("runtime/test_esc_input.py", "runtime/test_snapshot.py"),
+    *("recordings/test_plain_bytes.py", "recordings/test_tables.py"),
 )
 """Files and folders of tests of what the core does: they run on the core in C and on the one in Python."""
 
@@ -65,3 +67,14 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
         pytest.skip(f"the core in C: {why}; sudo apt-get install gcc libc6-dev, and install again")
     yield language
     library.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def native_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The core in C, optimised, for any layout; no warning of the compiler."""
+    from built import STRICT, built
+
+    from kontronik_can_gw.native.binding import load
+    from kontronik_can_gw.native.objects import OPTIONS
+
+    return load(built(tmp_path_factory.mktemp("native") / "core.so", *STRICT, "-O2", *OPTIONS))

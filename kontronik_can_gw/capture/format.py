@@ -185,6 +185,16 @@ def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
         raise ValueError("is not as long as its table says")
 
 
+def entry_at(payload: bytes, number: int, begin: int) -> Entry:
+    """One entry of an intact data block (of version 2). ``begin``: where its data begin."""
+    at = _COUNT.size + number * _ENTRY.size
+    time_ns, kind, flags, index, length = _ENTRY.unpack_from(payload, at)
+    data, came_ns = payload[begin : begin + length], None
+    if kind in _WITH_ARRIVAL:
+        came_ns, data = _NUMBER.unpack_from(data)[0], data[_NUMBER.size :]
+    return Entry(time_ns, kind, index, data, flags, came_ns)
+
+
 def frame_data(frame: CanFrame) -> bytes:
     """A CAN frame as the data of an entry: u32 id (bit 31: 29 bits), u8 flags (1 FD, 2 remote), its bytes."""
     return (

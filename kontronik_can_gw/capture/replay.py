@@ -74,6 +74,15 @@ class Replay:
             self.rejected += 1
         return found
 
+    @property
+    def frames_wait(self) -> bool:
+        """True while the next entry decides whether the frames of the last turn were sent."""
+        return bool(self._taken)
+
+    def go_on(self, taken: list[TimedFrame]) -> None:
+        """Take over from another that played this replay's gateway: the frames of its last turn."""
+        self._taken += taken
+
     def finish(self) -> list[TimedFrame]:
         """Return the frames of the last turn, after the last entry."""
         found, self._taken = self._taken, []

@@ -149,6 +149,7 @@ class Handle:
             raise NotInCore(f"fields on the wire: {tables.wire}")
         self.library = library
         self._on_event = on_event
+        self.pages = tables.pages
         arrays = {name: self._array(*table) for name, table in tables.arrays.items()}
         self.messages, self.signals, self.pieces = (
             arrays[name] for name in ("message", "signal", "piece")

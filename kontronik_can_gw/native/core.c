@@ -218,9 +218,9 @@ static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
     hold(e, data + at, size - at);
 }
 
-static void flush(kcg_esc *e)
+static void flush(kcg *g, kcg_esc *e)
 {
-    scan(NULL, e, e->held, e->held_count, 1);
+    scan(g, e, e->held, e->held_count, 1);
     e->held_count = 0;
     e->need = 1;
     e->blame_until = e->base;
@@ -410,8 +410,8 @@ static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
     return (e->has_info || x) && !(e->had_info && not_on >> (e->info[1] >> 2) & 1);
 }
 
-/* The steps of a value; 0 where it is not available. */
-static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
+/* The steps of a value before its divisor; 0 where it is not available. */
+static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
 {
     switch (s->kind) {
     case KCG_OF_LIVE:
@@ -439,11 +439,31 @@ static int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t no
         return e->rate >= 0;
     case KCG_OF_GATEWAY: *x = g->gateway[s->place]; return 1;
     case KCG_OF_STATUS: *x = e->link | (g->gateway[KCG_GATEWAY_STATE] == s->place) << 6 | e->has_info << 7; return 1;
-    default: *x = (now - g->gateway[KCG_STARTED]) / 1000000; return 1;
+    default: *x = floor_div(now - g->gateway[KCG_STARTED], 1000000); return 1; /* a row may be of just before */
     }
     if (s->mask)
         *x = *x >> s->shift & s->mask;
     return !s->not_on || supplied(e, s->not_on, *x);
+}
+
+static inline int value_of(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
+{
+    const kcg_esc *e = s->esc == 255 ? NULL : &g->esc[s->esc];
+    *by = *over = 1;
+    if (!steps(g, s, e, now, x))
+        return 0;
+    if (s->divisor == KCG_BY_CELLS)
+        *by = e->cells;
+    else if (s->divisor == KCG_BY_POLES)
+        *by = e->settings.poles;
+    else if (s->divisor == KCG_BY_OUTPUT)
+        *by = (int64_t)e->settings.poles * e->settings.gear_numerator, *over = e->settings.gear_denominator;
+    return *by != 0; /* the number of cells may not be known */
+}
+
+int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
+{
+    return value_of(g, s, now, x, by, over);
 }
 
 #if KCG_FLOATS
@@ -489,19 +509,10 @@ static uint64_t float_bits(const kcg_signal *s, double v)
 
 static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive)
 {
-    const kcg_esc *e = s->esc == 255 ? NULL : &g->esc[s->esc];
-    int64_t x, v, by = 1, over = 1;
+    int64_t x, v, by, over;
     if (s->kind == KCG_OF_ALIVE)
         return (uint64_t)(alive % s->div);
-    if (!steps(g, s, e, now, &x))
-        return s->not_available;
-    if (s->divisor == KCG_BY_CELLS)
-        by = e->cells;
-    else if (s->divisor == KCG_BY_POLES)
-        by = e->settings.poles;
-    else if (s->divisor == KCG_BY_OUTPUT)
-        by = (int64_t)e->settings.poles * e->settings.gear_numerator, over = e->settings.gear_denominator;
-    if (!by)
+    if (!value_of(g, s, now, &x, &by, &over))
         return s->not_available;
     if (s->flags & KCG_TABLE) {
         const kcg_pair *p = g->plan->pair + s->first_pair, *end = p + s->pairs;
@@ -941,6 +952,12 @@ static uint8_t e2e_crc(const kcg_frame *f, int at, int data_id) /* AUTOSAR E2E p
     return c;
 }
 
+static void put_u64(uint8_t *p, uint64_t v)
+{
+    p[0] = (uint8_t)v, p[1] = (uint8_t)(v >> 8), p[2] = (uint8_t)(v >> 16), p[3] = (uint8_t)(v >> 24);
+    p[4] = (uint8_t)(v >> 32), p[5] = (uint8_t)(v >> 40), p[6] = (uint8_t)(v >> 48), p[7] = (uint8_t)(v >> 56);
+}
+
 static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -957,8 +974,8 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     memset(f, 0, sizeof *f);
     f->page = (uint8_t)place;
     f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
-    for (int k = 0; k < m->length; k++, bits[(k - 1) / 8] >>= 8)
-        f->data[k] = (uint8_t)bits[k / 8];
+    for (int k = 0; k < (int)WORDS_OF(m); k++) /* beyond the length they are 0 */
+        put_u64(f->data + k * 8, bits[k]);
     if (KCG_E2E && m->flags & KCG_HAS_CRC)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
 }
@@ -1176,7 +1193,7 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     }
     g->again = 0;
     if (e->arrivals && now - e->arrival_bound[0] > e->settings.timeout)
-        flush(e);
+        flush(NULL, e);
     int64_t bound = earlier(now, since + ((int64_t)size - 1) * BYTE_NS); /* a pseudo terminal is faster than the wire */
     g->read_esc = esc;
     g->read_now = now;
@@ -1188,6 +1205,12 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     if (size)
         note_arrival(e, g->read_end, bound);
     return kcg_next_event(g);
+}
+
+void kcg_end(kcg *g, int esc)
+{
+    g->found_count = g->found_at = 0;
+    flush(g, &g->esc[esc]);
 }
 
 int kcg_expire(kcg *g, int64_t now)
@@ -1208,7 +1231,7 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
     kcg_esc *e = &g->esc[esc];
     if (!is_open) {
         uint64_t late = e->count[KCG_N_LATE];
-        flush(e);
+        flush(NULL, e);
         e->count[KCG_N_LATE] = late; /* that it was dropped is said by the link */
         report(g, esc, lose(e, KCG_PORT_ERROR), now);
     } else if (e->link == KCG_PORT_ERROR) {

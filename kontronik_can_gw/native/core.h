@@ -190,6 +190,10 @@ void kcg_slot_news(kcg *g, uint32_t slot, int64_t now);
 void kcg_slot_send(kcg *g, uint32_t slot, int64_t now);
 int kcg_slot_is_news(const kcg *g, uint32_t slot);
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
+/* The stream of an ESC has ended: what is held is decided. Frames in it are in g->found, and not taken. */
+void kcg_end(kcg *g, int esc);
+/* The steps of a value and what they are divided by, x * over / by; 0 where it is not available. */
+int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over);
 uint64_t kcg_count(const kcg_esc *e, int what);
 uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
 /* For a caller that cannot see structures: 0 KCG_SOURCE, then the sizes of signal, message, settings, plan, ESC and frame. */

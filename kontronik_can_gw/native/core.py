@@ -51,7 +51,7 @@ class NativeCore:
         self.link_changes: list[int] = []
         self.shortest_timeout_ns = self._shortest_timeout()
         self.packs_at_once = False
-        handle = self._handle
+        self.handle = handle = self._handle
         self.receive, self.port, self.expire = handle.receive, handle.port, handle.expire
         self.gateway_changed, self.repeat = handle.gateway_changed, handle.repeat
         self.stop = handle.stop

@@ -90,7 +90,7 @@ class Tables:
         """Of each slot."""
         self.listeners_of: list[list[int]] = [[] for _ in escs]
         """The messages that follow events of each ESC."""
-        self._wire = [_places(protocol_named(esc.protocol)) for esc in escs]
+        self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
             raise NotInCore(f"{len(escs)} ESCs, {len(layout.messages)} messages")
@@ -192,39 +192,12 @@ class Tables:
         else:
             assert signal.source is not None
             try:
-                self._source(row, signal.source, signal.esc)
+                bind(row, signal.source, self._wire[signal.esc or 0], signal.esc)
                 self._scale(row, signal, signal.source)
             except NotInCore as error:
                 raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
         self.signals.append(row)
         self.signal_names.append(f"{plan.name}.{signal.name}")
-
-    def _source(self, row: Any, value: Value, esc: int | None) -> None:
-        row.divisor = _DIVISORS[value.divisor]
-        name = _NAME_OF.get(value.name, value.name)
-        if value.kind in (Kind.WIRE, Kind.BITS):
-            if not value.supplied or esc is None:
-                raise NotInCore("not supplied by this ESC's protocol")
-            is_info = value.group is Group.INFO or value.last
-            row.kind = OF_LAST if value.last else OF_INFO if is_info else OF_LIVE
-            row.place, row.wire = self._wire[esc][is_info][value.words[0]]
-            row.not_on = sum(1 << device for device in value.not_on)
-            if value.mask != -1:
-                row.shift, row.mask = value.shift, value.mask
-        elif value.kind is Kind.PRODUCT:
-            row.kind = OF_POWER
-        elif value.name == "uptime":
-            row.kind = OF_UPTIME
-        elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
-            row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
-        elif value.kind in _KINDS:
-            row.kind = _KINDS[value.kind]
-        elif value.kind is Kind.OBJECT and value.name == "link_status":
-            row.kind, row.place = OF_STATUS, GatewayState.REPLAY
-        elif name in COUNTS and (value.kind is not Kind.OBJECT or value.name in _NAME_OF):
-            row.kind, row.place = OF_COUNT, COUNTS.index(name)
-        else:
-            raise NotInCore(f"no source {value.name}")
 
     def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
         flags = 0
@@ -254,6 +227,8 @@ class Tables:
         row.flags = flags
 
 
+Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
+"""Offset after the header and wire type of each word of live data and of info."""
 _KINDS = {
     Kind.INTEGRAL: OF_ENERGY,
     Kind.RUN_TIME: OF_RUN_TIME,
@@ -262,6 +237,35 @@ _KINDS = {
 }
 _NAME_OF = {"received_bytes": "bytes", "live_counter": "live_frames"}
 """Of values that are one of COUNTS under another name."""
+
+
+def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
+    """Where the steps of a value come from, in a row of Signal. NotInCore where the core does not have it."""
+    row.divisor = _DIVISORS[value.divisor]
+    name = _NAME_OF.get(value.name, value.name)
+    if value.kind in (Kind.WIRE, Kind.BITS):
+        if not value.supplied or esc is None:
+            raise NotInCore("not supplied by this ESC's protocol")
+        is_info = value.group is Group.INFO or value.last
+        row.kind = OF_LAST if value.last else OF_INFO if is_info else OF_LIVE
+        row.place, row.wire = places[is_info][value.words[0]]
+        row.not_on = sum(1 << device for device in value.not_on)
+        if value.mask != -1:
+            row.shift, row.mask = value.shift, value.mask
+    elif value.kind is Kind.PRODUCT:
+        row.kind = OF_POWER
+    elif value.name == "uptime":
+        row.kind = OF_UPTIME
+    elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
+        row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
+    elif value.kind in _KINDS:
+        row.kind = _KINDS[value.kind]
+    elif value.kind is Kind.OBJECT and value.name == "link_status":
+        row.kind, row.place = OF_STATUS, GatewayState.REPLAY
+    elif name in COUNTS and (value.kind is not Kind.OBJECT or value.name in _NAME_OF):
+        row.kind, row.place = OF_COUNT, COUNTS.index(name)
+    else:
+        raise NotInCore(f"no source {value.name}")
 
 
 def settings_of(esc: EscSettings) -> Any:
@@ -285,11 +289,11 @@ def held_settings(esc: EscSettings) -> Any:
         return row
 
 
-def _places(protocol: EscProtocol) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def places_of(protocol: EscProtocol) -> Places:
     """Offset after the header and wire type of each word of live data and of info."""
     if protocol.wire is None:
         raise NotInCore(f"ESC protocol {protocol.name}")
-    found: tuple[list[tuple[int, int]], list[tuple[int, int]]] = ([], [])
+    found: Places = ([], [])
     for places, (codes, _) in zip(found, protocol.wire, strict=True):
         at = 0
         for code in codes:

@@ -8,6 +8,7 @@ The obvious program says how many frames a file has.
 
 import argparse
 import json
+import os
 import random
 import re
 import subprocess
@@ -95,10 +96,15 @@ def converted(context: Context, form: str) -> Path:
     return context.folder / f"converted{'.log' if form == 'candump' else f'.{form}'}"
 
 
-def convert(context: Context, form: str, source: Path, *options: object) -> Run:
-    """One conversion in a process of its own, into ``converted``."""
+def convert(
+    context: Context, form: str, source: Path, *options: object, python: bool = False
+) -> Run:
+    """One conversion in a process of its own, into ``converted``. ``python``: without the core in C."""
     command = [sys.executable, __file__, form, source, converted(context, form), *options]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=3600)
+    core = os.environ | {"KONTRONIK_PURE": "1" if python else "0"}
+    done = subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, timeout=3600, env=core
+    )
     if done.returncode:
         raise RuntimeError(f"{form}: {(done.stderr.strip().splitlines() or ['no word'])[-1]}")
     return Run(**json.loads(done.stdout))
@@ -113,7 +119,7 @@ def best(context: Context, form: str, source: Path, *options: object) -> Run:
 def convert_here(arguments: list[str]) -> Run:
     """In this process. The libraries are loaded before the clock starts."""
     from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
-    from kontronik_can_gw.desk.recordings.inputs import DumpInput
+    from kontronik_can_gw.desk.recordings.inputs import open_input
     from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
     from kontronik_can_gw.desk.recordings.tables.rows import Choice
     from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -129,7 +135,7 @@ def convert_here(arguments: list[str]) -> Run:
 
         pyarrow.array([0])  # imports pandas where it is installed
     layout = None if args.dbc is None else layout_of_dbc(args.dbc)
-    with DumpInput(Path(args.source), layout) as recording:
+    with open_input(Path(args.source), layout) as recording:
         convert_all = partial(to_log, form=args.form)
         if args.form in TABLES:
             names = LiveData._fields if args.live else ()
@@ -193,6 +199,102 @@ def tables(context: Context) -> list[Figure]:
             note = f"a CPU second; {run.count / run.wall_s:.0f} by the clock, {run.peak_mb:.0f} MB of memory"
             figures.append(Figure(f"{form}, {what}", run.count / run.cpu_s, "rows/s", note=note))
     return figures
+
+
+def capture(context: Context, seconds: int, noise: bool = False) -> Path:
+    """Of one ESC, as a recorder writes it: a read and a turn for each UART frame. ``noise``: 5 % of the frames are spoilt."""
+    from kontronik_can_gw.capture.format import Kind, block, data_payload, json_payload
+    from kontronik_can_gw.cli.recording import setup_of
+    from kontronik_can_gw.config.assemble import assemble
+    from kontronik_can_gw.config.parse import parse
+
+    file = context.folder / f"{'noise' if noise else 'capture'}-{seconds}.kcap"
+    if file.exists():
+        return file
+    chance, period, start = random.Random(SEED), 10_000_000, 1_000_000_000
+    setup = setup_of(assemble(parse({"esc": [{"port": "/dev/ttyUSB0"}]}, "bench.toml")))
+    header = setup.header() | {"created_ns": start, "monotonic_ns": start, "wall_ns": start << 30}
+    frames = [b"KOD" + frame for frame in flight(context).split(b"KOD")[1:]]
+    first = [(start, Kind.PORT_OPENED, 0, b"", 0, None), (start, Kind.START, 0, b"", 1, None)]
+    blocks = [(b"H", json_payload(header)), (b"D", data_payload(first))]
+    for at in range(0, 100 * seconds, 50):
+        entries: list[tuple[int, int, int, bytes, int, int | None]] = []
+        for number in range(at, at + 50):
+            now, wire = start + number * period, frames[number % len(frames)]
+            if noise and chance.random() < 0.05:
+                wire = spoilt(wire * 100, number)[: len(wire)] + chance.randbytes(3)
+            entries.append((now, Kind.BYTES, 0, wire, 0, now - 4_000_000))
+            entries.append((now, Kind.ADVANCE, 0, b"", 0, None))
+        blocks.append((b"D", data_payload(entries)))
+    every = enumerate([*blocks, (b"E", b"")])
+    file.write_bytes(b"".join(block(kind, number, payload) for number, (kind, payload) in every))
+    return file
+
+
+@benchmark(
+    "offline-capture", "an hour's capture of one ESC; with noise; by the core in C and by Python"
+)
+def captures(context: Context) -> list[Figure]:
+    """Seconds of CPU without the start of the program. Python is given a tenth of it."""
+    figures, seconds = [], 60 if context.quick else 3600
+    clean, noisy = capture(context, seconds), capture(context, seconds, noise=True)
+    short, hours = capture(context, seconds // 10), 3600 / seconds
+    forms = (
+        ("candump", (), ""),
+        ("parquet", ("--live",), ">= 400000"),
+        ("parquet", (), ">= 120000"),
+    )
+    for form, options, least in forms:
+        rounds = [
+            [convert(context, form, each, *options) for each in (clean, noisy)]
+            + [convert(context, form, short, *options, python=True)]
+            for _ in range(context.rounds)
+        ]
+        name = f"{form}{', 16 values' if options else ', all values' if least else ''}"
+        spent = median([first.cpu_s for first, _, _ in rounds]) * hours
+        figures.append(judged(f"{name}, an hour", spent, "s", "<= 2", rounds[0][0].told))
+        noise = median([noisy.cpu_s / first.cpu_s for first, noisy, _ in rounds])
+        figures.append(judged(f"{name}, with noise / without", noise, "x", "<= 1.5"))
+        gain = median([10 * python.cpu_s / first.cpu_s for first, _, python in rounds])
+        figures.append(Figure(f"{name}, Python / C", gain, "x"))
+        if least:
+            rows = median([first.count / first.cpu_s for first, _, _ in rounds])
+            figures.append(judged(f"{name}, rows", rows, "rows/s", least))
+    return figures
+
+
+@benchmark("offline-bytes", "UART bytes at full speed: MB a CPU second")
+def plain_bytes(context: Context) -> list[Figure]:
+    """Of the deframer alone, and of conversions without the start of the program."""
+    source, figures = recording(context, 1 if context.quick else 20), []
+    size = source.stat().st_size / _MB
+    aims = {
+        "candump": (("--dbc", FIVE), ">= 80"),
+        "parquet": (("--live",), ">= 70"),
+        "csv": (("--live",), ">= 30"),
+    }
+    figures.append(judged("scan", size / min(scan(source) for _ in range(7)), "MB/s", ">= 900"))
+    for form, (options, aim) in aims.items():
+        run = best(context, form, source, *options)
+        figures.append(judged(f"{form}, bytes", size / run.cpu_s, "MB/s", aim, run.told))
+    return figures
+
+
+def scan(source: Path) -> float:
+    """CPU seconds that the core in C needs to find all frames."""
+    from kontronik_can_gw.esc.telemetry import EscSettings
+    from kontronik_can_gw.native.binding import Handle, load
+    from kontronik_can_gw.native.objects import shared_object
+    from kontronik_can_gw.native.tables import Tables
+    from kontronik_can_gw.signals.plan import Layout
+
+    data, escs = source.read_bytes(), [EscSettings("esc1")]
+    core = Handle(load(shared_object()), Tables(Layout("", "", ()), escs), 0, lambda *_: None)
+    core.report_only(0)
+    begun = time.process_time()
+    for at in range(0, len(data), 16384):
+        core.receive(0, data[at : at + 16384], 0, 0)
+    return time.process_time() - begun
 
 
 _FORMS = {"candump": (), "parquet": ("--live",), "csv": ("--live",)}

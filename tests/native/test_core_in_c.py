@@ -1,65 +1,34 @@
 """The core in C gives what the core in Python gives; gcc and clang build it without a warning, for a small machine too."""
 
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import equality
 import pytest
+from built import COMPILERS, STRICT, built, there
 from sanitized import run_sanitized
 
 from kontronik_can_gw.native.binding import WrongObject, load
-from kontronik_can_gw.native.compile import compile_core, compiler
 from kontronik_can_gw.native.objects import FOLDER, OPTIONS
 
 SEEDS = 16
-STRICT = [
-    "-pedantic",
-    "-Wall",
-    "-Wextra",
-    "-Wconversion",
-    "-Wdouble-promotion",
-    "-Wshadow",
-    "-Werror",
-]
-
-
-COMPILERS = ["gcc", pytest.param("clang", marks=pytest.mark.extended)]
-
-
-def there(program: str | None = None) -> str:
-    """A compiler, as a rule the machine's; the test is skipped where there is none."""
-    found = compiler() if program is None else shutil.which(program)
-    if found is None:
-        pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev clang")
-    return found
-
-
-def built(target: Path, *options: str, program: str | None = None) -> Path:
-    """The core as a shared object."""
-    assert compile_core(target, options, there(program)) is None
-    return target
-
-
-@pytest.fixture(scope="session")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The core, optimised, for any layout."""
-    return load(built(tmp_path_factory.mktemp("native") / "core.so", *STRICT, "-O2", *OPTIONS))
 
 
 @pytest.mark.parametrize("group", range(4))
 def test_both_cores_give_the_same_frames_events_counters_and_deadlines(
-    library: Any, group: int
+    native_library: Any, group: int
 ) -> None:
-    counts = [equality.run(library, seed) for seed in range(group, SEEDS, 4)]
+    counts = [equality.run(native_library, seed) for seed in range(group, SEEDS, 4)]
     assert sum(counts) > 500, "the layouts are hardly sent"
 
 
 @pytest.mark.extended
 @pytest.mark.parametrize("group", range(20))
-def test_both_cores_are_equal_over_many_more_layouts(library: Any, group: int) -> None:
-    assert sum(equality.run(library, 10_000 + seed) for seed in range(group, 400, 20)) > 5_000
+def test_both_cores_are_equal_over_many_more_layouts(native_library: Any, group: int) -> None:
+    assert (
+        sum(equality.run(native_library, 10_000 + seed) for seed in range(group, 400, 20)) > 5_000
+    )
 
 
 @pytest.mark.parametrize("program", COMPILERS)
@@ -83,11 +52,12 @@ def test_the_core_builds_for_a_small_machine(tmp_path: Path, program: str, optio
 @pytest.mark.extended
 def test_no_byte_outside_its_memory_and_nothing_undefined(tmp_path: Path) -> None:
     script = (
-        "import pathlib, sys\nimport equality\nfrom kontronik_can_gw.native.binding import load\n"
-        "library = load(pathlib.Path(sys.argv[1]))\n"
+        "import pathlib, sys\nimport equality, offline_equality\nfrom kontronik_can_gw.native.binding import load\n"
+        "path = pathlib.Path(sys.argv[1])\nlibrary = load(path)\n"
         "print(sum(equality.run(library, seed) for seed in range(10)))\n"
+        "print(sum(offline_equality.run(library, seed, path.parent) for seed in range(3)))\n"
     )
-    assert int(run_sanitized(tmp_path, "-c", script)) > 1_000
+    assert all(int(count) > 1_000 for count in run_sanitized(tmp_path, "-c", script).split())
 
 
 def test_an_object_with_other_tables_is_refused_in_one_line(tmp_path: Path) -> None:

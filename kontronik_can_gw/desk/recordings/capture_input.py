@@ -2,64 +2,50 @@
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.capture.format import (
-    Block,
-    Damage,
-    Entry,
     Kind,
-    Scanner,
-    read_entries,
-    read_json,
-    read_number,
+    entry_at,
 )
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.blocks import NO_MESSAGES, RowBlock, player_of, timed
+from kontronik_can_gw.desk.recordings.capture_files import CaptureFiles
 from kontronik_can_gw.desk.recordings.columns import sections
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
-from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
-from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.gateway import Gateway, MakeOutput
 
-_LOOK_FOR_HEADER = 1 << 25
-_MAX_DAMAGE = 50
-_LATEST_NS = 1 << 62
-_NO_MESSAGES = Layout("", "", ())
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.offline import Frames, Rows
+    from kontronik_can_gw.native.player import Player
 
 
-class CaptureInput(Input):
-    """Captures of one run, in the order of their parts."""
+class CaptureInput(CaptureFiles):
+    """Captures of one run, in the order of their parts, played through the gateway's core."""
 
     def __init__(self, paths: Sequence[Path], layout: BusLayout | None = None) -> None:
-        self._paths = list(paths)
-        self._headerless: list[str] = []
-        self.position = 0
-        self._file: IO[bytes] | None = None
-        self.header = self._first_header()
+        size = self._open(paths)
         first = self._paths[0]
-        try:
-            size = sum(path.stat().st_size for path in self._paths)
-        except OSError as error:
-            raise RunError(f"{error.filename}: cannot be read: {error.strerror}.") from None
         try:
             self.setup = CaptureSetup.of(self.header)
             found = self.setup.database()
-            self.setup.gateway(_NO_MESSAGES if found is None else found[1], 0)
+            self.setup.gateway(NO_MESSAGES if found is None else found[1], 0)
         except Exception as error:  # a header may hold anything
             problems = error.problems if isinstance(error, UserError) else [str(error)]
             raise UserError(*(f"{first}: {problem[:400]}" for problem in problems)) from None
         name = str(first)
         if len(self._paths) > 1:
             name = f"{first.parent}/{first.stem.rpartition('-')[0]}"
-        self.sent_layout = _NO_MESSAGES if found is None else found[1]
+        self.sent_layout = NO_MESSAGES if found is None else found[1]
         """Of the frames; that of the rows, ``bus``, may be another one."""
         if layout is not None:
             layout = shown_by(layout, self.setup.escs)
@@ -68,23 +54,32 @@ class CaptureInput(Input):
         else:
             layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), self.setup.escs)
         super().__init__(name, layout, size)
-        self._offsets: list[tuple[int, int]] = []
-        self._devices: list[Any] = list(self.header.get("devices") or [])
         self._describe()
 
     def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
+        for frames in self.batches(marked):
+            yield from timed(frames)
+
+    def batches(self, marked: bool = False) -> "Iterator[list[TimedFrame] | Frames]":
         """``marked``: the gateway's state in the frames is REPLAY."""
-        gateway = self.setup.gateway(self.sent_layout, self._created_ns)
+        found, player, now = None, None, self._created_ns
+        if self._is_for_c:
+            found = player_of(lambda _: self.setup.gateway(self.sent_layout, now), None, (), now)
+        if found is None:
+            gateway = self.setup.gateway(self.sent_layout, now)
+        else:
+            player, gateway = found
         replay = Replay(gateway, self.header.get("state"), marked)
-        yield from replay.follow(self.entries())
+        for frames in self._steps(replay, player):
+            if player is not None and len(sent := player.take_frames()):
+                yield sent
+            yield frames
+        if player is not None:
+            yield player.take_frames(final=True)
+        yield replay.finish()
         self._add_losses(replay)
 
-    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        # the caller shows names, pole pairs and gears
-        escs = [
-            replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
-            for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
-        ]
+    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         columns = sections(self.fields, self._chosen(chosen), self.bus.escs)
         makers: list[RowMaker] = []
 
@@ -92,27 +87,80 @@ class CaptureInput(Input):
             makers.append(RowMaker(columns, *of_gateway))
             return makers[0]
 
-        # without messages; nodes are there, because they may change pole pairs and gear
-        gateway = Gateway(
-            *(escs, _NO_MESSAGES, self._created_ns), canopen=self.setup.canopen, further=(make,)
-        )
-        replay = Replay(gateway, self.header.get("state"))
-        for entry in self.entries():
-            replay.play(entry)
+        replay = Replay(self._silent_gateway((make,)), self.header.get("state"))
+        for _ in self._steps(replay):
             yield from makers[0].take_rows()
         yield from makers[0].finish()
         self._add_losses(replay)
 
-    def esc_bytes(self, esc: int) -> Iterator[bytes]:
-        for entry in self.entries():
-            if entry.kind == Kind.BYTES and entry.esc == esc:
-                yield entry.data
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:
+        fields = [self.fields[index] for index in self._chosen(chosen)]
+        found = None
+        if self._is_for_c:
+            now = self._created_ns
+            found = player_of(self._silent_gateway, fields, self.bus.escs, now)
+        return None if found is None else self._blocks_of(*found)
 
-    def wall_ns(self, time_ns: int) -> int | None:
-        header = self.header
-        begun = int(header.get("wall_ns") or 0) - int(header.get("monotonic_ns") or 0)
-        offsets = (offset for since, offset in reversed(self._offsets) if since <= time_ns)
-        return time_ns + next(offsets, begun)
+    def _blocks_of(self, player: "Player", gateway: Gateway) -> Iterator[RowBlock]:
+        replay = Replay(gateway, self.header.get("state"))
+        is_first = True
+        for _ in self._steps(replay, player):
+            if player.is_full or (is_first and player.has_rows):
+                is_first = False
+                yield from self._timed(player.take_rows())
+        yield from self._timed(player.take_rows(final=True))
+        self._add_losses(replay)
+
+    def _timed(self, rows: "Rows") -> Iterator[RowBlock]:
+        """Blocks of rows in which the wall clock goes on as it began."""
+        times = rows.times
+        cuts = {bisect_left(times, since) for since, _ in self._offsets}
+        for begin, end in pairwise(sorted({0, rows.count, *cuts})):
+            wall_ns = self.wall_ns(times[begin])
+            yield RowBlock(rows, begin, end, wall_ns=(wall_ns or 0) - times[begin])
+
+    @property
+    def _is_for_c(self) -> bool:
+        """The core in C may play it at full speed: no CANopen node has frames of its own, or changes settings."""
+        return self.setup.version > 1 and self.setup.canopen is None
+
+    def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
+        """Without messages; nodes are there, because they may change pole pairs and gear."""
+        # the caller shows names, pole pairs and gears
+        escs = [
+            replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
+            for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
+        ]
+        return Gateway(
+            *(escs, NO_MESSAGES, self._created_ns), canopen=self.setup.canopen, further=further
+        )
+
+    def _steps(self, replay: Replay, player: "Player | None" = None) -> Iterator[list[TimedFrame]]:
+        """Give all entries to a replay's gateway; the frames that Python made of each, or nothing where ``player`` gave some.
+
+        The player plays what comes all the time. Any other entry, and the rest of its turn, is played here.
+        """
+        here = True
+        for payload, damaged in self._data():
+            if player is None or not player.begin(payload):
+                if player is not None:
+                    here = True
+                    yield []
+                    replay.go_on(list(timed(player.take_frames(final=True))))
+                for entry in self._entries_of(payload, damaged):
+                    yield replay.play(entry)
+                continue
+            while (kind := player.next_kind) is not None:
+                if here or (kind == Kind.NOT_SENT and replay.frames_wait):
+                    here = here if kind == Kind.NOT_SENT else kind != Kind.ADVANCE
+                    if (found := self._checked(entry_at(payload, *player.skip()))) is not None:
+                        yield replay.play(found)
+                else:
+                    yield replay.finish()
+                    here, self._last_ns = player.play(self._last_ns)
+                    yield []
+                    if here:
+                        replay.go_on(list(timed(player.take_frames(final=True))))
 
     @property
     def channel(self) -> str:
@@ -121,109 +169,6 @@ class CaptureInput(Input):
         except (ValueError, LookupError, TypeError, RecursionError):
             channel = ""
         return channel if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII) else "can0"
-
-    def entries(self) -> Iterator[Entry]:
-        """All entries of all parts. What is damaged is left out, and reported in ``damage``."""
-        self.position = 0
-        self.damage = list(self._headerless)
-        self._offsets = []
-        last, impossible = 0, 0
-        for number, path in enumerate(self._paths):
-            for entry in self._entries_of(path, number):
-                time_ns, is_clock = entry.time_ns, entry.kind == Kind.CLOCK
-                if time_ns > _LATEST_NS or (is_clock and len(entry.data) != 8):
-                    impossible += 1
-                    continue
-                if is_clock:
-                    # it stands after what was written by the clock before
-                    self._offsets.append((time_ns + 1, read_number(entry.data) - time_ns))
-                if time_ns < last:
-                    entry = entry._replace(time_ns=last)
-                last = entry.time_ns
-                yield entry
-        if impossible:
-            self.damage.append(f"{impossible} entries have no possible time")
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-    @property
-    def _created_ns(self) -> int:
-        """When the recorded gateway was made: its cycles count from there."""
-        return int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
-
-    def _first_header(self) -> Mapping[str, Any]:
-        """The header of the first part that has one; those before it are left out."""
-        while True:
-            path = self._paths[0]
-            for found in self._blocks(path):
-                if isinstance(found, Block) and found.kind == b"H":
-                    with suppress(ValueError):
-                        return read_json(found.payload)
-                if self.position > _LOOK_FOR_HEADER:
-                    break
-            self.close()
-            if len(self._paths) == 1:
-                raise UserError(
-                    f"{path}: has no header that could be read, so nothing is known of what was recorded"
-                )
-            self._headerless.append(f"{path.name}: has no header that could be read")
-            del self._paths[0]
-
-    def _blocks(self, path: Path) -> Iterator[Block | Damage]:
-        scanner = Scanner()
-        try:
-            with path.open("rb") as self._file:
-                while data := self._file.read(CHUNK):
-                    self.position += len(data)
-                    yield from scanner.feed(data)
-        except OSError as error:
-            raise RunError(f"{path}: cannot be read: {error.strerror}.") from None
-        yield from scanner.flush()
-
-    def _entries_of(self, path: Path, part: int) -> Iterator[Entry]:
-        expected, ended = 0, False
-
-        def damaged(text: str) -> None:
-            if len(self.damage) <= _MAX_DAMAGE:
-                is_last = len(self.damage) == _MAX_DAMAGE
-                self.damage.append("and more of that kind" if is_last else f"{path.name}: {text}")
-
-        for found in self._blocks(path):
-            if isinstance(found, Damage):
-                damaged(f"{found.length} bytes at {found.offset} are damaged")
-                continue
-            if missing := max(0, found.number - expected):
-                damaged(f"{missing} blocks in front of byte {found.offset} are missing")
-            expected, ended = found.number + 1, found.kind == b"E"
-            try:
-                if found.kind == b"D":
-                    yield from read_entries(found.payload, self.header["version"])
-                elif found.kind == b"I":
-                    self._devices = read_json(found.payload).get("devices", self._devices)
-                    self._describe()
-                elif found.kind == b"H":
-                    self._check_part(read_json(found.payload), path, part)
-            except ValueError as error:
-                damaged(f"the block at {found.offset} {error}")
-        if not ended:
-            damaged("was not closed: up to the last second before its end may be missing")
-
-    def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
-        if header.get("run") != self.header.get("run"):
-            raise UserError(
-                f"{path}: is of another run than {self._paths[0]}. Convert each run by itself."
-            )
-        now, wall = header.get("monotonic_ns"), header.get("wall_ns")
-        if all(isinstance(at, int) and 0 <= at <= _LATEST_NS for at in (now, wall)):
-            self._offsets.append((int(now or 0), int(wall or 0) - int(now or 0)))
-        missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
-        if missing > 0:
-            self.damage.append(
-                f"{path.name}: {missing} parts of the run in front of it are not given"
-            )
 
     def _add_losses(self, replay: Replay) -> None:
         if replay.lost:

@@ -45,6 +45,17 @@ def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
     return found
 
 
+def values_of_fields(
+    fields: Sequence[Field], escs: Sequence[EscSettings]
+) -> list[tuple[Field, EscValue]]:
+    """Each field with its value, as its ESC supplies it."""
+    tables = [values_of_esc(esc) for esc in escs]
+    return [
+        (field, (VALUES if field.esc is None else tables[field.esc])[field.source])
+        for field in fields
+    ]
+
+
 def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
     texts = tuple(sorted(value.names.items()))
     high = math.inf if value.high is None else value.high / value.per_unit
@@ -159,14 +170,11 @@ def sections(
     fields: Sequence[Field], chosen: Sequence[int], escs: Sequence[EscSettings]
 ) -> list[Section]:
     """The sections of chosen fields, in their order."""
-    tables = [values_of_esc(esc) for esc in escs]
-
-    def value_of(field: Field) -> EscValue:
-        return (VALUES if field.esc is None else tables[field.esc])[field.source]
+    value_of = {id(field): value for field, value in values_of_fields(fields, escs)}
 
     def together(field: Field) -> Hashable:
         """The same for columns that are read together."""
-        value = value_of(field)
+        value = value_of[id(field)]
         word = _word(value)
         way = None if word is None else word if value.bit is not None else -1
         return field.esc, value.group, way, value.kind is How.AGE
@@ -174,7 +182,7 @@ def sections(
     found = []
     for _, neighbours in groupby((fields[index] for index in chosen), together):
         of_section = list(neighbours)
-        values = [value_of(field) for field in of_section]
+        values = [value_of[id(field)] for field in of_section]
         value, esc = values[0], of_section[0].esc
         if esc is None:
             read = _of_gateway(values)

@@ -120,6 +120,7 @@ def to_table(
     units_line: bool = False,
 ) -> str | None:
     """To a table."""
+    from kontronik_can_gw.desk.recordings.blocks import RowBlock
     from kontronik_can_gw.desk.recordings.tables.rows import rows_of
     from kontronik_can_gw.desk.recordings.tables.writers import open_table
 
@@ -130,6 +131,12 @@ def to_table(
     with open_table(out.open(), form, table, units_line) as writer, _settled():
         write = writer.write
         for row in rows:
+            if isinstance(row, RowBlock):
+                writer.write_block(row)
+                count += len(row)
+                last_ns = row.times[-1] - row.origin_ns
+                reached(recording.position)
+                continue
             write(row)
             count += 1
             last_ns = row.time_ns
@@ -150,40 +157,41 @@ def to_log(
     end_ns: int | None = None,
 ) -> str | None:
     """To a log of CAN frames (a format of can_logs), from ``start_ns`` to ``end_ns`` after the recording's first frame."""
+    from kontronik_can_gw.desk.recordings.blocks import cut, time_at
     from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
-    from kontronik_can_gw.desk.recordings.tables.rows import cut, first_of
+    from kontronik_can_gw.desk.recordings.tables.rows import first_of
 
-    first, frames = first_of(recording.frames())
+    first, batches = first_of(filter(len, recording.batches()))
     if first is None:
         return None
-    origin_ns = first.time_ns
+    origin_ns = time_at(first, 0)
     wall_ns = recording.wall_ns(origin_ns)
-    last, frames = first_of(cut(frames, start_ns, end_ns, origin_ns))
-    if last is None:
+    first, batches = first_of(cut(batches, start_ns, end_ns, origin_ns))
+    if first is None:
         return None
-    begins, channel = last.time_ns - origin_ns, recording.channel
+    begins, channel = time_at(first, 0) - origin_ns, recording.channel
     writer = CanLogWriter(
         out.open(), form, wall_ns, begins, channel, out.name, recording.provenance
     )
     count = 0
     try:
-        for last in frames:
-            writer.write(last.time_ns - origin_ns, last.frame, last.received)
-            count += 1
-            if not count % _TURN:
-                reached(recording.position)
+        for frames in batches:
+            writer.write_all(frames, origin_ns)
+            count += len(frames)
+            last_ns = time_at(frames, -1)
+            reached(recording.position)
         reached(recording.position)
         writer.close()
     except BaseException:
         writer.discard()
         raise
     out.is_whole = True
-    lasted = last.time_ns - origin_ns
+    lasted = last_ns - origin_ns
     frames_written = _many(count - sum(writer.left_out.values()), "CAN frame")
     summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
     for what, number in writer.left_out.items():
         summary += f"; {number} {what} left out, which {form} does not know"
-    moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - lasted
+    moved = 0 if wall_ns is None else (recording.wall_ns(last_ns) or 0) - wall_ns - lasted
     if abs(moved) > _CLOCK_SET_NS:
         summary += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
     return summary

@@ -4,21 +4,28 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kontronik_can_gw.capture.replay import TimedFrame, follow_bytes
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.desk.recordings.blocks import NO_MESSAGES, RowBlock, player_of
 from kontronik_can_gw.desk.recordings.can_logs import UART_MAGIC
 from kontronik_can_gw.desk.recordings.columns import sections
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.decoder import Reading
+from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import SECOND, Event
+from kontronik_can_gw.gateway import Gateway, MakeOutput
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.offline import Frames
+    from kontronik_can_gw.native.player import Player
 
 LIVE_RATE = 100.0
 """Live frames a second that plain bytes are taken to have come at."""
@@ -54,10 +61,52 @@ class DumpInput(Input):
                 "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
             )
 
-    def frames(self) -> Iterator[TimedFrame]:
-        yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
+    def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
+        found = player_of(lambda _: self.setup.gateway(self.bus.layout, 0), None, (), 0)
+        if found is None:
+            gateway = self.setup.gateway(self.bus.layout, 0)
+            yield from ([frame] for frame in follow_bytes(gateway, self.chunks()))
+            return
+        player, gateway = found
+        gateway.port(0, True, 0)
+        gateway.start(0)
+        for _ in self._steps(player):
+            yield player.take_frames()
 
-    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:
+        fields = [self.fields[index] for index in self._chosen(chosen)]
+
+        def make(further: Sequence[MakeOutput]) -> Gateway:
+            return Gateway(self.setup.escs, NO_MESSAGES, 0, further=further)
+
+        found = player_of(make, fields, self.bus.escs, 0)
+        return None if found is None else self._blocks_of(*found)
+
+    def _blocks_of(self, player: "Player", gateway: Gateway) -> Iterator[RowBlock]:
+        gateway.status.state = GatewayState.RUNNING
+        for _ in self._steps(player):
+            if player.is_full:
+                rows = player.take_rows()
+                yield RowBlock(rows, 0, rows.count)
+        rows = player.take_rows(final=True)
+        yield RowBlock(rows, 0, rows.count)
+
+    def _steps(self, player: "Player") -> Iterator[None]:
+        """Give all bytes to the player, which finds the frames and their times as ``_found`` does."""
+        self.damage = []
+        player.set_bytes(self._period_ns, MAX_WAITING)
+        rest = b""
+        for data in chain(self.esc_bytes(0), (None,)):
+            rest += data or b""
+            is_full = True
+            while is_full:
+                begin = player.position
+                is_full = player.play_bytes(rest, ended=data is None)
+                rest = rest[player.position - begin :]
+                yield
+        self._describe_damage(player.counters)
+
+    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         """A gateway runs from the first frame on; it knows no more than the telemetry."""
         esc = EscStream(self.setup.escs[0], 0)
         status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
@@ -125,7 +174,9 @@ class DumpInput(Input):
                 del waiting[:gone]
                 at += gone
         yield now, bytes(waiting), None
-        counters = decoder.counters
+        self._describe_damage(decoder.counters)
+
+    def _describe_damage(self, counters: Counters) -> None:
         if counters.dropped_bytes:
             self.damage.append(
                 f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"

@@ -7,6 +7,7 @@ come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
@@ -28,6 +29,8 @@ __all__ = ["LIVE_RATE", "CanLogInput", "CaptureInput", "DumpInput", "Input", "op
 
 _HEAD = 1 << 16
 _MAX_IDS = 4096
+_BATCH = 256
+"""Frames."""
 
 
 def open_input(
@@ -100,6 +103,11 @@ class CanLogInput(Input):
         self.others = 0
         """Frames that the layout does not have; complete when it was read to the end."""
 
+    def batches(self) -> Iterator[list[TimedFrame]]:
+        frames = self.frames()
+        while some := list(islice(frames, _BATCH)):
+            yield some
+
     def frames(self) -> Iterator[TimedFrame]:
         self._log.close()
         self._log = CanLog(self._path)
@@ -127,7 +135,7 @@ class CanLogInput(Input):
     def fields(self) -> Sequence[Field]:
         return fields_of_log(self.reader, self.bus.escs)
 
-    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         yield from samples_of_frames(self.frames(), self.reader, self._chosen(chosen))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:

@@ -3,14 +3,18 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.blocks import RowBlock, timed
 from kontronik_can_gw.desk.recordings.columns import fields_of_values
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.samples import Sample
 from kontronik_can_gw.signals.unpacker import SignalReader
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.offline import Frames
 
 CHUNK = 1 << 18
 
@@ -49,13 +53,31 @@ class Input(ABC):
         """The columns of the samples: values by name."""
         return fields_of_values(self.bus.escs)
 
-    @abstractmethod
     def frames(self) -> Iterator[TimedFrame]:
         """The CAN frames that were sent (or would have been) and received."""
+        for frames in self.batches():
+            yield from timed(frames)
 
     @abstractmethod
+    def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
+        """The same frames, many at once; ``Frames`` were all sent."""
+
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         """Rows of the values of ``chosen`` fields, in that order; None: of all."""
+        blocks = self.blocks(chosen)
+        if blocks is None:
+            yield from self.samples_in_python(chosen)
+        else:
+            for block in blocks:
+                yield from (Sample(time_ns, (values,)) for time_ns, values in block.values())
+
+    @abstractmethod
+    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        """The rows of ``samples``, whatever core there is."""
+
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:  # noqa: ARG002
+        """The rows of ``samples``, many at once; None where they can only be had one by one."""
+        return None
 
     @abstractmethod
     def esc_bytes(self, esc: int) -> Iterator[bytes]:

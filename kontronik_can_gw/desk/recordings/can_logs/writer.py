@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from kontronik_can_gw.desk.recordings.blocks import timed
 from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
@@ -16,7 +17,11 @@ from kontronik_can_gw.lean import without_asammdf
 if TYPE_CHECKING:
     from can import Message
 
+    from kontronik_can_gw.capture.replay import TimedFrame
+    from kontronik_can_gw.native.offline import Frames
+
 _MS = 1_000_000
+_LATEST_NS = 1 << 61
 Write = Callable[[int, CanFrame, bool], None]
 
 
@@ -42,6 +47,8 @@ class CanLogWriter:
         """Frames that the format does not know, by what they are."""
         self.write: Write
         """Add a frame: its time in ns, the frame, whether it was received."""
+        self._at_once: Callable[[Frames, int], memoryview] | None = None
+        self._file = file
         self.close: Callable[[], object] = lambda: None
         """Write what is held back, and the end. The file stays open."""
         self.discard: Callable[[], object] = lambda: None
@@ -60,12 +67,25 @@ class CanLogWriter:
             self.close, self.discard = mf4.close, mf4.discard
         elif format_ == "candump":
             self.write = _candump(file, wall_start_ns or 0, channel)
+            half = 500 + (wall_start_ns or 0)
+            if 0 <= half < _LATEST_NS:
+                self._at_once = lambda frames, origin_ns: frames.candump(half - origin_ns, channel)
         elif format_ == "asc":
             self._asc(file, base_ns, None if wall_start_ns is None else start_ns)
         elif format_ == "blf":
             self._blf(file, base_ns, start_ns)
         else:
             self._trc(file, base_ns, start_ns, name)
+
+    def write_all(self, frames: "Frames | list[TimedFrame]", origin_ns: int) -> None:
+        """Add frames, whose times are those of a recording that begins at ``origin_ns``."""
+        if self._at_once is not None and not isinstance(frames, list):
+            assert not isinstance(self._file, Path)
+            self._file.write(self._at_once(frames, origin_ns))
+            return
+        write = self.write
+        for time_ns, frame, received in timed(frames):
+            write(time_ns - origin_ns, frame, received)
 
     def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None) -> None:
         with without_asammdf():

@@ -9,10 +9,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from kontronik_can_gw.desk.recordings.blocks import RowBlock
 from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4File, quiet
 from kontronik_can_gw.desk.recordings.columns import Values
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table
-from kontronik_can_gw.desk.recordings.tables.rows import Row
+from kontronik_can_gw.desk.recordings.tables.rows import Row, rows_of_block
 from kontronik_can_gw.signals.unpacker import Value
 
 ROWS = 8192
@@ -42,6 +43,11 @@ class Mf4Table:
         parts = zip(row.parts, self._nothing, strict=True)
         values = list(chain.from_iterable(nothing if p is None else p for p, nothing in parts))
         self._groups[values[1] if self._by_frame else None].write(row.time_ns, values)
+
+    def write_block(self, block: RowBlock) -> None:
+        """Add many rows."""
+        for row in rows_of_block(block):
+            self.write(row)
 
     def close(self) -> None:
         """Write the file."""

@@ -6,9 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from kontronik_can_gw.desk.recordings.blocks import RowBlock
 from kontronik_can_gw.desk.recordings.columns import Values
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
-from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
+from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row, rows_of_block
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.signals.unpacker import Value
 
@@ -17,8 +18,15 @@ ROWS = 4096
 _FIRST = 64
 """Rows that tell whether neighbours are one object."""
 _FAR = 1 << 63
+_EXACT = 1 << 53
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
+
+
+def _is_exact(block: RowBlock) -> bool:
+    """True where times are within what a float and an int64 hold."""
+    last: int = block.times[-1]
+    return last - block.origin_ns < _EXACT and abs(last + (block.wall_ns or 0)) < _FAR
 
 
 class ParquetTable:
@@ -72,6 +80,40 @@ class ParquetTable:
         if len(self._rows) >= ROWS:
             self._gather()
 
+    def write_block(self, block: RowBlock) -> None:
+        """Add many rows."""
+        if not _is_exact(block):
+            for row in rows_of_block(block):
+                self.write(row)
+            return
+        self._gather()
+        pa, begin, count = self._pa, block.begin, len(block)
+        from pyarrow import compute
+
+        def array(kind: Any, values: Any, valid: Any = None) -> Any:
+            buffers = [None if valid is None else pa.py_buffer(valid), pa.py_buffer(values)]
+            return pa.Array.from_buffers(kind, begin + count, buffers)[begin:]
+
+        times = array(pa.int64(), block.rows.times)
+        since = compute.subtract(times, block.origin_ns).cast(pa.float64())
+        arrays = [compute.divide(since, float(SECOND_NS))]
+        if self._table.has_utc:
+            wall = compute.add(times, block.wall_ns)
+            arrays.append(wall.cast(pa.timestamp("ns", tz="UTC")))
+        for index, one in enumerate(self._table.fields):
+            values, valid = block.rows.values(index), block.rows.valid[index]
+            is_real = block.rows.is_real[index]
+            found = array(pa.float64() if is_real else pa.int64(), values, valid)
+            if one.kind is Kind.TEXT:
+                numbers = pa.array([number for number, _ in one.texts], pa.int64())
+                codes = pa.array([self._codes[index][text] for _, text in one.texts], pa.int32())
+                found = codes.take(compute.index_in(found, numbers))
+                found = pa.DictionaryArray.from_arrays(found, self._texts(index))
+            elif one.kind is Kind.FLAG:
+                found = found.cast(pa.int8(), safe=False)
+            arrays.append(found)
+        self._hold(arrays)
+
     def close(self) -> None:
         """Write the rest and the end."""
         self._gather()
@@ -97,7 +139,10 @@ class ParquetTable:
         for part, values in zip(self._table.parts(), zip(*rows, strict=True), strict=True):
             arrays += self._columns(part, values)
         self._rows = []
-        batch = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
+        self._hold(arrays)
+
+    def _hold(self, arrays: list[Any]) -> None:
+        batch = self._pa.RecordBatch.from_arrays(arrays, schema=self._schema)
         self._batches.append(batch)
         self._held += batch.num_rows
         if self._held >= GROUP:
@@ -123,7 +168,10 @@ class ParquetTable:
             return pa.array(column, self._type(one))
         codes = self._codes[index]
         indices = pa.array([codes.get(value) for value in column], pa.int32())
-        return pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string()))
+        return pa.DictionaryArray.from_arrays(indices, self._texts(index))
+
+    def _texts(self, index: int) -> Any:
+        return self._pa.array(list(self._codes[index]), self._pa.string())
 
     def _write_group(self) -> None:
         if self._batches:

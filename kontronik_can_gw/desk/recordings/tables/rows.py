@@ -2,13 +2,14 @@
 
 import fnmatch
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import chain, groupby
 from operator import itemgetter
 from typing import Any, NamedTuple, TypeVar
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.blocks import DISORDER_NS, RowBlock
 from kontronik_can_gw.desk.recordings.columns import Values
 from kontronik_can_gw.desk.recordings.fields import (
     Field,
@@ -23,10 +24,7 @@ from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.unpacker import Column, Value
 
 SECOND_NS = 1_000_000_000
-DISORDER_NS = SECOND_NS
-"""Frames of several interfaces may stand in a log a little out of order."""
 T = TypeVar("T")
-Timed = TypeVar("Timed", "Row", TimedFrame)
 
 
 class Row(NamedTuple):
@@ -107,8 +105,12 @@ def first_of(items: Iterator[T]) -> tuple[T | None, Iterator[T]]:
 
 def rows_of(
     recording: Input, choice: Choice, by_frame: bool = False
-) -> tuple[Table | None, Iterator[Row]]:
+) -> tuple[Table | None, Iterator[Row | RowBlock]]:
     """The rows of a recording, and the table that describes them; None where the recording has nothing."""
+    if not by_frame and choice.rate is None:
+        blocks = recording.blocks(choice.columns)
+        if blocks is not None:
+            return _in_blocks(recording, choice, blocks)
     wall_ns = recording.wall_ns
     every = fields_of_frames(recording) if by_frame else recording.fields
     fields = [every[index] for index in choice.columns]
@@ -133,14 +135,47 @@ def rows_of(
         items = (Row(at - origin_ns, wall_ns(at), parts) for at, parts in samples)
         widths = list(map(len, first.parts))
     if choice.start_ns is not None or choice.end_ns is not None:
-        items = cut(items, choice.start_ns, choice.end_ns)
+        items = _cut(items, choice.start_ns, choice.end_ns)
     if choice.rate is not None:
         items = thinned(items, choice.rate, (lambda row: row.parts[0]) if by_frame else None)
     first_row, items = first_of(items)
     if first_row is None:
-        return None, items
+        return None, iter(())
     wall = wall_ns(origin_ns)
     return Table(fields, wall is not None, by_frame, wall, recording.provenance, widths), items
+
+
+def _in_blocks(
+    recording: Input, choice: Choice, blocks: Iterator[RowBlock]
+) -> tuple[Table | None, Iterator[RowBlock]]:
+    first, blocks = first_of(filter(len, blocks))
+    if first is None:
+        return None, blocks
+    origin_ns = first.times[0]
+    wall = recording.wall_ns(origin_ns)
+    first, blocks = first_of(_cut_blocks(blocks, choice, origin_ns))
+    if first is None:
+        return None, blocks
+    fields = [recording.fields[index] for index in choice.columns]
+    widths = [len(fields)]
+    return Table(fields, wall is not None, False, wall, recording.provenance, widths), blocks
+
+
+def _cut_blocks(blocks: Iterator[RowBlock], choice: Choice, origin_ns: int) -> Iterator[RowBlock]:
+    for block in blocks:
+        end_ns = choice.end_ns
+        if end_ns is not None and block.times[0] - origin_ns > end_ns + DISORDER_NS:
+            return
+        found = replace(block, origin_ns=origin_ns).between(choice.start_ns, end_ns)
+        if len(found):
+            yield found
+
+
+def rows_of_block(block: RowBlock) -> Iterator[Row]:
+    """The rows of a block one by one."""
+    origin_ns, wall_ns = block.origin_ns, block.wall_ns
+    for at, values in block.values():
+        yield Row(at - origin_ns, None if wall_ns is None else at + wall_ns, (values,))
 
 
 def _of_frames(
@@ -173,16 +208,14 @@ def _frame_name(column: Column) -> tuple[str, str]:
     return f"{can_id:08X}" if column.key & EXTENDED else f"{can_id:03X}", column.message
 
 
-def cut(
-    items: Iterator[Timed], start_ns: int | None, end_ns: int | None, origin_ns: int = 0
-) -> Iterator[Timed]:
-    """The items from one time to another, both after ``origin_ns``; ``end_ns`` included."""
-    for item in items:
-        since = item.time_ns - origin_ns
+def _cut(rows: Iterator[Row], start_ns: int | None, end_ns: int | None) -> Iterator[Row]:
+    """The rows from one time to another; ``end_ns`` included."""
+    for row in rows:
+        since = row.time_ns
         if end_ns is not None and since > end_ns + DISORDER_NS:
             return
         if (start_ns is None or since >= start_ns) and (end_ns is None or since <= end_ns):
-            yield item
+            yield row
 
 
 def thinned(

@@ -2,21 +2,31 @@
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from datetime import UTC as UTC_ZONE
 from datetime import datetime
 from operator import getitem
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
+from kontronik_can_gw.desk.recordings.blocks import RowBlock
 from kontronik_can_gw.desk.recordings.columns import Known, Values
-from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Table
-from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
+from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row, rows_of_block
+from kontronik_can_gw.native import load
 from kontronik_can_gw.signals.unpacker import Value
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.offline import Lines
 
 _LINES = 256
 """Lines that gather before they are written."""
+_END_OF_YEARS_NS = 253_402_300_800 * SECOND_NS
+"""The year 10000."""
 Cell = Callable[[Value], str]
 """What gives the text of a value."""
+Style = tuple[str, str, str, str, str]
+"""As native.offline.Style."""
 
 
 def seconds_text(time_ns: int) -> str:
@@ -74,8 +84,12 @@ def _number(value: float | None, nothing: str) -> str:
 class _Lines:
     """Lines of text, a row each. A part of a row that is the one of the row before is not put into words again."""
 
-    def __init__(self, file: IO[bytes], table: Table, cell: Callable[[Field], Cell]) -> None:
+    def __init__(
+        self, file: IO[bytes], table: Table, cell: Callable[[Field], Cell], style: Style
+    ) -> None:
         self._file = file
+        self._table, self._cell, self._style = table, cell, style
+        self._at_once: Lines | None = None
         self._utc = UtcText()
         cells = [Known(cell(one)) for one in table.fields]
         self._cells = [[cells[index] for index in part] for part in table.parts()]
@@ -98,6 +112,45 @@ class _Lines:
         if len(self._lines) >= _LINES:
             self.close()
 
+    def write(self, row: Row) -> None:
+        """Add a row."""
+        raise NotImplementedError
+
+    def write_block(self, block: RowBlock) -> None:
+        """Add many rows."""
+        times, wall_ns = block.times, block.wall_ns or 0
+        begin, end = block.begin, block.end
+        if not 0 <= times[0] + wall_ns <= times[-1] + wall_ns < _END_OF_YEARS_NS:
+            found: Iterable[bytes | int] = range(begin, end)
+        else:
+            if self._at_once is None:
+                self._at_once = self._lines_at_once()
+            found = self._at_once.of(block.rows, begin, end, block.origin_ns, wall_ns)
+        for part in found:
+            if isinstance(part, int):
+                for row in rows_of_block(replace(block, begin=part, end=part + 1)):
+                    self.write(row)
+            else:
+                self.close()
+                self._file.write(part)
+
+    def _lines_at_once(self) -> "Lines":
+        from kontronik_can_gw.native.offline import Lines, Style
+
+        head, utc, utc_end, end, nothing = (text.encode() for text in self._style)
+        style = Style(head, utc if self._table.has_utc else None, utc_end, end, nothing)
+        cells = []
+        for one in self._table.fields:
+            cell = self._cell(one)
+            nothing_here = cell(None)
+            prefix = self._separator + nothing_here[: len(nothing_here) - len(self._style[-1])]
+            words = None
+            if one.kind is Kind.TEXT:
+                skip = len(prefix) - len(self._separator)
+                words = [(number, cell(text)[skip:].encode()) for number, text in one.texts]
+            cells.append((prefix.encode(), words))
+        return Lines(load.library()[0], style, cells)
+
     def close(self) -> None:
         """Write what has gathered."""
         self._file.write("".join(self._lines).encode())
@@ -111,7 +164,7 @@ class CsvTable(_Lines):
     """RFC 4180 without its carriage returns: a header of names with units, comma, decimal point, UTF-8; empty where not available."""
 
     def __init__(self, file: IO[bytes], table: Table) -> None:
-        super().__init__(file, table, _csv_cell)
+        super().__init__(file, table, _csv_cell, ("", ",", "", "\n", ""))
         self._has_utc = table.has_utc
         self._nothing = ["," * (len(part) - 1) for part in table.parts()]
         heads = [f"{TIME} [s]", *([UTC] if table.has_utc else [])]
@@ -133,7 +186,8 @@ class JsonTable(_Lines):
     """One object a line, keys are the names of the fields; null where not available. ``units``: a first line with the units."""
 
     def __init__(self, file: IO[bytes], table: Table, units: bool = False) -> None:
-        super().__init__(file, table, _json_cell)
+        style = (f'{{"{TIME}": ', f', "{UTC}": "', '"', "}\n", "null")
+        super().__init__(file, table, _json_cell, style)
         self._separator = ", "
         self._has_utc = table.has_utc
         if units:

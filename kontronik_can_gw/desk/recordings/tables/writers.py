@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
 
+from kontronik_can_gw.desk.recordings.blocks import RowBlock
 from kontronik_can_gw.desk.recordings.fields import Table
 from kontronik_can_gw.desk.recordings.tables.rows import Row
 from kontronik_can_gw.desk.recordings.tables.text import CsvTable, JsonTable
@@ -15,6 +16,9 @@ class TableWriter(Protocol):
 
     def write(self, row: Row) -> None:
         """Add a row."""
+
+    def write_block(self, block: RowBlock) -> None:
+        """Add many rows."""
 
     def close(self) -> None:
         """Write what is held back, and the end."""

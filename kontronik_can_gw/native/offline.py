@@ -1,0 +1,210 @@
+"""What comes of a recording that the core in C plays at full speed (player.py): frames and rows in blocks, and their text (offline.c)."""
+
+import ctypes as c
+import struct
+from collections.abc import Iterator, Sequence
+from itertools import starmap
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.esc.values import Divisor, Value
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.native.binding import Frame
+from kontronik_can_gw.native.rows import NotInCore
+
+ROWS = 1 << 13
+_TEXT = 1 << 20
+_WHOLE, _DIVIDED, _ROUNDED = range(3)
+_u8, _u32, _u64, _i64, _p = c.c_uint8, c.c_uint32, c.c_uint64, c.c_int64, c.c_void_p
+_text, _size = c.c_char_p, c.c_size_t
+_head = struct.Struct("=IBBB").unpack_from
+
+
+class _Word(c.Structure):
+    _fields_ = (("number", _i64), ("text", _text))
+
+
+class _Cell(c.Structure):
+    _fields_ = (
+        *(("values", _p), ("valid", _p), ("prefix", _text), ("word", c.POINTER(_Word))),
+        *(("words", _u32), ("is_real", _u32)),
+    )
+
+
+class Style(c.Structure):
+    """Of lines: what stands before the time, before and after the Unix time (None: none), at the end, for what is not available."""
+
+    _fields_ = tuple((name, _text) for name in ("head", "utc", "utc_end", "end", "nothing"))
+
+
+_FUNCTIONS: dict[str, tuple[Any, ...]] = {
+    "kcg_is_intact": (c.c_int, _text, _size),
+    "kcg_play": (c.c_int, _p, _text, _size),
+    "kcg_play_bytes": (c.c_int, _p, _text, _size, c.c_int),
+    "kcg_row_event": (None, _p, c.c_int, c.c_int, _i64),
+    "kcg_close_row": (None, _p),
+    "kcg_candump": (_size, _p, _p, _u32, _i64, _text, _p),
+    "kcg_lines": (
+        *(_size, _p, _u32, _p, _p, _u32, _u32, _i64, _i64, _p, _size, _size),
+        c.POINTER(_u32),
+    ),
+    "kcg_offline_sizes": (_u32, _u32),
+}
+
+
+def declare(library: Any, *structures: Any) -> None:
+    """Declare the functions. NotInCore where the structures are others."""
+    for name, (result, *arguments) in _FUNCTIONS.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    sizes = [library.kcg_offline_sizes(number) for number in range(3)]
+    if sizes != [*map(c.sizeof, (*structures, _Cell))]:
+        raise NotInCore("the shared object has other structures")
+
+
+def _address(memory: bytearray) -> int:
+    """Of memory that is there, and is not made longer, while the address is used."""
+    return c.addressof(c.c_char.from_buffer(memory))
+
+
+class Frames:
+    """Frames that were sent: ``times`` in ns, which do not decrease."""
+
+    def __init__(
+        self, library: Any, memory: bytearray, times: bytearray, begin: int, end: int
+    ) -> None:
+        self._library, self._memory, self._times = library, memory, times
+        self._begin, self._end = begin, end
+        self.times = memoryview(times).cast("q")[begin:end]
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    def part(self, begin: int, end: int) -> "Frames":
+        """Some of them."""
+        return Frames(
+            *(self._library, self._memory, self._times, self._begin + begin, self._begin + end)
+        )
+
+    def __iter__(self) -> Iterator[tuple[int, CanFrame]]:
+        raw = self._memory
+        size = c.sizeof(Frame)
+        for time_ns, at in zip(
+            self.times, range(self._begin * size, self._end * size, size), strict=True
+        ):
+            number, length, flags, page = _head(raw, at)
+            data = bytes(raw[at + 8 : at + 8 + length])
+            yield (
+                time_ns,
+                CanFrame(number & ~EXTENDED, data, number >= EXTENDED, flags != 0, page),
+            )
+
+    def candump(self, shift_ns: int, channel: str) -> memoryview:
+        """Lines of a candump log, with microseconds of the time and ``shift_ns``."""
+        if not len(self):
+            return memoryview(b"")
+        name = channel.encode()
+        out = bytearray(len(self) * (len(name) + 190))
+        frames = _address(self._memory) + self._begin * c.sizeof(Frame)
+        times = _address(self._times) + self._begin * 8
+        write = self._library.kcg_candump
+        return memoryview(out)[: write(frames, times, len(self), shift_ns, name, _address(out))]
+
+
+class ColumnOf(NamedTuple):
+    """A value that is wanted in a column. ``esc``: its index, None for the gateway."""
+
+    value: Value
+    esc: int | None
+
+    @property
+    def form(self) -> int:
+        """How steps become a number of its unit."""
+        value = self.value
+        if value.divisor is Divisor.ONE:
+            if value.names or value.per_unit == 1:
+                return _WHOLE
+            if 10**6 % value.per_unit == 0:
+                return _DIVIDED
+        return _ROUNDED
+
+
+class Rows:
+    """Rows as columns: ``times`` in ns, and of each column ``values`` (int64 or float64) and ``valid`` (a bit a row, lowest first)."""
+
+    def __init__(self, columns: Sequence[ColumnOf]) -> None:
+        self.columns = columns
+        self.count = 0
+        self._times = bytearray(8 * ROWS)
+        self._values = [bytearray(8 * ROWS) for _ in columns]
+        self.valid = [bytearray(ROWS // 8) for _ in columns]
+        self.is_real = [column.form != _WHOLE for column in columns]
+
+    @property
+    def times(self) -> memoryview:
+        return memoryview(self._times).cast("q")[: self.count]
+
+    def values(self, column: int) -> Any:
+        """What stands where a row is not valid has no meaning."""
+        values = memoryview(self._values[column])
+        return (values.cast("d") if self.is_real[column] else values.cast("q"))[: self.count]
+
+    def numbers(self, column: int, begin: int, end: int) -> list[float | None]:
+        """Of the rows ``begin`` to ``end``; None where not available."""
+        found: list[float | None] = self.values(column)[begin:end].tolist()
+        valid = self.valid[column]
+        if valid.count(0xFF) * 8 < self.count:
+            for row in range(begin, end):
+                if not valid[row >> 3] >> (row & 7) & 1:
+                    found[row - begin] = None
+        return found
+
+    def addresses(self) -> list[int]:
+        """Of the times, then of each column's values and valid bits."""
+        every = (self._times, *self._values, *self.valid)
+        return [*map(_address, every)]
+
+
+class Lines:
+    """Text of rows. Each cell: what stands before it, and texts by number; None for a number itself."""
+
+    def __init__(
+        self,
+        library: Any,
+        style: Style,
+        cells: Sequence[tuple[bytes, Sequence[tuple[int, bytes]] | None]],
+    ) -> None:
+        self._library, self._style = library, style
+        self._cells = (_Cell * max(1, len(cells)))()
+        self._longest = 128
+        self._out = c.create_string_buffer(_TEXT)
+        for cell, (prefix, words) in zip(self._cells, cells, strict=False):
+            cell.prefix = prefix
+            self._longest += len(prefix) + 32
+            if words is not None:
+                cell.word, cell.words = (
+                    (_Word * max(1, len(words)))(*starmap(_Word, words)),
+                    len(words),
+                )
+                self._longest += max((len(text) for _, text in words), default=0)
+
+    def of(
+        self, rows: Rows, begin: int, end: int, origin_ns: int, wall_ns: int
+    ) -> Iterator[bytes | int]:
+        """Lines of the rows ``begin`` to ``end``; for a row that needs another way its index. ``wall_ns`` added, times are Unix times."""
+        times, *addresses = rows.addresses()
+        count = len(rows.columns)
+        for at in range(count):
+            cell = self._cells[at]
+            cell.values, cell.valid = addresses[at], addresses[count + at]
+            cell.is_real = rows.is_real[at]
+        done = _u32(begin)
+        while done.value < end:
+            length = self._library.kcg_lines(
+                *(self._cells, count, c.byref(self._style), times, done.value, end),
+                *(origin_ns, wall_ns, self._out, _TEXT, self._longest, c.byref(done)),
+            )
+            if length:
+                yield c.string_at(self._out, length)
+            elif done.value < end:
+                yield done.value
+                done.value += 1

@@ -1,0 +1,215 @@
+"""Plays a recording by the core in C at full speed (offline.c): a capture's entries, or the plain bytes of one ESC.
+
+What a Player leaves to the caller, entries that come now and then, is given to the same core by the calls of its Gateway, whose outputs
+include the Player for the sake of its rows.
+"""
+
+import ctypes as c
+from bisect import bisect_left
+from collections.abc import Sequence
+
+from kontronik_can_gw.esc.decoder import Counters
+from kontronik_can_gw.native.binding import Frame, Handle
+from kontronik_can_gw.native.core import NativeCore
+from kontronik_can_gw.native.offline import ROWS, ColumnOf, Frames, Rows, declare
+from kontronik_can_gw.native.rows import Signal
+from kontronik_can_gw.native.state import NativeEsc
+from kontronik_can_gw.native.tables import OF_AGE, Tables, bind, places_of
+from kontronik_can_gw.output import Output
+from kontronik_can_gw.signals.plan import Layout
+
+_DONE, _FULL, _OTHER_ENTRY = range(3)
+_MAX_ROWS = 1024
+"""That one call of the core can make."""
+_FRAMES = 1 << 13
+_u8, _u32, _u64, _i64, _p = c.c_uint8, c.c_uint32, c.c_uint64, c.c_int64, c.c_void_p
+
+
+class _Column(c.Structure):
+    _fields_ = (
+        *(("of", Signal), ("per_unit", _i64), ("values", _p), ("valid", _p), ("now", _i64)),
+        *(("form", _u8), ("has", _u8), ("reserved", _u8 * 6)),
+    )
+
+
+class _Found(c.Structure):
+    _fields_ = (("end", _u64), ("bytes", _u8 * 40))
+
+
+class _Offline(c.Structure):
+    _fields_ = (
+        *((name, _p) for name in ("core", "finder", "frame", "frame_time", "column", "first")),
+        *((name, _p) for name in ("age", "row_time")),
+        *((name, _u32) for name in ("room", "count", "sure", "ages", "rows", "index")),
+        *((name, _u8) for name in ("is_open", "is_timed", "has_ended", "found_count", "found_at")),
+        ("reserved", _u8 * 3),
+        *((name, _i64) for name in ("last", "row_ns", "last_row_ns", "gateway_ns", "now")),
+        *((name, _i64) for name in ("lives", "period")),
+        *((name, _u64) for name in ("at", "base", "fed", "max_waiting", "data_at")),
+        ("in_row", _u8 * 256),
+        ("found", _Found * 16),
+    )
+
+
+class Player(Output):
+    """Plays a recording. ``columns``: rows of these values are wanted; None: frames. A follower of its core for the rows' sake."""
+
+    def __init__(self, columns: Sequence[ColumnOf] | None = None) -> None:
+        super().__init__()
+        self._columns = columns
+        self._state = _Offline()
+        self._payload = b""
+        self._count = 0
+
+    def bind(self, core: NativeCore, now: int) -> None:
+        """Take the core that is to be played. NotInCore where it does not have one of the values."""
+        self._handle = handle = core.handle
+        self._library = library = handle.library
+        declare(library, _Offline, _Column)
+        self._settings = core.escs[0].settings
+        self._state.core = handle.core
+        if self._columns is None:
+            self._state.room = room = max(_FRAMES, 2 * handle.pages)
+            self._frames, self._times = (Frame * room)(), (_i64 * room)()
+            self._state.frame = c.addressof(self._frames)
+            self._state.frame_time = c.addressof(self._times)
+            return
+        self._state.room = ROWS
+        self._state.gateway_ns = now - 100_000_000
+        self._set_columns(core, self._columns)
+        self._new_rows()
+
+    def _set_columns(self, core: NativeCore, columns: Sequence[ColumnOf]) -> None:
+        count = len(core.escs)
+
+        def place(number: int) -> tuple[int, bool]:
+            value, esc = columns[number]
+            return count if esc is None else esc, value.group.value == "info"
+
+        order = sorted(range(len(columns)), key=place)
+        self._table = table = (_Column * max(1, len(order)))()
+        ages = []
+        for at, number in enumerate(order):
+            value, esc = columns[number]
+            row = table[at]
+            where = ([], []) if esc is None else places_of(core.escs[esc].protocol)
+            bind(row.of, value, where, esc)
+            row.of.esc = 255 if esc is None else esc
+            row.per_unit, row.form = value.per_unit, columns[number].form
+            if row.of.kind == OF_AGE:
+                ages.append(at)
+        places = [place(number) for number in order]
+        begins = [bisect_left(places, (n, is_info)) for n in range(count + 1) for is_info in (0, 1)]
+        self._order = order
+        self._first = (_u32 * len(begins))(*begins)
+        self._ages = (_u32 * max(1, len(ages)))(*ages)
+        state = self._state
+        state.column, state.first = c.addressof(table), c.addressof(self._first)
+        state.age, state.ages = c.addressof(self._ages), len(ages)
+
+    def _new_rows(self) -> None:
+        assert self._columns is not None
+        self._rows = Rows(self._columns)
+        times, *addresses = self._rows.addresses()
+        self._state.row_time, self._state.rows = times, 0
+        values, valid = addresses[: len(self._columns)], addresses[len(self._columns) :]
+        for at, number in enumerate(self._order):
+            self._table[at].values, self._table[at].valid = values[number], valid[number]
+
+    # --- captures
+
+    def begin(self, payload: bytes) -> bool:
+        """Take a data block (of version 2); False where it is damaged: nothing of it is taken."""
+        if not self._library.kcg_is_intact(payload, len(payload)):
+            return False
+        self._payload = payload
+        self._count = int.from_bytes(payload[:4], "little")
+        self._state.index, self._state.data_at = 0, 4 + 16 * self._count
+        return True
+
+    @property
+    def next_kind(self) -> int | None:
+        """Of the next entry; None at the end of the block."""
+        index = self._state.index
+        return self._payload[12 + 16 * index] if index < self._count else None
+
+    def skip(self) -> tuple[int, int]:
+        """Index of the next entry, and where its data begin: the caller plays it."""
+        state, at = self._state, 4 + 16 * self._state.index
+        found = state.index, state.data_at
+        state.index += 1
+        state.data_at += int.from_bytes(self._payload[at + 12 : at + 16], "little")
+        return found
+
+    def play(self, last_ns: int) -> tuple[bool, int]:
+        """Play on. True at an entry that is the caller's; else the block ends, or there is no room. And the time of the last entry."""
+        state = self._state
+        state.last = last_ns
+        why = self._library.kcg_play(c.byref(state), self._payload, len(self._payload))
+        return why == _OTHER_ENTRY, state.last
+
+    # --- plain bytes of one ESC
+
+    def set_bytes(self, period_ns: int, max_waiting: int) -> None:
+        """Times: a live frame each ``period_ns``. ``max_waiting``: bytes without a frame that are held."""
+        tables = Tables(Layout("", "", ()), [self._settings])
+        self._finder = Handle(self._library, tables, 0, lambda *_: None)
+        self._finder.report_only(0)
+        self._state.finder = self._finder.core
+        self._state.period, self._state.max_waiting = period_ns, max_waiting
+
+    def play_bytes(self, data: bytes, ended: bool) -> bool:
+        """The stream from ``position`` on; what is left of it is to be given again. True where there was no room for all of it."""
+        state = self._state
+        state.base = state.at
+        why = self._library.kcg_play_bytes(c.byref(state), data, len(data), ended)
+        state.sure = state.count
+        return bool(why == _FULL)
+
+    @property
+    def position(self) -> int:
+        """Bytes that were played."""
+        return int(self._state.at)
+
+    @property
+    def counters(self) -> Counters:
+        """Of what found the frames."""
+        return NativeEsc(self._settings, self._finder.escs[0]).counters
+
+    # --- what came of it
+
+    def on_event(self, esc: int, events: int, now: int) -> None:
+        self._library.kcg_row_event(c.byref(self._state), esc, events, now)
+
+    def take_frames(self, final: bool = False) -> Frames:
+        """The frames that are sure: those of the last turn are only by the next entry, or because there is none (``final``)."""
+        state = self._state
+        if self._columns is not None:
+            return Frames(self._library, bytearray(), bytearray(), 0, 0)
+        sure = state.count if final else state.sure
+        state.count, state.sure = state.count - sure, 0
+        taken = []
+        for held in (self._frames, self._times):
+            size, begin = c.sizeof(held) // state.room, c.addressof(held)
+            taken.append(bytearray(c.string_at(begin, size * sure)))
+            c.memmove(begin, begin + size * sure, size * state.count)
+        return Frames(self._library, taken[0], taken[1], 0, sure)
+
+    @property
+    def has_rows(self) -> bool:
+        """True where rows are complete."""
+        return bool(self._state.rows)
+
+    @property
+    def is_full(self) -> bool:
+        """True where rows must be taken before more is played."""
+        return bool(self._state.rows + _MAX_ROWS > self._state.room)
+
+    def take_rows(self, final: bool = False) -> Rows:
+        """The rows that are complete; ``final``: also the one that is open."""
+        if final:
+            self._library.kcg_close_row(c.byref(self._state))
+        found = self._rows
+        found.count = self._state.rows
+        self._new_rows()
+        return found

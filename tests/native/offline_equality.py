@@ -1,0 +1,152 @@
+"""Recordings that the core in C plays at full speed beside those that Python plays: the same rows, frames, damage and text."""
+
+import random
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import equality
+from capture_bench import START, Bench, made
+
+from kontronik_can_gw.capture.format import Entry, Kind, block, data_payload, json_payload
+from kontronik_can_gw.desk.recordings import dump_input
+from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
+from kontronik_can_gw.desk.recordings.tables.rows import Choice
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.native import load
+
+TEXTS = ("csv", "jsonl", "candump")
+
+
+@contextmanager
+def core(library: Any) -> Iterator[None]:
+    """The shared object that is there; None: there is none."""
+    before, load.library = load.library, lambda: (library, "")  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        load.library = before
+
+
+def esc(chance: random.Random, number: int) -> dict[str, object]:
+    gear = f"{chance.randint(1, 300)}/{chance.randint(1, 300)}"
+    timeout, poles = chance.choice((20, 250, 1000)), chance.choice((1, 7, 14, 64, 100))
+    cells = chance.choice((0, 0, 6, 14))
+    more = {"gear": gear, "cell_count": cells, "telemetry_timeout_ms": timeout}
+    return {"name": f"e{number}", "pole_pairs": poles} | more
+
+
+def odd(chance: random.Random, last: Entry) -> Entry:
+    """An entry that comes now and then, or that no recorder writes."""
+    now, number = last.time_ns, chance.randrange(1 << 50).to_bytes(8, "little")
+    noise = equality.stream(chance)
+    return chance.choice(
+        (
+            Entry(now, Kind.CLOCK, 0, (START + chance.randrange(1 << 60)).to_bytes(8, "little")),
+            Entry(now, Kind.CLOCK, 0, b"short"),
+            Entry(now, Kind.NOT_SENT),
+            Entry(now, Kind.COUNTERS, 0, number * 8),
+            Entry(now, Kind.COUNTERS, 0, number * 3),
+            Entry(now, Kind.LOST, 0, number),
+            Entry(now, Kind.FRAME, 0, b"1"),
+            Entry(now, Kind.HELD_UP, 0, b"", 1),
+            Entry(now - chance.randrange(SECOND), Kind.ADVANCE),
+            Entry(now, Kind.BYTES, 0, noise, 0, now - chance.randrange(SECOND)),
+            Entry(now, Kind.BYTES, 0, bytes(17_000) + noise, 0, now),
+            Entry(now, Kind.BYTES, 9, noise, 0, now),
+            Entry(now, 77),
+        )
+    )
+
+
+def write_capture(chance: random.Random, path: Path, version: int = 2) -> Path:
+    """A capture in which everything happens; in part damaged."""
+    bench = Bench(*made(chance.randint(1, 3), of_esc=lambda number: esc(chance, number)))
+    bench.live(chance.randrange(1000), 6)
+    entries = [bench.entries[0]]
+    for entry in bench.entries[1:]:
+        if chance.random() < 0.01:
+            entries.append(odd(chance, entries[-1]))
+        entries.append(entry)
+    header = bench.setup.header() | {"run": "r", "part": 0, "created_ns": START}
+    header |= {"monotonic_ns": START, "wall_ns": 1_700_000_000 * SECOND, "version": version}
+    blocks = [block(b"H", 0, json_payload(header))]
+    while entries:
+        count = chance.choice((1, 2, 40, 400))
+        some, entries = entries[:count], entries[count:]
+        payload = data_payload(some)
+        if version == 1:
+            payload = data_payload([e._replace(came_ns=e.time_ns) for e in some])
+        if chance.random() < 0.02:
+            payload = payload[:-1]  # its table says otherwise
+        blocks.append(block(b"D", len(blocks), payload))
+    if chance.random() < 0.5:
+        blocks[chance.randrange(1, len(blocks))] = b"damaged"
+    path.write_bytes(b"".join(blocks) + block(b"E", len(blocks), b""))
+    return path
+
+
+def write_bytes(chance: random.Random, path: Path) -> Path:
+    """Plain bytes; in part damaged."""
+    data = b"".join(equality.stream(chance) for _ in range(chance.choice((1, 30, 300))))
+    if chance.random() < 0.5:
+        data += bytes(chance.choice(b"KODLI\0\xff") for _ in range(chance.choice((5, 100_000))))
+    path.write_bytes(b"KODL" + data + b"".join(equality.stream(chance) for _ in range(20)))
+    return path
+
+
+def read(recording: Input, chosen: Sequence[int]) -> list[Any]:
+    """All of a recording."""
+    rows = [(row.time_ns, row.values) for row in recording.samples(chosen)]
+    found = [rows, list(recording.damage), recording.position]
+    frames = list(recording.frames())
+    return [*found, frames, list(recording.damage), recording.position]
+
+
+def converted(recording: Input, choice: Choice, form: str, path: Path) -> Any:
+    """The file of a conversion, and what is said of it."""
+    with Output(path, form) as out:
+        if form in TABLES:
+            said = to_table(recording, out, lambda _: None, form, choice)
+        else:
+            said = to_log(recording, out, lambda _: None, form, choice.start_ns, choice.end_ns)
+    return said, path.read_bytes() if path.exists() else b""
+
+
+def run(library: Any, seed: int, folder: Path) -> int:
+    """Rows and frames compared."""
+    chance = random.Random(seed)
+    write = write_capture if chance.random() < 0.6 else write_bytes
+    path = write(chance, folder / f"{seed}.kcap")
+    path = path if write is write_capture else path.rename(path.with_suffix(".bin"))
+    setattr(dump_input, "CHUNK", chance.choice((7, 100, 5000, 1 << 18)))  # noqa: B010
+    setattr(dump_input, "MAX_WAITING", chance.choice((64, 300, 1 << 16)))  # noqa: B010
+    found = []
+    part = {"start_ns": chance.choice((None, SECOND)), "end_ns": chance.choice((None, 3 * SECOND))}
+    fields = range(len(open_input(path).fields))
+    chosen = chance.choice((fields, chance.sample(fields, 20)))
+    for which in (None, library):
+        with core(which):
+            recording = open_input(path)
+            assert (recording.blocks() is None) is (which is None)
+            read_once = read(recording, chosen)
+            files = [
+                converted(recording, Choice(chosen, **part), form, folder / f"{seed}.{form}")
+                for form in TEXTS
+            ]
+            recording.close()
+        found.append([*read_once, files])
+    for python, native in zip(*found, strict=True):
+        assert python == native, _difference(python, native)
+    return len(found[0][0]) + len(found[0][3])
+
+
+def _difference(*sides: Any) -> str:
+    if not all(isinstance(side, list) for side in sides):
+        return f"{sides}"
+    length = [len(side) for side in sides]
+    pairs = enumerate(zip(*sides, strict=False))
+    place, pair = next(((n, p) for n, p in pairs if p[0] != p[1]), (min(length), ()))
+    return f"{place} of {length}: {str(pair)[:3000]}"

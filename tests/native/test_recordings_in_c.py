@@ -1,0 +1,49 @@
+"""The core in C plays recordings at full speed and gives what Python gives, from the file to the text."""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import offline_equality
+import pytest
+from capture_bench import Bench, capture, made
+
+from kontronik_can_gw.desk.recordings import dump_input
+from kontronik_can_gw.desk.recordings.inputs import open_input
+
+
+@pytest.fixture(autouse=True)
+def reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a run changes is as it was after it."""
+    for name in ("CHUNK", "MAX_WAITING"):
+        monkeypatch.setattr(dump_input, name, 0)
+
+
+@pytest.mark.parametrize("group", range(4))
+def test_rows_frames_damage_and_text_are_those_of_python(
+    native_library: Any, tmp_path: Path, group: int
+) -> None:
+    counts = [offline_equality.run(native_library, seed, tmp_path) for seed in range(group, 12, 4)]
+    assert sum(counts) > 5_000
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("group", range(10))
+def test_the_same_over_many_more_recordings(
+    native_library: Any, tmp_path: Path, group: int
+) -> None:
+    seeds = range(1_000 + group, 1_300, 10)
+    assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 20_000
+
+
+def test_what_it_does_not_play_python_plays(native_library: Any, tmp_path: Path) -> None:
+    """Captures of 0.5.0, and of CANopen nodes, which have frames of their own and may change settings."""
+    bench = Bench(*made(2, canopen=True)).live(3, 2)
+    nodes = capture(tmp_path / "nodes.kcap", bench.setup, bench.entries)
+    old = offline_equality.write_capture(random.Random(1), tmp_path / "old.kcap", version=1)
+    with offline_equality.core(native_library):
+        for path in (nodes, old):
+            with open_input(path) as recording:
+                assert recording.blocks() is None
+                assert list(recording.samples())
+                assert all(isinstance(frames, list) for frames in recording.batches())
