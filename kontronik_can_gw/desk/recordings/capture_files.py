@@ -35,7 +35,7 @@ class CaptureFiles(Input):
         self._offsets: list[tuple[int, int]] = []
         self._file: IO[bytes] | None = None
         self.header = self._first_header()
-        self._devices: list[Any] = list(self.header.get("devices") or [])
+        self._devices: list[Any] = []
         try:
             return sum(path.stat().st_size for path in self._paths)
         except OSError as error:

@@ -54,6 +54,7 @@ class CaptureInput(CaptureFiles):
         else:
             layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), self.setup.escs)
         super().__init__(name, layout, size)
+        self._devices = list(self.header.get("devices") or [])
         self._describe()
 
     def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
