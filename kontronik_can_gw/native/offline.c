@@ -240,7 +240,8 @@ static int give_frame(kcg_offline *o, const uint8_t *data)
         g->read_now = g->read_shown = g->read_bound = o->now;
         follow(o, kcg_next_event(g), o->now);
     }
-    if (!give(o, data, f->end, o->now))
+    uint64_t end = o->fed - (uint32_t)((uint32_t)o->fed - f->end); /* the core counts in 32 bits */
+    if (!give(o, data, end, o->now))
         return 0;
     o->is_timed = 0;
     o->found_at++;

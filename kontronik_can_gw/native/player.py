@@ -33,7 +33,7 @@ class _Column(c.Structure):
 
 
 class _Found(c.Structure):
-    _fields_ = (("end", _u64), ("bytes", _u8 * 40))
+    _fields_ = (("end", _u32), ("bytes", _u8 * 36))
 
 
 class _Offline(c.Structure):

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames, Rows
     from kontronik_can_gw.native.player import Player
 
+_PLAYED = frozenset({Kind.BYTES, Kind.ADVANCE, Kind.COUNTERS})
+"""What a player plays, and by which frames of the turn before are certain."""
+
 
 class CaptureInput(CaptureFiles):
     """Captures of one run, in the order of their parts, played through the gateway's core."""
@@ -152,7 +155,7 @@ class CaptureInput(CaptureFiles):
                     yield replay.play(entry)
                 continue
             while (kind := player.next_kind) is not None:
-                if here or (kind == Kind.NOT_SENT and replay.frames_wait):
+                if here or (replay.frames_wait and kind not in _PLAYED):  # it may still drop them
                     here = here if kind == Kind.NOT_SENT else kind != Kind.ADVANCE
                     if (found := self._checked(entry_at(payload, *player.skip()))) is not None:
                         yield replay.play(found)
