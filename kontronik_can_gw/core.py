@@ -32,6 +32,8 @@ class Core(Protocol):
 
     language: str
     """``Python`` or ``C``."""
+    note: str
+    """What live frames need Python for although the core is in C, in words; empty: nothing."""
 
     @property
     def escs(self) -> Sequence[EscTelemetry]:
@@ -98,6 +100,7 @@ class PythonCore:
     """The core in plain Python. ``silent``: see Messages. ``packs_at_once``: see Core."""
 
     language = "Python"
+    note = ""
 
     def __init__(
         self,

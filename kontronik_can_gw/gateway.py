@@ -62,6 +62,11 @@ class Gateway:
         self._being_saved: list[tuple[int, Output]] = []
         self._dropped = False
 
+    @property
+    def core_note(self) -> str:
+        """Why the core is the one in Python, or is not all that runs; empty where it is the one in C alone."""
+        return self.why_python or self.core.note
+
     def start(self, now: int, can_open: bool = True) -> None:
         """The runtime has opened what it could: run. Nodes boot when there is a bus that can hear it."""
         self.status.state = GatewayState.RUNNING

@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         _write(folder, files)
     except OSError as error:
-        raise RunError(f"{error.filename}: cannot be written: {error.strerror}") from None
+        raise RunError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
     say(f"{folder} written. {folder / 'README.md'} says how to build it in.")
     return 0
 

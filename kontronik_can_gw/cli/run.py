@@ -136,7 +136,7 @@ class _Run:
         # first, because a damaged file is moved aside by now and must be reported
         _say_parameters(loaded)
         loop.open()
-        log.info("%s", in_words(gateway.core.language, gateway.why_python))
+        log.info("%s", in_words(gateway.core.language, gateway.core_note))
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         self._loop = loop

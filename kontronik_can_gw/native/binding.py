@@ -17,7 +17,8 @@ from kontronik_can_gw.native.rows import (
     Settings,
     Signal,
 )
-from kontronik_can_gw.native.tables import END_OF_TIME, Tables, held_settings
+from kontronik_can_gw.native.settings import held_settings
+from kontronik_can_gw.native.tables import END_OF_TIME, Tables
 
 HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256

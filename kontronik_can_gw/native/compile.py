@@ -1,5 +1,6 @@
 """Compiles the core in C: hatch_build.py at the installation, ``python -m kontronik_can_gw.native.compile`` after an edit."""
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -17,8 +18,16 @@ CROSS_COMPILERS = {
     "armv7l": "arm-linux-gnueabihf-gcc",
 }
 """By machine; Debian's gcc, gcc-aarch64-linux-gnu and gcc-arm-linux-gnueabihf."""
-OF_NO_LIBRARY = (*_OPTIMISED, "-nostdlib", "-U_FORTIFY_SOURCE", "-fno-stack-protector", "-lgcc")
-"""Linked with nothing: the process that loads it has a libc, of whichever kind and version."""
+OF_NO_LIBRARY = (
+    *_OPTIMISED,
+    "-nostdlib",
+    "-U_FORTIFY_SOURCE",
+    "-U_TIME_BITS",
+    "-U_FILE_OFFSET_BITS",
+    "-fno-stack-protector",
+    "-lgcc",
+)
+"""Linked with nothing: the process that loads it has a libc, of whichever kind and version (of 32 bits, with its oldest time_t)."""
 
 
 def compiler() -> str | None:
@@ -56,7 +65,10 @@ def compile_core(
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{named}: {error}"
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(
+            OSError
+        ):  # of a file system that is read-only even where it is not there
+            part.unlink()
     return None
 
 

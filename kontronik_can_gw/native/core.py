@@ -17,6 +17,7 @@ from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import Slot, Slots
 
+_LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"
 _OF_ITS_OWN = Event.SECOND | Event.LINK
 """Followed here in any case."""
 
@@ -72,6 +73,7 @@ class NativeCore:
             events |= wanted
         self.reports_live = bool(events & Event.LIVE)
         """True while somebody follows each live frame."""
+        self.note = _LIVE_IN_PYTHON if self.reports_live else ""
         self._handle.report_only(events)
 
     def slot(self, esc: int) -> Slot:

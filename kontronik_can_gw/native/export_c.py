@@ -78,11 +78,10 @@ def _options(layout: Layout, tables: Tables) -> dict[str, int]:
 def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSettings]) -> str:
     """Names of messages and ESCs: their places, ids (bit 31: 29 bits) and lengths."""
     places = _names("KCG_ESC_", [esc.name for esc in escs])
-    rows = [
-        f"#define {name.replace('MESSAGE', 'ID', 1)} {_id(row)}u\n"
-        f"#define {name.replace('MESSAGE', 'LENGTH', 1)} {row.length}"
-        for name, row in zip(names, tables.messages, strict=True)
-    ]
+    rows = []
+    for name, row in zip(names, tables.messages, strict=True):
+        _, can_id, length = _forms(name)
+        rows.append(f"#define {can_id} {_id(row)}u\n#define {length} {row.length}")
     parts = (
         "#ifndef KCG_TABLES_H",
         "#define KCG_TABLES_H",
@@ -157,15 +156,20 @@ def _id(row: Any) -> str:
 
 
 def _names(prefix: str, texts: Sequence[str]) -> list[str]:
-    """A C identifier for each, no two the same."""
+    """A C identifier for each, no two the same, and none that core.h has, as an id or a length neither."""
+    taken = set(re.findall(r"KCG_\w+", (FOLDER / "core.h").read_text(encoding="utf-8")))
     found: dict[str, None] = {}
     for text in texts:
         name = base = prefix + re.sub(r"\W", "_", text, flags=re.ASCII)
         number = 2
-        while name in found:
+        while name in found or not taken.isdisjoint(_forms(name)):
             name, number = f"{base}_{number}", number + 1
         found[name] = None
     return list(found)
+
+
+def _forms(name: str) -> list[str]:
+    return [name.replace("MESSAGE", form, 1) for form in ("MESSAGE", "ID", "LENGTH")]
 
 
 def _plain(text: str) -> str:

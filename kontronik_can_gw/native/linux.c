@@ -110,30 +110,30 @@ static void put(kcg_turns *t, const kcg_frame *made)
 /* What is pending goes to the bus, or waits until it takes frames again; false where that is the loop's. */
 static int transmit(kcg_turns *t)
 {
-    uint32_t count, before = t->unsent;
-    while (t->unsent <= KCG_OUT - KCG_MADE && (count = kcg_take(t->core, t->now, t->made, KCG_MADE))) {
-        kcg_sent(t->core, t->now, count);
-        t->taken += count;
-        for (uint32_t i = 0; i < count; i++) {
-            if (before)
-                put(t, &t->made[i]);
-            else
-                t->frames[t->unsent++] = t->made[i];
+    do {
+        uint32_t count, before = t->unsent;
+        while (t->unsent <= KCG_OUT - KCG_MADE && (count = kcg_take(t->core, t->now, t->made, KCG_MADE))) {
+            kcg_sent(t->core, t->now, count);
+            t->taken += count;
+            for (uint32_t i = 0; i < count; i++) {
+                if (before)
+                    put(t, &t->made[i]);
+                else
+                    t->frames[t->unsent++] = t->made[i];
+            }
         }
-    }
-    if (kcg_pending(t->core))
-        return 0;
-    if (t->unsent && !t->is_full) {
-        uint32_t waiting = t->unsent;
-        int went = hand_over(t), is_full = went < 0 && errno == EAGAIN;
-        if (t->unsent && (!is_full || t->records))
-            return 0;
-        kcg_gateway(t->core)[KCG_SEND_FAILURES] += is_full;
-        if (t->unsent < waiting || !before)
-            t->full_since = t->now;
-        watch_room(t, is_full);
-    }
-    return !t->unsent || t->now - t->full_since < MAX_FULL;
+        if (t->unsent && !t->is_full) {
+            uint32_t waiting = t->unsent;
+            int went = hand_over(t), is_full = went < 0 && errno == EAGAIN;
+            if (t->unsent && (!is_full || t->records))
+                return 0;
+            kcg_gateway(t->core)[KCG_SEND_FAILURES] += is_full;
+            if (t->unsent < waiting || !before)
+                t->full_since = t->now;
+            watch_room(t, is_full);
+        }
+    } while (kcg_pending(t->core) && !t->unsent);
+    return !kcg_pending(t->core) && (!t->unsent || t->now - t->full_since < MAX_FULL);
 }
 
 int kcg_watch(kcg_turns *t)
@@ -161,7 +161,8 @@ static void note_answer(const struct pollfd *p, kcg_input *in, int64_t asked)
 /* Ask which of all descriptors are ready. */
 static void ask_all(kcg_turns *t)
 {
-    t->before = t->asked;
+    if (!t->fds[t->bus_place].revents)
+        t->before = t->asked; /* what the bus has brought came since */
     t->asked = now_ns();
     if (poll(t->fds, t->count, 0) < 0)
         for (uint32_t i = 0; i < t->count; i++)
@@ -234,7 +235,7 @@ void kcg_turn(kcg_turns *t)
     t->unsent = t->taken = t->recorded = t->turns = 0;
     for (uint32_t i = 0; i < t->count; i++)
         if (t->fds[i].fd == t->bus) {
-            t->bus_place = i;
+            t->bus_place = i, t->fds[i].revents = 0;
         } else if (t->input_of[i] >= 0) {
             kcg_input *in = &t->inputs[t->input_of[i]];
             in->asked = in->empty > t->asked ? in->empty : t->asked;

@@ -8,7 +8,6 @@ import math
 import struct
 from collections.abc import Sequence
 from ctypes import c_uint16, c_uint64
-from dataclasses import replace
 from fractions import Fraction
 from itertools import accumulate
 from typing import Any
@@ -28,9 +27,9 @@ from kontronik_can_gw.native.rows import (
     NotInCore,
     Pair,
     Piece,
-    Settings,
     Signal,
 )
+from kontronik_can_gw.native.settings import MAX_GEAR, MAX_POLES, settings_of
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
@@ -46,9 +45,6 @@ ALL_PAGES = 64
 ALL_ESCS = 255
 MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""
-MAX_POLES = MAX_CELLS = 0xFF
-MAX_GEAR = 0xF_FFFF
-"""Of numerator and denominator of a gear in its lowest terms: 9.81818 has 490909 and 50000."""
 MAX_ROWS = 0xFFFF
 """Of a table that is addressed by 16 bits."""
 MAX_ALIVE, MAX_BITS = 1 << 16, 64
@@ -266,27 +262,6 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         row.kind, row.place = OF_COUNT, COUNTS.index(name)
     else:
         raise NotInCore(f"no source {value.name}")
-
-
-def settings_of(esc: EscSettings) -> Any:
-    """The settings of an ESC for the core. NotInCore where they are beyond its limits."""
-    numerator, denominator = esc.gear.numerator, esc.gear.denominator
-    if max(numerator, denominator) > MAX_GEAR:
-        raise NotInCore(f"{esc.name}: gear {esc.gear}: parts above {MAX_GEAR}")
-    if esc.pole_pairs > MAX_POLES or esc.cell_count > MAX_CELLS:
-        raise NotInCore(f"{esc.name}: {esc.pole_pairs} pole pairs, {esc.cell_count} cells")
-    timeout, errors = esc.timeout_ns, min(esc.crc_error_threshold, 0xFFFF_FFFF)
-    return Settings(timeout, errors, esc.pole_pairs, numerator, denominator, esc.cell_count)
-
-
-def held_settings(esc: EscSettings) -> Any:
-    """As ``settings_of``, of settings that come later. Beyond the limits the speeds that they divide are not available."""
-    try:
-        return settings_of(esc)
-    except NotInCore:
-        row = settings_of(replace(esc, pole_pairs=1, gear=Fraction(1)))
-        row.poles = 0
-        return row
 
 
 def places_of(protocol: EscProtocol) -> Places:

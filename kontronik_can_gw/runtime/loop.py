@@ -160,10 +160,11 @@ class Loop:
 
     def _turn_in_c(self, period: int) -> list[tuple[Handler, int]] | None:
         """Let turns be made in C, as long as these are plain; what is ready then. None where it is not the time for that."""
-        if self._lost or self.can.port is None:
-            return None
         can, housekeeping = self.can, self._housekeeping
+        if can.port is None:
+            return None
         due = min(can.due, housekeeping.wake_due, self.gateway.next_deadline(with_core=False))
+        due = min([due, *(esc.due for esc in self._lost)])
         leave = min(housekeeping.due, can.controller.due)
         max_turn = can.transmitter.max_turn_ns()
         limits = (max(MIN_HELD_UP_NS, max_turn), max_turn)

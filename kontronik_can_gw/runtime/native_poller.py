@@ -1,5 +1,6 @@
 """Turns of the loop in C, while the core is there, too, and nothing but plain reads and frames that are due is to be done."""
 
+import contextlib
 import os
 import signal
 import threading
@@ -35,6 +36,7 @@ class NativePoller(Poller):
         self._seen_changes = -1
         self._fits = True
         self._signals: tuple[int, int] | None = None
+        self._woken_before = -1
 
     def noted(self, esc: int) -> PortInput:
         return cast(PortInput, self._turns.inputs[esc])
@@ -43,21 +45,22 @@ class NativePoller(Poller):
         """A signal is followed when C is left: let it wake that, at whatever moment it comes."""
         if threading.current_thread() is threading.main_thread():
             self._signals = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-            signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
+            self._woken_before = signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
             self.register(self._signals[0], self._signalled)
 
     def close(self) -> None:
         super().close()
         self._turns.close()
         if self._signals is not None:
-            signal.set_wakeup_fd(-1)
+            signal.set_wakeup_fd(self._woken_before)
             for fd in self._signals:
                 os.close(fd)
             self._signals = None
 
     def _signalled(self, _now: int, _events: int) -> None:
         assert self._signals is not None
-        os.read(self._signals[0], 4096)
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._signals[0], 4096)
 
     def turn(
         self,
@@ -111,6 +114,6 @@ def _plain_socket(can: "CanLink", gateway: Gateway) -> int | None:
     """The interface's socket, while frames can be handed to it without further ado."""
     port = can.port
     is_plain = can.is_proven and can.transmitter.is_idle and not can.controller.is_off
-    if port is None or not is_plain or port.state is not gateway.status.can_state:
+    if port is None or port.gone or not is_plain or port.state is not gateway.status.can_state:
         return None
     return port.fileno() if port.is_socket else None

@@ -137,7 +137,7 @@ def snapshot(
             "esc_count": status.esc_count,
             "escs_ok": status.escs_ok,
             "core": gateway.core.language,
-            "core_reason": gateway.why_python or None,
+            "core_reason": gateway.core_note or None,
         },
         "can": _can(can, status),
         "units": _UNITS,

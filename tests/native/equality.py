@@ -35,7 +35,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import GATEWAY, NotInCore
-from kontronik_can_gw.native.tables import MAX_GEAR
+from kontronik_can_gw.native.settings import MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import Slot, SlotSettings
 

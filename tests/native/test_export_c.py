@@ -91,9 +91,9 @@ def test_what_the_core_cannot_express_is_refused(
 
 def test_names_end_no_comment_and_are_never_the_same() -> None:
     bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    names = "a*/b", "a  b", "é\n"
+    names = "a*/b", "a  b", "é\n", "COUNT"
     layout = replace(bus.layout, file='/x/*/"\\\n.dbc')
     files = exported(layout, [EscSettings(name) for name in names], False, "licence")
-    assert "KCG_ESC_a__b, KCG_ESC_a__b_2, KCG_ESC___," in files["tables.h"]
+    assert "KCG_ESC_a__b, KCG_ESC_a__b_2, KCG_ESC___, KCG_ESC_COUNT_2," in files["tables.h"]
     assert "Messages of ___.dbc:" in files["tables.h"]
     assert all(text.isascii() for text in files.values())

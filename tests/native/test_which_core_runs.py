@@ -25,7 +25,7 @@ from kontronik_can_gw.native import compile as compiling
 from kontronik_can_gw.native import load, objects
 from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import sealed
-from kontronik_can_gw.native.tables import MAX_GEAR
+from kontronik_can_gw.native.settings import MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
 
 EMPTY = Layout("", "", ())
@@ -175,8 +175,8 @@ def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available(
     for now, (poles, gear, motor, output) in enumerate(
         (
             (7, Fraction(490_909, 50_000), 10_000, 1_019),
-            (7, Fraction(1, MAX_GEAR + 1), NOT_AVAILABLE, NOT_AVAILABLE),
-            (7, Fraction(MAX_GEAR + 2, 2), NOT_AVAILABLE, NOT_AVAILABLE),
+            (7, Fraction(1, MAX_GEAR + 1), 10_000, NOT_AVAILABLE),
+            (7, Fraction(MAX_GEAR + 2, 2), 10_000, NOT_AVAILABLE),
             (100_000, Fraction(1), NOT_AVAILABLE, NOT_AVAILABLE),
             (7, Fraction(5), 10_000, 2_000),
         )
