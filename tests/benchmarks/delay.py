@@ -30,7 +30,7 @@ def delay(context: Context) -> list[Figure]:
     value = median(
         [a.delay["p50"] / b.delay["p50"] for a, b in zip(found["ours"], found["c"], strict=True)]
     )
-    figures.append(judged("ours / c, median", value, "x", "<= 2"))
+    figures.append(judged("ours / c, median", value, "x", "<= 1.1"))
     figures.append(judged("ours, 99 %", of_runs(found["ours"], "p99"), "us", "<= 2000"))
     return figures
 
@@ -56,7 +56,7 @@ def full(context: Context) -> list[Figure]:
     longest = f"longest {of_runs(runs, 'max'):.0f}"
     return [
         Figure("8 ESCs and all, median", of_runs(runs, "p50"), "us"),
-        judged("8 ESCs and all, 99 %", of_runs(runs, "p99"), "us", "<= 2000", longest),
+        judged("8 ESCs and all, 99 %", of_runs(runs, "p99"), "us", "<= 1000", longest),
         Figure(
             "SDO answers, 99 %",
             answer,

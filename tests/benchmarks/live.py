@@ -182,10 +182,10 @@ def beside(context: Context, escs: int, most: str, least: str, *options: str) ->
 @benchmark("cpu", "CPU time a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program")
 def cpu(context: Context) -> list[Figure]:
     """The table of the three programs."""
-    figures = beside(context, 1, "<= 3.2", "")
+    figures = beside(context, 1, "<= 1.35", ">= 6")
     if context.quick:
         return figures
-    return figures + beside(context, 8, "<= 2.2", ">= 4") + beside(context, 64, "", "")
+    return figures + beside(context, 8, "<= 1.25", ">= 6") + beside(context, 64, "<= 1.2", "")
 
 
 @benchmark("cpu-bytewise", "the same where the bytes come one by one")
@@ -211,7 +211,7 @@ def canopen(context: Context) -> list[Figure]:
             "us/frame",
             note=f"{frames:.1f} CANopen frames a live frame",
         ),
-        judged("with / without CANopen", ratio(both, plain), "x", "<= 1.6"),
+        judged("with / without CANopen", ratio(both, plain), "x", "<= 1.25"),
     ]
 
 

@@ -76,7 +76,7 @@ def start_up(context: Context) -> list[Figure]:
             found[name].append(first_frame_ms(escs, config))
     context.data["starts_ms"] = found
     return [
-        judged(f"first CAN frame, {name}", median(times), "ms", "<= 500")
+        judged(f"first CAN frame, {name}", median(times), "ms", "<= 250")
         if name == "1 ESC"
         else Figure(f"first CAN frame, {name}", median(times), "ms")
         for name, times in found.items()
@@ -137,10 +137,10 @@ def memory(context: Context) -> list[Figure]:
     figures = []
     for case, kinds in found.items():
         note = f"PSS {kinds['PSS']:.1f}, USS {kinds['USS']:.1f}"
-        limited = (judged, "<= 40") if case == "1 ESC" else (Figure, "")
+        limited = (judged, "<= 24") if case == "1 ESC" else (Figure, "")
         figures.append(limited[0](f"RSS, {case}", kinds["RSS"], "MB", limited[1], note=note))
     return [
         *figures,
-        judged("RSS, each further ESC", further, "MB", "<= 0.3"),
+        judged("RSS, each further ESC", further, "MB", "<= 0.05"),
         Figure("RSS, each further ESC, CANopen", further_nodes, "MB"),
     ]
