@@ -1,14 +1,13 @@
 """What comes of a recording that the core in C plays at full speed (player.py): frames and rows in blocks, and their text (offline.c)."""
 
 import ctypes as c
-import struct
 from collections.abc import Iterator, Sequence
 from itertools import starmap
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.esc.values import Divisor, Value
-from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.native.binding import Frame
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.rows import NotInCore
 
 ROWS = 1 << 13
@@ -16,7 +15,6 @@ _TEXT = 1 << 20
 _WHOLE, _DIVIDED, _ROUNDED = range(3)
 _u8, _u32, _u64, _i64, _p = c.c_uint8, c.c_uint32, c.c_uint64, c.c_int64, c.c_void_p
 _text, _size = c.c_char_p, c.c_size_t
-_head = struct.Struct("=IBBB").unpack_from
 
 
 class _Word(c.Structure):
@@ -86,17 +84,8 @@ class Frames:
         )
 
     def __iter__(self) -> Iterator[tuple[int, CanFrame]]:
-        raw = self._memory
-        size = c.sizeof(Frame)
-        for time_ns, at in zip(
-            self.times, range(self._begin * size, self._end * size, size), strict=True
-        ):
-            number, length, flags, page = _head(raw, at)
-            data = bytes(raw[at + 8 : at + 8 + length])
-            yield (
-                time_ns,
-                CanFrame(number & ~EXTENDED, data, number >= EXTENDED, flags != 0, page),
-            )
+        frames = frames_in(memoryview(self._memory), self._begin * c.sizeof(Frame), len(self))
+        return zip(self.times, frames, strict=True)
 
     def candump(self, shift_ns: int, channel: str) -> memoryview:
         """Lines of a candump log, with microseconds of the time and ``shift_ns``."""

@@ -19,7 +19,7 @@ from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
-from kontronik_can_gw.runtime.poller import Handler, Poller
+from kontronik_can_gw.runtime.poller import Bounds, Handler, Poller
 from kontronik_can_gw.runtime.snapshot import ProgramFacts
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
@@ -167,8 +167,8 @@ class Loop:
         due = min([due, *(esc.due for esc in self._lost)])
         leave = min(housekeeping.due, can.controller.due)
         max_turn = can.transmitter.max_turn_ns()
-        limits = (max(MIN_HELD_UP_NS, max_turn), max_turn)
-        return self._poller.turn(can, self._now, due, leave, period, limits)
+        max_late = max(MIN_HELD_UP_NS, max_turn)
+        return self._poller.turn(can, Bounds(self._now, due, leave, period, max_late, max_turn))
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
         """Take what has come, do what is due, send what is made of it. Returns the time."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.poller import Handler, Poller, PortInput
+from kontronik_can_gw.runtime.poller import Bounds, Handler, Poller, PortInput
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.core import NativeCore
@@ -62,20 +62,10 @@ class NativePoller(Poller):
         with contextlib.suppress(BlockingIOError):
             os.read(self._signals[0], 4096)
 
-    def turn(
-        self,
-        can: "CanLink",
-        last: int,
-        due: int,
-        leave: int,
-        period: int,
-        limits: tuple[int, int],
-    ) -> list[tuple[Handler, int]] | None:
+    def turn(self, can: "CanLink", bounds: Bounds) -> list[tuple[Handler, int]] | None:
         """Turn until something is to be done that is the loop's; the handlers of what is ready then.
 
-        None where it is not the time for that. ``last``: the last turn; ``due``: what the loop has to do apart from the core;
-        ``leave``: when to come back in any case; ``period``: how long a wait is at most; ``limits``: how late a turn, and the sending of
-        its frames, may be. All in ns.
+        None where it is not the time for that.
         """
         gateway = self._gateway
         if self._core.reports_live or gateway.frames_wait:
@@ -84,13 +74,12 @@ class NativePoller(Poller):
             return None
         turns = self._turns
         state = turns.state
-        state.now, state.asked, state.before, state.bus = last, self.now, self.before, bus
+        state.asked, state.before, state.bus = self.now, self.before, bus
+        state.now, due, state.leave, state.period, state.max_late, state.max_turn = bounds
         state.due = min(due, self._core.deadline_in_python())
-        state.leave, state.period = leave, period
-        state.max_late, state.max_turn = limits
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
-            recorded.prepare_turns(last)
+            recorded.prepare_turns(bounds.last)
         state.records = recorded is not None
         turns.run()
         self.count += state.turns
