@@ -348,17 +348,17 @@ def test_another_file_is_never_overwritten_nor_a_link_followed(
 def test_the_wall_clock_that_is_set_is_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shift = 1_700_000_000 * SECOND
-    bed = Bed(tmp_path)
-    monkeypatch.setattr(time, "time_ns", lambda: bed.now + shift)
-    bed.it.put(bed.now, Kind.BYTES, 0, b"a", 0)
+    now, shift = 10 * SECOND, 1_700_000_000 * SECOND
+    monkeypatch.setattr(time, "time_ns", lambda: now + shift)  # before the thread asks for it
+    bed = Bed(tmp_path, lambda: now)
+    bed.it.put(now, Kind.BYTES, 0, b"a", 0)
     until(lambda: bed.it._file is not None and not bed.it._entries)
-    bed.now += 11 * SECOND
+    now += 11 * SECOND
     shift += 3600 * SECOND
-    bed.it.put(bed.now, Kind.BYTES, 0, b"x", 0)
+    bed.it.put(now, Kind.BYTES, 0, b"x", 0)
     until(lambda: bed.it._offset == shift)
-    bed.now += SECOND
-    bed.it.put(bed.now, Kind.BYTES, 0, b"b", 0)
+    now += SECOND
+    bed.it.put(now, Kind.BYTES, 0, b"b", 0)
     bed.it.close()
     with open_input(tmp_path) as found:
         assert isinstance(found, CaptureInput)
