@@ -23,7 +23,7 @@ from kontronik_can_gw.printable import printable
 
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
-    "run": "the gateway: ESC telemetry in, CAN frames out",
+    "run": "the gateway: ESC telemetry in, CAN frames and CANopen out",
     "status": "show the state of a running gateway",
     "check": "check a configuration and print what it will send",
     "doctor": "check machine, ports, CAN interface and configuration, with remedies",
@@ -141,7 +141,7 @@ def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.Argumen
     """The parser of the program. Only commands in ``complete`` get their options; a run needs only those of one command."""
     parser = argparse.ArgumentParser(
         prog="kontronik-can-gw",
-        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN, described by a DBC.",
+        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN: messages of a DBC, and CANopen nodes of an EDS.",
         epilog="kontronik-can-gw COMMAND --help describes a command.",
         allow_abbrev=False,
     )

@@ -88,8 +88,22 @@ def number_from(
     return read
 
 
+class _Named(argparse.Action):
+    """Stores the configuration that stands without -c; where there is none, what -c has given stays."""
+
+    def __call__(self, _parser: object, namespace: object, values: Any, _: object = None) -> None:
+        if values is not None:
+            setattr(namespace, self.dest, values)
+
+
+CONFIG_PLACES = (Path("gateway.toml"), Path("/etc/kontronik-can-gw/gateway.toml"))
+"""Where a configuration is looked for that is not named, in this order."""
+_DEFAULTS = " or ".join(map(str, CONFIG_PLACES))
 # fmt: off
-CONFIG = option("-c --config FILE", "TOML configuration", type=Path, required=True)
+CONFIG = (
+    option("-c --config FILE", f"TOML configuration (default: {_DEFAULTS})", type=Path),
+    option("config FILE", "the same", type=Path, nargs="?", action=_Named),
+)
 JSON = option("--json", "one JSON document on standard output")
 OUTPUT = option("-o --output FILE", "where to (default: standard output)", default="-")
 LAYOUT = (
@@ -97,6 +111,21 @@ LAYOUT = (
     option("--dbc FILE", "DBC of the frames (default: the shipped one, for one ESC)", type=Path),
 )
 # fmt: on
+
+
+def config_file(given: Path | None) -> Path:
+    """The configuration that is named, or the first of CONFIG_PLACES that exists. UserError where there is none."""
+    found = given or default_config()
+    if found is None:
+        raise UserError(
+            f"there is no {_DEFAULTS}. Name the configuration: -c FILE; kontronik-can-gw init writes an example."
+        )
+    return found
+
+
+def default_config() -> Path | None:
+    """The first of CONFIG_PLACES that exists."""
+    return next((place for place in CONFIG_PLACES if place.exists()), None)
 
 
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:

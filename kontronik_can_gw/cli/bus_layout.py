@@ -2,7 +2,7 @@
 
 import argparse
 
-from kontronik_can_gw.cli.common import load_all
+from kontronik_can_gw.cli.common import announced_config, load_all
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.errors import UserError
@@ -14,7 +14,12 @@ def given_layout(args: argparse.Namespace) -> BusLayout | None:
 
 
 def bus_layout(args: argparse.Namespace) -> BusLayout:
-    """The layout that an option names, by default the shipped one. UserError with every mistake."""
+    """The layout that an option names, else of the configuration of this folder or machine, else the shipped one.
+
+    UserError with every mistake.
+    """
+    if args.config is None and args.dbc is None:
+        args.config = announced_config()
     if args.config is None:
         return layout_of_dbc(args.dbc or shipped("dbc/kontronik_esc.dbc"))
     loaded = load_all(args.config)

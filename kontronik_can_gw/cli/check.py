@@ -1,173 +1,145 @@
-"""``check``: shows what a configuration means and sends, without opening anything."""
+"""``check``: says in short whether a configuration can be used and what it sends, without opening anything."""
 
 import argparse
-import re
-import struct
-from collections.abc import Sequence
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
-from kontronik_can_gw.canopen.cob_ids import all_ids
-from kontronik_can_gw.canopen.nodes import Nodes
-from kontronik_can_gw.canopen.pdo import Tpdo
-from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
 from kontronik_can_gw.canopen.traffic import bits_per_second, frames_per_second
-from kontronik_can_gw.cli.arguments import CONFIG
-from kontronik_can_gw.cli.common import load_all, show
+from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file, option
+from kontronik_can_gw.cli.check_details import can_id, details, lost, source, timing
+from kontronik_can_gw.cli.common import say, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
-from kontronik_can_gw.config.assemble import Loaded
-from kontronik_can_gw.config.export import as_toml
-from kontronik_can_gw.dbc.loss import is_mute, reporter
-from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.config.assemble import Loaded, load_configuration
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.node_state import UNCONFIGURED
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
+from kontronik_can_gw.printable import printable_json
 
-OPTIONS = (CONFIG,)
+_EXAMPLE_PORT = "_EXAMPLE-"
+"""In the port of the configuration that ``init`` writes."""
+OPTIONS = (
+    CONFIG,
+    (
+        option("-v --verbose", "every key in effect, message, signal with its source, and node"),
+        JSON,
+    ),
+)
 EPILOG = (
-    "Prints the effective configuration, each message and signal with its source, what is lost, and the bus load. "
-    "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot."
+    "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot: "
+    "each mistake is a line, with key and remedy."
 )
 
 
 def main(args: argparse.Namespace) -> int:
-    loaded = load_all(args.config)
-    config, layout = loaded.config, loaded.layout
-    show(f"# effective configuration of {args.config}")
-    for line in as_toml(config).split("\n"):
+    path = config_file(args.config)
+    try:
+        loaded = load_configuration(path)
+    except UserError as error:
+        if not args.json:
+            raise
+        print(printable_json({"file": str(path), "mistakes": list(error.problems)}, indent=2))
+        return error.exit_code
+    warnings = [*loaded.layout.warnings, *loaded.warnings, *_examples(loaded)]
+    if args.json:
+        print(printable_json(document(path, loaded, warnings), indent=2))
+        return 0
+    for warning in warnings:
+        say(f"warning: {warning}")
+    for line in summary(path, loaded, len(warnings)):
         show(line)
-    load = layout.bus_load(config.can.bitrate, config.can.data_bitrate)
-    frames = sum(message.rate_hz for message in layout.messages)
-    if config.dbc.enabled:
-        show(f"# messages of {layout.node} by {layout.file}")
-        names = [esc.name for esc in config.escs]
-        for line in (*table(layout, names), "", *unbound(layout)):
-            show(line)
-    if loaded.canopen is not None:
-        nodes = loaded.canopen.nodes(loaded.escs)
-        show(f"# CANopen nodes by {loaded.canopen.eds.name}")
-        for line in node_table(nodes, loaded):
-            show(line)
+    if args.verbose:
         show()
-        load += bits_per_second(nodes.nodes) / config.can.bitrate
-        frames += frames_per_second(nodes.nodes)
-    if (folder := record_folder(config)) is not None:
-        show(f"# captures: {in_words(config, folder)}")
-    show(
-        f"# bus load {load:.1%} of {config.can.bitrate // 1000} kbit/s: {frames:.0f} frames/s with each ESC at 100 Hz, "
-        "worst stuffing; what is sent on change counted by its cycle, no SDO traffic"
-    )
+        for line in details(loaded):
+            show(line)
     return 0
 
 
-def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
-    """Each node's COB-IDs and PDOs in columns."""
-    rows: list[tuple[str, ...]] = [("node", "COB-ID", "what", "sent", "objects")]
-    for node, esc in zip(nodes.nodes, loaded.escs, strict=True):
-        if node.node_id == UNCONFIGURED:
-            serial = f"serial number {node.identity.identity[3]}"
-            rows.append((f"{esc.name}: waits for LSS", "7E5h", "LSS", "", serial))
-            continue
-        first = f"{esc.name}: {node.node_id}"
-        tpdos = {tpdo.cob_id: tpdo for tpdo in node.tpdos if tpdo.valid}
-        for cob_id, what in dict(all_ids(node)).items():
-            sent, objects = "", ""
-            if (tpdo := tpdos.get(cob_id)) is not None:
-                sent = pdo_timing(tpdo)
-                objects = ", ".join(variable.entry.name for variable in tpdo.mapped)
-            what = re.sub(rf" (of|to) CANopen node {node.node_id}$", "", what)
-            rows.append((first, f"{cob_id:03X}h", what, sent, objects))
-            first = ""
-    return columns(rows)
-
-
-def pdo_timing(tpdo: Tpdo) -> str:
-    """Transmission type and times of a PDO, in words."""
-    if tpdo.type not in EVENT_TYPES:
-        return "at a SYNC after news" if tpdo.type == 0 else f"every {tpdo.type} SYNC"
-    words = ["on change" if tpdo.on_change else "with each frame"]
-    if tpdo.inhibit_ns:
-        words.append(f">= {tpdo.inhibit_ns / MS:g} ms")
-    if tpdo.event_ns:
-        words.append(f"every {tpdo.event_ns // MS} ms")
-    return ", ".join(words)
-
-
-def table(layout: Layout, esc_names: list[str]) -> list[str]:
-    """Message, id, cycle, signal, source and losses in columns."""
-    head = ("message", "id", "sent", "signal", "source", "lost")
-    rows: list[tuple[str, ...]] = []
-    for message in layout.messages:
-        first = (message.name, can_id(message), timing(message))
-        for signal in message.signals:
-            rows.append((*first, signal.name, _source(signal, esc_names), _lost(message, signal)))
-            first = ("", "", "")
-    return columns([head, *rows])
-
-
-def unbound(layout: Layout) -> list[str]:
-    """Unbound signals with their constant values, a line for each message."""
-    lines = []
-    for message in layout.messages:
-        if found := [signal for signal in message.signals if signal.unbound]:
-            held = ", ".join(
-                f"{signal.name} = {shown(signal, signal.constant)}" for signal in found
+def _examples(loaded: Loaded) -> Iterator[str]:
+    """A warning for each port that is still the example's."""
+    for esc in loaded.config.esc:
+        if _EXAMPLE_PORT in esc.port:
+            yield (
+                f"{loaded.config.file}: port of {esc.name}: {esc.port} is the example's. "
+                "Write the name of yours: ls /dev/serial/by-id"
             )
-            lines.append(f"#   {message.name}: {held}")
-    return ["# bound to nothing, so they hold these values for ever:", *lines, ""] if lines else []
 
 
-def shown(signal: SignalPlan, raw: int) -> str:
-    """The physical value of raw bits, or their text in the value table."""
-    if signal.is_float:
-        (value,) = struct.unpack(
-            "<f" if signal.length == 32 else "<d", raw.to_bytes(signal.length // 8, "little")
-        )
-        return f"{value * float(signal.factor) + float(signal.offset):g} {signal.unit}".rstrip()
-    return (
-        signal.texts.get(raw)
-        or f"{float(raw * signal.factor + signal.offset):.10g} {signal.unit}".rstrip()
+def summary(path: Path, loaded: Loaded, warnings: int) -> Iterator[str]:
+    """What the gateway reads and sends, in a few lines that fit 80 columns."""
+    config, layout = loaded.config, loaded.layout
+    found = _counted(warnings, "warning") if warnings else "no warnings"
+    yield f"{path}: can be used, {found}"
+    for esc, settings in zip(config.esc, loaded.escs, strict=True):
+        yield f"  ESC       {esc.name}: {_counted(settings.pole_pairs, 'pole pair')}, gear {float(settings.gear):g}"
+        yield f"            {esc.port}"
+    can = config.can
+    rate = f"{can.bitrate // 1000} kbit/s" + (
+        f", data {can.data_bitrate // 1000} kbit/s" if can.fd else ""
     )
+    yield f"  CAN       {can.channel} ({can.interface}), {rate}"
+    if config.dbc.enabled:
+        ids = [can_id(message) for message in sorted(layout.messages, key=lambda each: each.can_id)]
+        span = f", {' to '.join(dict.fromkeys((ids[0], ids[-1])))}" if ids else ""
+        yield f"  DBC       {_counted(len(layout.messages), 'message')}{span}"
+        yield f"            {layout.file}"
+    if loaded.canopen is not None:
+        for node, each in zip(loaded.canopen.nodes(loaded.escs).nodes, loaded.escs, strict=True):
+            sent = (
+                f"node {node.node_id}, {_counted(sum(tpdo.valid for tpdo in node.tpdos), 'TPDO')}"
+            )
+            yield f"  CANopen   {each.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else sent}"
+    if (folder := record_folder(config)) is not None:
+        yield f"  captures  {in_words(config, folder)}"
+    load, frames = _traffic(loaded)
+    yield f"  bus load  {load:.1%}, {frames:.0f} frames/s: ESCs at 100 Hz, worst stuffing, no SDO"
 
 
-def _lost(message: MessagePlan, signal: SignalPlan) -> str:
-    """What is lost in a signal: resolution, range, or the report of lost telemetry."""
-    notes = list(signal.notes)
-    if is_mute(signal) and (found := reporter(message, signal)) is not None:
-        notes.append(f"{found.name} reports the loss")
-    return "; ".join(notes)
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows as lines with aligned columns."""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+def _traffic(loaded: Loaded) -> tuple[float, float]:
+    """Share of the bus and frames a second. What is sent on change is counted by its cycle."""
+    can, layout = loaded.config.can, loaded.layout
+    load = layout.bus_load(can.bitrate, can.data_bitrate)
+    frames = sum(message.rate_hz for message in layout.messages)
+    if loaded.canopen is not None:
+        nodes = loaded.canopen.nodes(loaded.escs).nodes
+        load += bits_per_second(nodes) / can.bitrate
+        frames += frames_per_second(nodes)
+    return load, frames
 
 
-def can_id(message: MessagePlan) -> str:
-    """The id in hexadecimal: 3 digits for 11 bits, 8 for 29."""
-    return f"{message.can_id:08X}h" if message.extended else f"{message.can_id:03X}h"
-
-
-def timing(message: MessagePlan) -> str:
-    """Send type, cycle and minimum distance of a message, in words."""
-    words = []
-    if message.cycle_ns:
-        words.append(f"every {message.cycle_ns // MS} ms")
-    if SendType.EVENT in message.send_type:
-        words.append("with each frame")
-    if SendType.ON_CHANGE in message.send_type:
-        words.append("on change")
-    if message.delay_ns:
-        words.append(f">= {message.delay_ns // MS} ms")
-    return ", ".join(words)
-
-
-def _source(signal: SignalPlan, esc_names: list[str]) -> str:
-    if signal.source is None:
-        text = str(signal.constant) if signal.role is Role.CONSTANT else ""
-        return f"({signal.role.value}{' ' + text if text else ''})"
-    unit = f" {signal.source.unit}" if signal.source.unit else ""
-    prefix = f"{esc_names[signal.esc]}." if signal.esc is not None and len(esc_names) > 1 else ""
-    page = f" page {signal.page}" if signal.page is not None else ""
-    return f"{prefix}{signal.source.name}{unit}{page}"
+def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
+    """The same as JSON, with every message and signal."""
+    config, layout = loaded.config, loaded.layout
+    names = [esc.name for esc in loaded.escs]
+    load, frames = _traffic(loaded)
+    nodes = [] if loaded.canopen is None else loaded.canopen.nodes(loaded.escs).nodes
+    return {
+        "file": str(path),
+        "mistakes": [],
+        "warnings": warnings,
+        "escs": [{"name": e.name, "port": e.port, "protocol": e.protocol} for e in config.esc],
+        "can": {
+            "interface": config.can.interface,
+            "channel": config.can.channel,
+            "bitrate": config.can.bitrate,
+        },
+        "bus_load": load,
+        "frames_per_second": frames,
+        "dbc": layout.file,
+        "messages": [
+            {
+                "name": message.name,
+                "id": can_id(message),
+                "sent": timing(message),
+                "signals": {
+                    signal.name: {"source": source(signal, names), "lost": lost(message, signal)}
+                    for signal in message.signals
+                },
+            }
+            for message in layout.messages
+        ],
+        "canopen_nodes": [None if node.node_id == UNCONFIGURED else node.node_id for node in nodes],
+    }

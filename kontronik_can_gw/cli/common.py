@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
+from kontronik_can_gw.cli.arguments import default_config
 from kontronik_can_gw.config.assemble import Loaded, load_configuration
 from kontronik_can_gw.errors import UserError
 
@@ -27,6 +28,13 @@ def load_all(path: Path, store: "Callable[[Path], ParameterStore] | None" = None
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         say(f"warning: {warning}")
     return loaded
+
+
+def announced_config() -> Path | None:
+    """The configuration to be used where an option might have named one, which a line on standard error says; None: there is none."""
+    if (found := default_config()) is not None:
+        say(f"by {found}")
+    return found
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.canopen.dbc import database as canopen_database
 from kontronik_can_gw.canopen.dbc import waiting_for_lss
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
-from kontronik_can_gw.cli.common import canopen_of, load_all, say
+from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
@@ -66,6 +66,9 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
+    options = ("config", "from", "esc", "name", "base_id", "id_step", "node")
+    if all(vars(args)[option] is None for option in options):
+        args.config = announced_config()
     text = dbc_text(_canopen(args) if args.canopen else _database(args))
     encoding = "cp1252"  # what tools assume; usually the text is ASCII
     try:

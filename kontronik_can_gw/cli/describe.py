@@ -5,7 +5,7 @@ from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import OUTPUT, option
 from kontronik_can_gw.cli.bus_layout import bus_layout
-from kontronik_can_gw.cli.common import load_all
+from kontronik_can_gw.cli.common import announced_config, load_all
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.describe.document import document
@@ -45,6 +45,8 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _facts(args: argparse.Namespace) -> Facts:
+    if args.config is None and args.dbc is None:
+        args.config = announced_config()
     if args.config is None:
         bus = bus_layout(args)
         return describe(bus, shipped_canopen(range(1, len(bus.escs) + 1)), bus.escs)

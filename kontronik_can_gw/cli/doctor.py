@@ -11,7 +11,7 @@ from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.traffic import bits_per_second
-from kontronik_can_gw.cli.arguments import CONFIG, JSON
+from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.assemble import Loaded, assemble
@@ -49,9 +49,10 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    findings, code = examine(System(), args.config)
+    config = config_file(args.config)
+    findings, code = examine(System(), config)
     if args.json:
-        print(printable_json(document(findings, __version__, str(args.config), code), indent=2))
+        print(printable_json(document(findings, __version__, str(config), code), indent=2))
     else:
         _show(findings)
     return code

@@ -11,10 +11,12 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.storage import VERIFY
-from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
-from kontronik_can_gw.cli.common import canopen_of, load_all
+from kontronik_can_gw.cli.arguments import OUTPUT, default_config, number_from, option
+from kontronik_can_gw.cli.common import canopen_of, load_all, say
 from kontronik_can_gw.cli.output import write_output
+from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
@@ -22,7 +24,7 @@ from kontronik_can_gw.node_state import UNCONFIGURED
 _NODE_ID = number_from(1, 127, "node-ID", kind=lambda text: int(text, 0))
 # fmt: off
 OPTIONS = (
-    option("-c --config FILE", "the EDS and the nodes of this configuration (default: shipped)", type=Path),
+    option("-c --config FILE", "the EDS and the nodes of this configuration (default: those of gateway.toml, else shipped)", type=Path),
     option("--node-id N", "write the DCF of the node with this node-ID: the EDS and its values", type=_NODE_ID),
     OUTPUT,
 )
@@ -38,17 +40,28 @@ _STATES_AND_COMMANDS = frozenset(
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.config is None:
+    loaded = _loaded(args)
+    if loaded is None:
         setup = shipped_canopen([args.node_id or 1])
         escs = setup.esc_settings([EscSettings()])
     else:
-        loaded = load_all(args.config)
         setup, escs = canopen_of(loaded), loaded.escs
     text = setup.eds.data.decode("latin-1")  # keeps all bytes
     if args.node_id is not None:
         text = _dcf(setup, escs, args.node_id, Path(args.output).name)
     write_output(args.output, text, "latin-1")
     return 0
+
+
+def _loaded(args: argparse.Namespace) -> Loaded | None:
+    """The configuration that is named, else that of this folder or machine if it has nodes."""
+    if args.config is not None:
+        return load_all(args.config)
+    path = default_config()
+    if path is None or not load(path).canopen.enabled:
+        return None
+    say(f"by {path}")
+    return load_all(path)
 
 
 def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, name: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cli import need_descriptors
-from kontronik_can_gw.cli.arguments import CONFIG, number_from, option
+from kontronik_can_gw.cli.arguments import CONFIG, config_file, number_from, option
 from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.errors import RunError, UserError
@@ -81,7 +81,8 @@ class _Run:
         from kontronik_can_gw.runtime.snapshot import program_facts
 
         self._args, self._notifier = args, notifier
-        self._program = program_facts(args.config)
+        self._path = config_file(args.config)
+        self._program = program_facts(self._path)
         self._loop: Loop | None = None
         self._stopping = False
 
@@ -106,7 +107,7 @@ class _Run:
         from kontronik_can_gw.runtime.native_poller import poller_for
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
-        loaded = load_all(self._args.config, _parameter_store)
+        loaded = load_all(self._path, _parameter_store)
         if loaded.canopen is not None:
             gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config

@@ -146,7 +146,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("words", [["check"], ["describe"], ["describe", "--format", "json"]])
+@pytest.mark.parametrize("words", [["check", "-v"], ["describe"], ["describe", "--format", "json"]])
 def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> None:
     done = run(*words, "-c", folder / "gateway.toml")
     assert done.code == 0, done.err

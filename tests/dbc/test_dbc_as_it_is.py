@@ -9,7 +9,7 @@ import pytest
 from dbc_bench import compiled, gateway_with, packed, refused
 
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.cli import check
+from kontronik_can_gw.cli import check_details as check
 from kontronik_can_gw.dbc.loss import unreported
 from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.reader import parse_database

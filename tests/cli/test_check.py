@@ -1,0 +1,99 @@
+"""What ``check`` says in short and as JSON, and where commands find a configuration that is not named."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import refused, run, written
+
+from kontronik_can_gw.cli import arguments, init
+
+LEAST = '[[esc]]\nport = "/dev/ttyUSB0"\n'
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """The files that are taken where none is named: of this folder, then of the machine. Neither exists."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(arguments, "CONFIG_PLACES", (Path("gateway.toml"), tmp_path / "etc.toml"))
+    return tmp_path / "gateway.toml", tmp_path / "etc.toml"
+
+
+def test_the_summary_fits_a_screen_and_says_what_is_sent(tmp_path: Path) -> None:
+    file = written(tmp_path / "g.toml", f"{LEAST}pole_pairs = 7\n[canopen]\nenabled = true\n")
+    done = run("check", file)
+    assert (done.code, done.err) == (0, "")
+    lines = done.out.splitlines()
+    assert lines[0] == f"{file}: can be used, no warnings"
+    assert all(
+        len(line) <= 80 for line in lines if str(tmp_path) not in line and ".dbc" not in line
+    )
+    for said in ("esc1: 7 pole pairs", "13 messages, 680h to 6D9h", "node 1, 4 TPDOs", "9.4%"):
+        assert said in done.out
+    assert run("check", "-c", file).out == done.out
+    assert run("check", "-v", file).out.startswith(done.out)
+
+
+def test_the_port_of_the_example_is_a_warning(tmp_path: Path) -> None:
+    done = run("check", written(tmp_path / "g.toml", init.example()))
+    assert done.code == 0
+    (line,) = done.err.splitlines()
+    assert "port of esc1" in line and "is the example's" in line
+    assert "1 warning\n" in done.out
+
+
+def test_json_has_messages_and_warnings_or_the_mistakes(tmp_path: Path) -> None:
+    done = run("check", "--json", written(tmp_path / "g.toml", LEAST))
+    found = json.loads(done.out)
+    assert (done.code, done.err, found["mistakes"], found["warnings"]) == (0, "", [], [])
+    assert found["escs"] == [{"name": "esc1", "port": "/dev/ttyUSB0", "protocol": "kontronik"}]
+    speed = next(each for each in found["messages"] if each["name"] == "EscSpeed")
+    assert speed["id"] == "688h"
+    assert speed["signals"]["BatteryVoltage"] == {"source": "battery_voltage V", "lost": ""}
+    assert 0.05 < found["bus_load"] < 0.1
+
+    done = run("check", "--json", written(tmp_path / "g.toml", f"{LEAST}pole_pair = 7\nx = 1\n"))
+    assert (done.code, done.err) == (2, "")
+    assert [".pole_pair" in line for line in json.loads(done.out)["mistakes"]] == [True, False]
+
+
+def test_a_configuration_is_named_once(tmp_path: Path) -> None:
+    file = written(tmp_path / "g.toml", LEAST)
+    assert "not allowed with argument -c" in refused(2, "check", "-c", file, file)
+
+
+@pytest.mark.parametrize("command", ["check", "doctor", "run"])
+def test_without_a_name_the_configuration_of_the_folder_comes_before_the_machines(
+    places: tuple[Path, Path], command: str
+) -> None:
+    own, machine = places
+    assert "Name the configuration: -c FILE" in refused(2, command)
+    bad = "[[esc]]\nno_such_key = 1\n"
+    written(machine, bad)
+    said = run(command)
+    assert (
+        said.code,
+        "etc.toml: esc1" in said.out + said.err or "etc.toml" in said.out + said.err,
+    ) == (2, True)
+    written(own, bad)
+    said = run(command)
+    assert (said.code, "etc.toml" in said.out + said.err) == (2, False)
+
+
+def test_commands_that_also_work_without_one_say_which_they_take(places: tuple[Path, Path]) -> None:
+    own, _ = places
+    assert run("dbc").err == ""
+    written(
+        own,
+        LEAST.replace("[[esc]]", '[[esc]]\nname = "left"')
+        + '[[esc]]\nname = "right"\nport = "x"\n',
+    )
+    done = run("dbc")
+    assert done.err.startswith("kontronik-can-gw: by gateway.toml\n")
+    assert "EscSpeed_right" in done.out or "right" in done.out.lower()
+    assert run("dbc", "--esc", 1).err == ""
+    assert "by gateway.toml" in run("describe").err
+    assert run("eds").err == "", "no nodes in it"
+    with own.open("a") as file:
+        file.write("[canopen]\nenabled = true\n")
+    assert "by gateway.toml" in run("eds").err
