@@ -1,6 +1,6 @@
 """The gateway's setup in a capture's header: enough to rebuild the same gateway on any machine.
 
-JSON keys of the header (run and recorder add created_ns, run, part, monotonic_ns, wall_ns, devices, state)::
+JSON keys of the header (run and recorder add created_ns, run, part, monotonic_ns, wall_ns, devices, state, layout)::
 
     format, version      "kontronik-can-gw capture", 2
     program              version, python, machine

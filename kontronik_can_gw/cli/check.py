@@ -80,7 +80,7 @@ def summary(path: Path, loaded: Loaded, warnings: int) -> Iterator[str]:
     if config.dbc.enabled:
         ids = [can_id(message) for message in sorted(layout.messages, key=lambda each: each.can_id)]
         span = f", {' to '.join(dict.fromkeys((ids[0], ids[-1])))}" if ids else ""
-        yield f"  DBC       {_counted(len(layout.messages), 'message')}{span}"
+        yield f"  DBC       {_counted(len(layout.messages), 'message')}{span}, layout {layout.fingerprint}"
         yield f"            {layout.file}"
     if loaded.canopen is not None:
         for node, each in zip(loaded.canopen.nodes(loaded.escs).nodes, loaded.escs, strict=True):
@@ -129,6 +129,7 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         "bus_load": load,
         "frames_per_second": frames,
         "dbc": layout.file,
+        "layout": layout.fingerprint,
         "messages": [
             {
                 "name": message.name,

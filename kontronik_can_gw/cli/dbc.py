@@ -60,7 +60,8 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "Prints a DBC that every tool reads; warnings go to standard error. "
+    "Prints a DBC that every tool reads; warnings go to standard error. With -c its VERSION ends with the layout's fingerprint, "
+    "which check, status, captures and report show too: so an old file can be told. "
     "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or DBC."
 )
 
@@ -110,11 +111,14 @@ def _database(args: argparse.Namespace) -> "Database":
     if args.config is not None:
         options = ("esc", "name", "base_id", "id_step", "node", "from")
         _refuse(args, options, "--config, which says all that")
-        database = load_all(args.config).database
+        loaded = load_all(args.config)
+        database = loaded.database
         if database is None:
             raise UserError(
                 f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. --canopen writes those of the nodes."
             )
+        plain = re.sub(" ?layout [0-9A-F]{8}$", "", database.version or "")
+        database.version = f"{plain} layout {loaded.layout.fingerprint}".strip()
         return database
     escs = _escs(args)
     file = vars(args)["from"] or shipped("dbc/kontronik_esc.dbc")

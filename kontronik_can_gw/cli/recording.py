@@ -48,7 +48,11 @@ def recorded(
     recorder = Recorder(settings)
     recorder.words = in_words(loaded.config, folder)
     gateway = RecordedGateway(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.canopen)
-    known = {"created_ns": now, "state": state_of(gateway)}
+    known = {
+        "created_ns": now,
+        "state": state_of(gateway),
+        "layout": loaded.layout.fingerprint,
+    }
     recorder.header = setup_of(loaded).header() | known
     return gateway, recorder
 

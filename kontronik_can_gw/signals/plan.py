@@ -5,7 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, Flag
 from fractions import Fraction
+from functools import cached_property
 from typing import NamedTuple
+from zlib import crc32
 
 from kontronik_can_gw.esc.values import Group, Value
 
@@ -140,6 +142,25 @@ class Layout:
     node: str
     messages: tuple[MessagePlan, ...]
     warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Eight hexadecimal digits that differ where a receiver would read frames otherwise: ids, bits, scaling, units, texts, names."""
+        found = [
+            (
+                *(message.name, message.can_id, message.extended, message.fd, message.length),
+                [
+                    (
+                        *(s.name, s.unit, s.page, s.length, s.signed, s.is_float),
+                        *(tuple(map(tuple, s.pieces)), str(s.factor), str(s.offset)),
+                        sorted(s.texts.items()),
+                    )
+                    for s in message.signals
+                ],
+            )
+            for message in self.messages
+        ]
+        return f"{crc32(repr(found).encode()):08X}"
 
     def bus_load(self, bitrate: int, data_bitrate: int = 2_000_000) -> float:
         """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s."""

@@ -97,3 +97,23 @@ def test_commands_that_also_work_without_one_say_which_they_take(places: tuple[P
     with own.open("a") as file:
         file.write("[canopen]\nenabled = true\n")
     assert "by gateway.toml" in run("eds").err
+
+
+def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another_layout(
+    places: tuple[Path, Path],
+) -> None:
+    own, _ = places
+
+    def fingerprint() -> str:
+        return str(json.loads(run("check", "--json").out)["layout"])
+
+    written(own, LEAST)
+    first = fingerprint()
+    text = run("dbc", "-c", own).out
+    assert text.startswith(f'VERSION "layout {first}"\n')
+    written(own.with_name("sent.dbc"), text)
+    written(own, f'[dbc]\nfile = "sent.dbc"\n{LEAST}')
+    assert fingerprint() == first
+    assert run("dbc", "-c", own).out == text
+    written(own.with_name("sent.dbc"), text.replace("(0.01,", "(0.02,", 1))
+    assert fingerprint() != first
