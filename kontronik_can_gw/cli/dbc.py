@@ -117,8 +117,8 @@ def _database(args: argparse.Namespace) -> "Database":
             raise UserError(
                 f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. --canopen writes those of the nodes."
             )
-        plain = re.sub(" ?layout [0-9A-F]{8}$", "", database.version or "")
-        database.version = f"{plain} layout {loaded.layout.fingerprint}".strip()
+        version = re.sub(" ?layout [0-9A-F]{8}$", "", database.version or "")
+        database.version = f"{version} layout {loaded.layout.fingerprint}".strip()
         return database
     escs = _escs(args)
     file = vars(args)["from"] or shipped("dbc/kontronik_esc.dbc")
