@@ -184,7 +184,7 @@ case $what in
         install_vm uml
         install_browser
         install_clang
-        install_programs "systemd and a broker" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients
+        install_programs "systemd, a broker, Prometheus" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients prometheus
         tests/foreign/install.sh || say "tests with the masters named above are left out"
         ;;
     release)

@@ -1,0 +1,52 @@
+"""A display against a real gateway: telemetry, an ESC that goes and comes back, error bits, a bus that goes down."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import CHANNEL, Bench, until
+from display import Display
+
+DBC = Path(__file__).parents[1] / "one-esc/bus.dbc"
+
+
+@pytest.fixture
+def display() -> Iterator[Display]:
+    display = Display(CHANNEL, str(DBC))
+    yield display
+    display.close()
+
+
+def test_telemetry_is_shown(bench: Bench, display: Display) -> None:
+    bench.plug_in("--cells", "6")
+    until(lambda: display.shown("BatteryVoltage"))
+    voltage = display.shown("BatteryVoltage")
+    assert isinstance(voltage, float)
+    assert 18 < voltage < 26
+
+
+def test_a_lost_esc_shows_dashes_and_one_that_is_back_shows_values(
+    bench: Bench, display: Display
+) -> None:
+    bench.plug_in()
+    until(lambda: display.shown("BatteryVoltage") is not None)
+    bench.unplug()
+    until(lambda: display.shown("BatteryVoltage") is None)
+    until(lambda: str(display.shown("LinkState")) in ("Lost", "PortError"))
+    bench.plug_in()
+    until(lambda: display.shown("BatteryVoltage") is not None)
+
+
+def test_an_error_of_the_esc_is_shown(bench: Bench, display: Display) -> None:
+    bench.plug_in("--error", "undervoltage@1s+2s")
+    until(lambda: display.shown("Undervoltage") == 1)
+    until(lambda: display.shown("Undervoltage") == 0)
+
+
+def test_a_bus_that_goes_down_shows_dashes_until_it_is_back(bench: Bench, display: Display) -> None:
+    bench.plug_in()
+    until(lambda: display.shown("BatteryVoltage") is not None)
+    bench.bus("down")
+    until(lambda: display.shown("BatteryVoltage") is None)
+    bench.bus("up")
+    until(lambda: display.shown("BatteryVoltage") is not None)

@@ -1,0 +1,114 @@
+"""examples/grafana: every expression of dashboard and alerts finds something in a real Prometheus that scrapes a real `metrics`."""
+
+import json
+import re
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+from urllib.request import urlopen
+
+import pytest
+import yaml  # type: ignore[import-untyped]
+from command_line import written
+from harness import LoggedProcess
+from statistics_bench import Bench
+from vcan_tools import PROGRAM, wait_for
+
+FOLDER = Path(__file__).parents[2] / "examples/grafana"
+RULES = [
+    rule
+    for group in yaml.safe_load((FOLDER / "alerts.yml").read_text())["groups"]
+    for rule in group["rules"]
+]
+EXPRESSIONS = {
+    target["expr"]
+    for panel in json.loads((FOLDER / "dashboard.json").read_text())["panels"]
+    for target in panel["targets"]
+}
+ALARMS = {rule["alert"]: rule["expr"] for rule in RULES}
+pytestmark = pytest.mark.extended
+
+
+class Prometheus:
+    """A server that scrapes one target each second, on a port of its own choice."""
+
+    def __init__(self, folder: Path, target: str) -> None:
+        config = {
+            "rule_files": [str(FOLDER / "alerts.yml")],
+            "scrape_configs": [
+                {
+                    "job_name": "kontronik",
+                    "scrape_interval": "1s",
+                    "static_configs": [{"targets": [target]}],
+                }
+            ],
+        }
+        file = written(folder / "prometheus.yml", json.dumps(config))
+        words = [f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}"]
+        self._process = LoggedProcess(
+            ["prometheus", *words, "--web.listen-address=127.0.0.1:0"], keep_out=False
+        )
+        wait_for(lambda: "is ready to receive" in self._process.log, lambda: self._process.log)
+        (self._address,) = set(re.findall(r"127\.0\.0\.1:[1-9]\d*", self._process.log)) - {target}
+
+    def find(self, expression: str) -> list[dict[str, Any]]:
+        query = urlencode({"query": expression})
+        with urlopen(f"http://{self._address}/api/v1/query?{query}") as answer:
+            found: list[dict[str, Any]] = json.load(answer)["data"]["result"]
+        return found
+
+    def end(self) -> None:
+        self._process.process.terminate()
+        self._process.wait()
+
+
+@pytest.fixture
+def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
+    if shutil.which("prometheus") is None:
+        pytest.skip("there is no Prometheus: sudo apt-get install prometheus")
+    bench = Bench(2)
+    bench.run(3)
+    document = bench.document()
+    file, stop = tmp_path / "status.json", threading.Event()
+
+    def refresh() -> None:
+        while not stop.wait(0.1):
+            document["monotonic_ns"] = time.monotonic_ns()
+            part = written(tmp_path / "part", json.dumps(document))
+            part.rename(file)
+
+    thread = threading.Thread(target=refresh)
+    thread.start()
+    metrics = LoggedProcess(
+        [*PROGRAM, "metrics", "--file", str(file), "--listen", "127.0.0.1:0"], keep_out=False
+    )
+    wait_for(lambda: "/metrics serves" in metrics.log, lambda: metrics.log)
+    (target,) = re.findall(r"http://(\S+)/metrics", metrics.log)
+    prometheus = Prometheus(tmp_path, target)
+    yield prometheus
+    prometheus.end()
+    stop.set()
+    thread.join()
+    metrics.process.terminate()
+    metrics.wait()
+
+
+def test_every_expression_finds_something(prometheus: Prometheus) -> None:
+    for expression in EXPRESSIONS:
+        wait_for(lambda e=expression: prometheus.find(e), expression)  # type: ignore[misc]
+    for expression in ALARMS.values():
+        without_limit = re.sub(r"\s*(==|<|>)\s*[\d.]+$", "", expression)
+        assert without_limit != expression
+        wait_for(lambda e=without_limit: prometheus.find(e), without_limit)  # type: ignore[misc]
+    assert prometheus.find(ALARMS["EscNotHeard"]) == []
+
+
+def test_promtool_finds_nothing_wrong() -> None:
+    if shutil.which("promtool") is None:
+        pytest.skip("there is no promtool: sudo apt-get install prometheus")
+    subprocess.run(["promtool", "check", "rules", FOLDER / "alerts.yml"], check=True)
