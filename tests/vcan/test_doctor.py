@@ -86,7 +86,7 @@ def test_a_running_gateway_is_noted_with_its_node_and_goes_on(
             found["port.users"]["text"] == f"in use by kontronik-can-gw (pid {gateway.process.pid})"
         )
         assert found["can.gateway"]["severity"] == "note"
-        assert "CANopen node 42" in found["can.gateway"]["text"]
+        assert "node 42" in found["can.gateway"]["text"]
         assert gateway.process.poll() is None
         assert gateway.end() == 0
 
