@@ -1,7 +1,7 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-all release soak hour bench golden wheels lint clean
+.PHONY: help demo test test-all release soak hour bench golden docs wheels lint clean
 
 help:
 	@echo 'make demo      show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
@@ -14,6 +14,7 @@ help:
 	@echo 'make hour      a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
 	@echo 'make bench     speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
 	@echo 'make golden    record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
+	@echo 'make docs      write docs/reference from the sources'
 	@echo 'make wheels    one wheel with the core in C for x86-64, arm64 and armv7, each tried under qemu-user   (ARGS=FOLDER)'
 	@echo 'make lint      ruff and mypy only'
 	@echo 'make clean     remove .venv and all caches'
@@ -49,6 +50,10 @@ bench:
 golden:
 	@tests/bootstrap.sh lint
 	@.venv/bin/python tests/golden/record.py $(ARGS)
+
+docs:
+	@tests/bootstrap.sh lint
+	@.venv/bin/python tests/readme/reference.py
 
 wheels:
 	@tests/bootstrap.sh wheels

@@ -2,11 +2,12 @@
 
 import argparse
 import os
+import platform
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
@@ -18,29 +19,26 @@ from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import SHIPPED, Config
 from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.config.parse import load
-from kontronik_can_gw.desk.doctor.can_interface import check_can
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity, count, document
-from kontronik_can_gw.desk.doctor.folders import check_folder, check_readable
-from kontronik_can_gw.desk.doctor.line import look
-from kontronik_can_gw.desk.doctor.machine import check_machine
-from kontronik_can_gw.desk.doctor.serial_ports import check_port
-from kontronik_can_gw.desk.doctor.service import Unit, unit_of
-from kontronik_can_gw.desk.doctor.system import System
+from kontronik_can_gw.desk.doctor.can import check_can
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity
+from kontronik_can_gw.desk.doctor.machine import Machine
+from kontronik_can_gw.desk.doctor.ports import check_port, look
+from kontronik_can_gw.desk.doctor.service import (
+    Unit,
+    check_folder,
+    check_readable,
+    check_service,
+    unit_of,
+)
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words, make_core
-from kontronik_can_gw.printable import printable, printable_json
+from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.runtime.store import parameter_file
 
-_STYLES = {
-    Severity.OK: "green",
-    Severity.NOTE: "cyan",
-    Severity.WARNING: "bold yellow",
-    Severity.ERROR: "bold red",
-}
-_INDENT = " " * 11
-_WIDTHS = (40, 100)
+_COLOURS = {Severity.OK: 32, Severity.NOTE: 36, Severity.WARNING: 33, Severity.ERROR: 31}
+"""Of the severities on a terminal, as ANSI has them."""
 OPTIONS = (CONFIG, JSON)
 EPILOG = (
     "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
@@ -50,95 +48,78 @@ EPILOG = (
 
 def main(args: argparse.Namespace) -> int:
     config = config_file(args.config)
-    findings, code = examine(System(), config)
+    findings, code = examine(Machine(), config)
     if args.json:
-        print(printable_json(document(findings, __version__, str(config), code), indent=2))
+        document = {
+            "format": 1,
+            "version": __version__,
+            "config": str(config),
+            "exit_code": code,
+            "errors": _count(findings, Severity.ERROR),
+            "warnings": _count(findings, Severity.WARNING),
+            "findings": [asdict(finding) for finding in findings],
+        }
+        print(printable_json(document, indent=2))
     else:
         _show(findings)
     return code
 
 
-def examine(system: System, path: Path) -> tuple[list[Finding], int]:
+def _count(findings: Sequence[Finding], severity: Severity) -> int:
+    return sum(finding.severity is severity for finding in findings)
+
+
+def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
     """All findings, and the exit code. Parts that do not depend on a mistake in the configuration are checked nevertheless."""
-    unit = unit_of(system, str(path.absolute()))
-    about = Findings("Configuration")
-    config, loaded, refused = _load(path, unit)
-    if refused is not None:
-        command = "" if config is None else f"kontronik-can-gw check -c {path}"
-        for problem in refused.problems:
-            about.say("config", "mistake", problem=problem, command=command)
-    found = about.found
-    if config is not None:
-        _configuration(system, about, config, loaded, unit)
-        for esc in config.esc:
-            line = look if protocol_named(esc.protocol).even_parity else None
-            found += check_port(system, esc.name, esc.port, unit, line)
-        found += check_can(system, config.can)
-    found += check_machine(system, unit)
-    code = int(count(found, Severity.ERROR) > 0)
-    return found, code if refused is None else refused.exit_code
-
-
-def _load(path: Path, unit: Unit | None) -> tuple[Config | None, Loaded | None, UserError | None]:
-    """Configuration, the objects made from it, and the error; None for what could not be made."""
-    config = None
+    unit = unit_of(machine, str(path.absolute()))
+    about, rest = Findings("Configuration"), Findings("Machine")
+    found, config, code = about.found, None, 0
     try:
         config = load(path)
         if unit is not None and config.canopen.store is None:  # as set by systemd
             config = replace(config, canopen=replace(config.canopen, store=unit.state_folder))
         check_interface(config.can)
-        return config, assemble(config), None
+        _outputs(about, assemble(config))
     except UserError as error:
-        return config, None, error
+        code = error.exit_code
+        command = "" if config is None else f"kontronik-can-gw check -c {path}"
+        for problem in error.problems:
+            about.say("config", "mistake", problem=problem, command=command)
+    if config is not None:
+        _files(machine, about, config, unit)
+        for esc in config.esc:
+            line = look if protocol_named(esc.protocol).even_parity else None
+            found += check_port(machine, esc.name, esc.port, unit, line)
+        found += check_can(machine, config.can)
+    check_service(machine, rest, unit)
+    # a Raspberry Pi's own alarm; it affects USB adapters first
+    alarms = [f"/sys/class/hwmon/{name}" for name in machine.names("/sys/class/hwmon")]
+    if any(machine.text(f"{each}/in0_lcrit_alarm") == "1" for each in alarms):
+        rest.say("machine.power", "low")
+    versions = {"python": platform.python_version(), "kernel": platform.release()}
+    rest.say("machine.versions", "ok", version=__version__, **versions)
+    found += rest.found
+    return found, code or int(_count(found, Severity.ERROR) > 0)
 
 
-def _configuration(
-    system: System, findings: Findings, config: Config, loaded: Loaded | None, unit: Unit | None
-) -> None:
-    if loaded is not None:
-        _outputs(findings, config, loaded)
-        _warnings(findings, config, loaded)
-    files = [Path(config.file)]
-    if config.dbc.enabled and config.dbc.file != SHIPPED:
-        files.append(config.dbc_path)
-    if config.canopen.enabled and config.canopen.eds != SHIPPED:
-        files.append(config.eds_path)
-    for file in files:
-        check_readable(system, findings, str(file.absolute()), unit)
-
-    def check(name: str, what: str, folder: Path, reserve: int = 0) -> None:
-        path = str(folder.absolute())
-        check_folder(system, findings, f"config.{name}", what, path, unit, reserve)
-
-    if config.canopen.enabled:
-        check("store", "stored parameters", parameter_folder(config))
-    if (captures := record_folder(config)) is not None:
-        check("record", "captures", captures, config.record.min_free_mb * 1_000_000)
-    if config.statistics_path is not None:
-        check("statistics", "statistics", config.statistics_path.absolute().parent)
-
-
-def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
-    number = len(config.esc)
-    words = [f"{number} ESC{'s' * (number > 1)}"]
+def _outputs(findings: Findings, loaded: Loaded) -> None:
+    """What will be sent, by which core, and warnings."""
+    config = loaded.config
+    words = [f"{len(config.esc)} ESC{'s' * (len(config.esc) > 1)}"]
     load = loaded.layout.bus_load(config.can.bitrate, config.can.data_bitrate)
     if config.dbc.enabled:
         words.append(f"{len(loaded.layout.messages)} messages of {config.dbc_path.name}")
     if loaded.canopen is not None:
-        nodes = loaded.canopen.nodes(loaded.escs).nodes
-        words.append(f"{len(nodes)} CANopen node{'s' * (number > 1)} of {config.eds_path.name}")
-        load += bits_per_second(nodes) / config.can.bitrate
-    findings.say("config", "ok", file=config.file, outputs=", ".join(words))
-    findings.say("config.bus_load", "ok", load=load, kilobits=config.can.bitrate // 1000)
+        words.append(f"their CANopen nodes of {config.eds_path.name}")
+        load += bits_per_second(loaded.canopen.nodes(loaded.escs).nodes) / config.can.bitrate
+    about = {"file": config.file, "outputs": ", ".join(words), "load": load}
+    findings.say("config", "ok", **about, kilobits=config.can.bitrate // 1000)
     core, why = make_core(loaded.escs, loaded.layout, 0, silent=False)
     findings.say("config.core", "python" if why else "ok", core=in_words(core.language, why))
-
-
-def _warnings(findings: Findings, config: Config, loaded: Loaded) -> None:
-    damaged = {}
-    for esc, reason in loaded.damaged:
-        name = loaded.escs[esc].name
-        damaged[f"{name}: stored parameters: {reason}"] = name
+    damaged = {
+        f"{loaded.escs[esc].name}: stored parameters: {reason}": loaded.escs[esc].name
+        for esc, reason in loaded.damaged
+    }
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         if warning not in damaged:
             findings.say("config.warning", "any", warning=warning)
@@ -147,47 +128,49 @@ def _warnings(findings: Findings, config: Config, loaded: Loaded) -> None:
         findings.say("config.parameters", "damaged" if is_open else "closed", damage=damage)
 
 
-def _show(findings: list[Finding]) -> None:
-    lowest, highest = _WIDTHS
-    lines = _lines(findings, max(lowest, min(highest, shutil.get_terminal_size().columns)))
-    if not sys.stdout.isatty():
-        for word, _, text in lines:
-            show(word + text)
-        return
-    from rich.console import Console
-    from rich.text import Text
+def _files(machine: Machine, findings: Findings, config: Config, unit: Unit | None) -> None:
+    """Whether its files can be read and its folders filled."""
+    files = [Path(config.file)]
+    if config.dbc.enabled and config.dbc.file != SHIPPED:
+        files.append(config.dbc_path)
+    if config.canopen.enabled and config.canopen.eds != SHIPPED:
+        files.append(config.eds_path)
+    for file in files:
+        check_readable(machine, findings, str(file.absolute()), unit)
+    store = parameter_folder(config) if config.canopen.enabled else None
+    status = config.statistics_path
+    folders = {
+        "stored parameters": (store, 0),
+        "captures": (record_folder(config), config.record.min_free_mb * 1_000_000),
+        "statistics": (status.parent if status else None, 0),
+    }
+    for what, (folder, reserve) in folders.items():
+        if folder is not None:
+            check_folder(machine, findings, what, str(folder.absolute()), unit, reserve)
 
-    console = Console(highlight=False, soft_wrap=True)
-    for word, style, text in lines:
-        console.print(Text.assemble((printable(word), style), printable(text)))
 
-
-def _lines(findings: list[Finding], width: int) -> Iterator[tuple[str, str, str]]:
-    """The lines of the report: a word, its style, text. Commands are not wrapped, so that they can be copied."""
+def _show(findings: Sequence[Finding]) -> None:
+    """Print the report. Commands are not wrapped, so that they can be copied."""
+    width = max(40, min(100, shutil.get_terminal_size().columns))
     group = ""
     for finding in findings:
         if finding.group != group:
             if group:
-                yield "", "", ""
+                show()
             group = finding.group
-            yield group, "bold", ""
-        first, *more = _wrapped(finding.text, width) or [""]
-        yield f"  {finding.severity:<9}", _STYLES[finding.severity], first
-        for line in more:
-            yield "", "", _INDENT + line
-        arrow = "-> "
-        for line in _wrapped(finding.remedy, width - len(arrow)):
-            yield "", "", f"{_INDENT}{arrow}{line}"
-            arrow = "   "
-        if finding.command:
-            yield _INDENT + arrow, "", finding.command
-    yield "", "", ""
-    parts = []
-    for severity in (Severity.ERROR, Severity.WARNING, Severity.NOTE):
-        number = count(findings, severity)
-        parts.append(f"{number or 'no'} {severity}{'s' * (number != 1)}")
-    yield "", "", ", ".join(parts)
-
-
-def _wrapped(text: str, width: int) -> list[str]:
-    return textwrap.wrap(text, width - len(_INDENT), break_on_hyphens=False)
+            show(group)
+        word = f"{finding.severity:<9}"
+        if sys.stdout.isatty():
+            word = f"\x1b[{_COLOURS[finding.severity]}m{word}\x1b[0m"
+        sys.stdout.write(f"  {word}")
+        first, *lines = textwrap.wrap(finding.text, width - 11, break_on_hyphens=False) or [""]
+        show(first)
+        remedy = textwrap.wrap(finding.remedy, width - 14, break_on_hyphens=False)
+        remedy += [finding.command] if finding.command else []
+        lines += [f"{'   ' if n else '-> '}{line}" for n, line in enumerate(remedy)]
+        for line in lines:
+            show(f"{' ' * 11}{line}")
+    kinds = (Severity.ERROR, Severity.WARNING, Severity.NOTE)
+    numbers = {kind: _count(findings, kind) for kind in kinds}
+    show()
+    show(", ".join(f"{n or 'no'} {kind}{'s' * (n != 1)}" for kind, n in numbers.items()))

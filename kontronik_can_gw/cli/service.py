@@ -1,43 +1,58 @@
 """``service``: installs the gateway as a systemd service, shows its state, removes it.
 
-Without --root it works on this machine, as root, and calls systemd's tools; with it only files below that folder are changed.
+The files of the package's folder ``service`` are copied as they are, with the path of the program in the units. Without --root it works
+on this machine, as root, and calls systemd's tools; with it only files below that folder are changed.
 """
 
 import argparse
+import contextlib
+import os
 import re
+import shutil
+import subprocess
+import sys
+import sysconfig
 import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
-from kontronik_can_gw.cli import service_files as files
 from kontronik_can_gw.cli.arguments import number_from, option
-from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.common import say, show
 from kontronik_can_gw.cli.init import example
-from kontronik_can_gw.cli.service_files import COMPANIONS, WANTS, Choices
-from kontronik_can_gw.cli.service_machine import (
-    call,
-    check_executable,
-    check_rights,
-    own_executable,
-    reload,
+from kontronik_can_gw.cli.service_files import (
+    COMPANIONS,
+    CONFIGURATIONS,
+    NAME,
+    OBSOLETE,
+    UNITS,
+    planned,
+    put,
+    remove,
+    unit,
 )
-from kontronik_can_gw.cli.service_removal import uninstall
-from kontronik_can_gw.cli.service_status import status
 from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.runtime.locks import is_held
+
+_WANTS = f"{UNITS}/multi-user.target.wants"
+_BOOTED = Path("/run/systemd/system")
+"""Exists where systemd runs (sd_booted)."""
+_NOT_RUNNING = 3
+"""Exit code, as of systemctl."""
 
 
-def _instance(text: str) -> str:
-    if text == "gateway":
-        raise argparse.ArgumentTypeError(f"{text!r} is the plain service's configuration")
-    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no name: letters, digits, _ . -")
+def _name(text: str) -> str:
+    if text == "gateway" or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}", text):
+        problem = f"{text!r} is no name: letters, digits, _ . -, and not gateway"
+        raise argparse.ArgumentTypeError(problem)
     return text
 
 
-def _channel(text: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is not the name of an interface")
+def _program(text: str) -> str:
+    if not re.fullmatch(r"/[\w/.+@~=,:-]+", text) or ".." in Path(text).parts:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not an absolute path without spaces, quotes, % and the like"
+        )
     return text
 
 
@@ -45,7 +60,7 @@ _BITRATE = number_from(
     5_000, 1_000_000, kind=int, problem="is not a bit rate in bit/s, 5000 to 1000000"
 )
 # fmt: off
-_INSTANCE = option("--instance NAME", "one of several gateways: NAME.toml, kontronik-can-gw@NAME", type=_instance)
+_INSTANCE = option("--instance NAME", "one of several gateways: NAME.toml, kontronik-can-gw@NAME", type=_name)
 _ROOT = option("--root DIR", "only write below DIR, as for a disk image; call no tools", type=Path)
 OPTIONS = ()
 ACTIONS = {
@@ -53,9 +68,9 @@ ACTIONS = {
         _INSTANCE,
         _ROOT,
         option("--now", "start it too, or restart it"),
-        option("--executable PATH", "the program (default: this one)"),
+        option("--executable PATH", "the program (default: this one)", type=_program),
         option("--network BITRATE", "let systemd-networkd set up the CAN interface", type=_BITRATE),
-        option("--channel NAME", "the CAN interface (default can0)", type=_channel, default="can0"),
+        option("--channel NAME", "the CAN interface (default can0)", type=_name, default="can0"),
         option("--mqtt", "a second service that publishes to the broker of the table [mqtt]"),
         option("--metrics", "a service that serves the statistics for Prometheus on 127.0.0.1:9123"),
     )),
@@ -77,75 +92,94 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    actions = {"install": _install, "status": status, "uninstall": uninstall}
-    return actions[args.action](args)
+    """Do it. RunError or UserError where this machine does not allow it, OSError of a file as RunError."""
+    root = vars(args).get("root")
+    if root is not None and not root.is_dir():
+        raise UserError(f"{root}: is not a folder. --root names the top folder of a disk image.")
+    if root is None and not _BOOTED.is_dir():
+        raise RunError(
+            "this system does not run systemd. For a disk image: --root DIR. Without systemd: run --wait"
+        )
+    if root is None and args.action != "status" and os.geteuid() != 0:
+        raise RunError(f"only root may do that: sudo {_own_program()} service {args.action} ...")
+    try:
+        return {"install": _install, "status": _status, "uninstall": _uninstall}[args.action](args)
+    except OSError as error:
+        raise RunError(f"{error.filename}: {error.strerror}") from None
+
+
+# --- install
 
 
 def _install(args: argparse.Namespace) -> int:
     root = args.root or Path("/")
-    check_rights(args.root, "install")
-    executable = args.executable or own_executable()
-    is_in_home = check_executable(executable, root)
     companions = [kind for kind in COMPANIONS if vars(args)[kind]]
     for kind in companions:
-        _, module, library = COMPANIONS[kind]
-        if args.executable is None and find_spec(module) is None:
-            raise RunError(f"--{kind}: needs {library}: pip install 'kontronik-can-gw[{kind}]'")
-    group = files.serial_group(root)
-    choices = Choices(executable, is_in_home, group, args.channel, args.network, companions)
-    plan = files.planned(choices, root)
-    own = root / files.configuration(args.instance)
-    files.check_inside(root, [*(root / file.path for file in plan), own, root / WANTS / "x"])
-    for file in plan:
-        say(f"{root / file.path}: {file.put(root)}")
-    files.remove_obsolete(root)
-    if args.network is not None:  # an active file replaces its example
-        for name in files.network_files(args.channel):
-            path = root / f"{name}.{files.EXAMPLE}"
-            if path.exists():
-                files.remove(path)
-    if files.read(own) is None:
-        files.write(own, example())
-        say(f"{own}: new, an example")
+        if args.executable is None and find_spec(COMPANIONS[kind]) is None:
+            raise RunError(f"--{kind}: pip install 'kontronik-can-gw[{kind}]'")
+    program = args.executable or _own_program()
     if args.root is None:
-        reload(None if args.network is None else args.channel)
-    _enable(args, own, companions)
+        _check_program(program)
+    files = dict(planned(program, companions, args.channel, args.network))
+    own = root / CONFIGURATIONS / f"{args.instance or 'gateway'}.toml"
+    if not own.exists():
+        files[str(own.relative_to(root))] = example()
+    for place in files:
+        # a link to /etc, as in some roots, would lead to this machine
+        if not (root / place).parent.resolve().is_relative_to(root.resolve()):
+            raise RunError(f"{(root / place).parent}: leads out of {root}")
+    for place, text in files.items():
+        put(root / place, text)
+    for place in OBSOLETE:
+        remove(root / place)
+    if args.root is None:
+        _reload(args.network)
+    _enable(args, root, own, companions)
     return 0
 
 
-def _enable(args: argparse.Namespace, own: Path, companions: list[str]) -> None:
+def _reload(network: int | None) -> None:
+    """Let systemd make user and folders, and read units, udev rules and network files."""
+    for words in (
+        ("systemd-sysusers", f"/etc/sysusers.d/{NAME}.conf"),
+        ("systemd-tmpfiles", "--create", f"/etc/tmpfiles.d/{NAME}.conf"),
+        ("systemctl", "daemon-reload"),
+        ("udevadm", "control", "--reload"),
+        ("udevadm", "trigger", "--action=change", "--subsystem-match=tty"),
+    ):
+        if shutil.which(words[0]):
+            _call(*words)
+    _call("id", NAME)
+    if network:
+        now = "sudo systemctl enable --now systemd-networkd; sudo networkctl reload"
+        say(f"the CAN interface is set up when the machine starts; now: {now}")
+
+
+def _enable(args: argparse.Namespace, root: Path, own: Path, companions: list[str]) -> None:
     """Enable the services, and start them with --now, if their configuration is usable."""
-    unit = files.unit(args.instance)
     if problems := _not_ready(own):
-        wanted = "enabled and started" if args.now else "enabled"
-        then = "" if args.root else f" When it is right: sudo systemctl enable --now {unit}"
-        text = [*problems, f"{unit} was not {wanted}.{then}"]
+        then = f"When it is right: sudo systemctl enable --now {unit(args.instance)}"
+        text = [*problems, f"{unit(args.instance)} was not enabled. {then}"]
         if args.now:
             raise RunError(*text)
         for line in text:
             say(line)
         return
-    _enable_unit(args, unit, "kontronik-can-gw service status")
-    for kind in companions:
-        unit = files.unit(args.instance, kind)
+    for kind in ("", *companions):
+        name = unit(args.instance, kind)
         if kind == "mqtt" and load(own).mqtt.broker is None:
-            say(f"{own}: mqtt.broker is not set. {unit} was not enabled.")
+            say(f"{own}: mqtt.broker is not set. {name} was not enabled.")
+            continue
+        if args.root is not None:
+            link = root / _WANTS / name
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.unlink(missing_ok=True)
+            link.symlink_to(f"/{UNITS}/{unit('' if args.instance else None, kind)}")
         else:
-            _enable_unit(args, unit, f"journalctl -u {unit}")
-
-
-def _enable_unit(args: argparse.Namespace, unit: str, see: str) -> None:
-    if args.root is not None:
-        file = f"{unit.partition('@')[0]}@.service" if args.instance else unit
-        files.link(args.root / WANTS / unit, f"/{files.UNITS}/{file}")
-        say(f"{unit} is enabled")
-        return
-    call("systemctl", "enable", unit)
-    if args.now:
-        call("systemctl", "restart", unit)
-        say(f"{unit} is enabled and runs. See: {see}")
-    else:
-        say(f"{unit} is enabled. Start it now: sudo systemctl restart {unit}")
+            _call("systemctl", "enable", name)
+            if args.now:
+                _call("systemctl", "restart", name)
+        say(f"{name} is enabled{' and runs' if args.now else ''}. See: systemctl status {name}")
 
 
 def _not_ready(own: Path) -> list[str]:
@@ -157,3 +191,120 @@ def _not_ready(own: Path) -> list[str]:
     if ports & {esc.port for esc in parse(tomllib.loads(example()), "").esc}:
         return [f"{own}: is the example. Set ports, bit rate and motors first."]
     return []
+
+
+def _own_program() -> str:
+    """Path of the installed program of this Python. UserError where there is none."""
+    for folder in (Path(sysconfig.get_path("scripts")), Path(sys.argv[0]).absolute().parent):
+        if os.access(folder / NAME, os.X_OK):
+            return str(folder / NAME)
+    raise UserError(f"no installed {NAME} belongs to this Python. Name it with --executable.")
+
+
+def _check_program(program: str) -> None:
+    """UserError where the service's user could not run it, or import this package."""
+    for path in (Path(program), Path(program).resolve(), Path(__file__).resolve()):
+        for part in (*reversed(path.parents), path):
+            mode = part.stat().st_mode & (1 if part.is_dir() else 4) if part.exists() else 0
+            if not mode or str(part) in ("/tmp", "/var/tmp"):  # noqa: S108  it has its own
+                raise UserError(
+                    f"{path}: the service's user cannot reach it: {part}. Install the program where all may read, as in /opt/{NAME}."
+                )
+
+
+# --- status and uninstall
+
+
+def _units(instance: str | None) -> list[str]:
+    """Names of an instance's services, or patterns of all."""
+    kinds = ("", *COMPANIONS)
+    which = [instance] if instance else [None, "*"]
+    return [unit(each, kind) for each in which for kind in kinds]
+
+
+def _there(instance: str | None) -> list[str]:
+    """Services that there are, loaded or only as files."""
+    lines: list[str] = []
+    for verb in ("list-units", "list-unit-files"):
+        done = _run("systemctl", verb, "--all", "--plain", "--no-legend", *_units(instance))
+        lines += done.stdout.splitlines()
+    names = {line.split()[0] for line in lines if line.strip()}
+    return sorted(name for name in names if not name.endswith("@.service"))
+
+
+def _status(args: argparse.Namespace) -> int:
+    """systemd's own account of the services in use, with their last log lines."""
+    codes = []
+    for name in _there(args.instance):
+        words = ("systemctl", "show", "--value", "--property", "ActiveState,UnitFileState", name)
+        state = _run(*words).stdout.split()
+        if "inactive" in state and "enabled" not in state:
+            continue
+        shown = ("systemctl", "status", "--no-pager", "--full", "--lines", str(args.lines), name)
+        for line in _run(*shown).stdout.splitlines():
+            show(line)
+        codes.append(0 if "active" in state else _NOT_RUNNING)
+    if not codes:
+        show("no service is in use. See: kontronik-can-gw service install --help")
+    return max(codes, default=_NOT_RUNNING)
+
+
+def _uninstall(args: argparse.Namespace) -> int:
+    """Stop, disable and remove. Configurations and stored parameters stay without --purge."""
+    root = args.root or Path("/")
+    if args.instance and args.purge:
+        raise UserError("--purge removes everything: not with --instance")
+    for name in _there(args.instance) if args.root is None else ():
+        _call("systemctl", "disable", "--now", name)
+        _run("systemctl", "reset-failed", name)
+        say(f"{name}: stopped and disabled")
+    links = sorted((root / _WANTS).glob("*"))
+    found = [path for path in links if any(map(path.match, _units(args.instance)))]
+    data: list[Path] = []
+    if not args.instance:
+        places = [*(place for place, _ in planned("", COMPANIONS, "*", 1)), *OBSOLETE]
+        found += [path for place in places for path in root.glob(place)]
+        folders = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*")
+        data = [path for place in folders for path in root.glob(place)]
+        if args.purge:
+            data += [path for place in places for path in root.glob(f"{place}.bak")]
+            found, data = [*found, *data], []
+    for path in found:
+        remove(path)
+    for folder in root.glob(f"{UNITS}/{NAME}*.service.d"):
+        with contextlib.suppress(OSError):  # it holds drop-ins of others
+            folder.rmdir()
+    if args.root is None and not args.instance:
+        held = Path("/proc/locks").read_text()
+        for folder in (path for name in (NAME, f"{NAME}-*") for path in Path("/run").glob(name)):
+            if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
+                remove(folder)
+        _call("systemctl", "daemon-reload")
+        if args.purge:
+            _run("userdel", NAME)
+    say("done" if found else "nothing is installed")
+    if data:
+        say(f"kept: {', '.join(map(str, data))} (--purge removes them)")
+    return 0
+
+
+# --- tools
+
+
+def _run(*words: str) -> "subprocess.CompletedProcess[str]":
+    environment = os.environ | {"LC_ALL": "C.UTF-8", "SYSTEMD_PAGER": "", "SYSTEMD_COLORS": "0"}
+    try:
+        return subprocess.run(
+            words, capture_output=True, text=True, errors="replace", timeout=120, stdin=subprocess.DEVNULL, env=environment
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise RunError(f"`{' '.join(words)}` did not end: {error}") from None
+
+
+def _call(*words: str) -> None:
+    """Call a tool. RunError with its output where it fails."""
+    done = _run(*words)
+    if done.returncode:
+        raise RunError(
+            f"`{' '.join(words)}` failed: {' '.join((done.stderr or done.stdout).split())}"
+        )

@@ -6,22 +6,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kontronik_can_gw.desk.doctor.findings import Finding, Severity
-from kontronik_can_gw.desk.doctor.system import FileSystem, System, User
+from kontronik_can_gw.desk.doctor.machine import Machine, User
 
 DIALOUT = 20
 ME = User("anna", 1000, frozenset({1000, DIALOUT}))
 _DEVICE_FOLDER = 6
-_ROOM = FileSystem(False, 1 << 30, 100_000)
+_ROOM = (False, 1 << 30)
 
 
-class Tree(System):
+class Tree(Machine):
     """A machine below a folder. Only what a test adds exists."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self.programs: dict[tuple[str, ...], str] = {}
         self.devices: dict[str, os.stat_result] = {}
-        self.full: dict[str, FileSystem] = {}
+        self.full: dict[str, tuple[bool, int]] = {}
         self.closed: set[str] = set()
         """Files and folders that we may not open or fill."""
         self.me = ME
@@ -141,15 +141,12 @@ class Tree(System):
     def user(self) -> User:
         return self.me
 
-    def user_named(self, name: str, more_groups: Sequence[str] = ()) -> User | None:
+    def user_named(self, name: str, more_groups: str = "") -> User | None:
         numbers = {"root": 0, "kontronik-can-gw": 990}
         if name not in numbers:
             return None
-        own = {numbers[name]}
-        return User(name, numbers[name], self.group_numbers(more_groups) | own)
-
-    def group_numbers(self, names: Sequence[str]) -> frozenset[int]:
-        return frozenset({DIALOUT} if "dialout" in names else ())
+        more = {DIALOUT} if "dialout" in more_groups else set()
+        return User(name, numbers[name], frozenset({numbers[name], *more}))
 
     def group_name(self, gid: int) -> str:
         return {0: "root", DIALOUT: "dialout"}.get(gid, str(gid))
@@ -157,20 +154,17 @@ class Tree(System):
     def status(self, name: str) -> os.stat_result | None:
         return self.devices.get(self.real(name)) or super().status(name)
 
-    def run(self, *command: str) -> str | None:
+    def run(self, *command: str) -> str:
         """What was put down for the longest beginning of this command."""
         for length in range(len(command), 0, -1):
             if (found := self.programs.get(command[:length])) is not None:
                 return found
-        return None
+        return ""
 
-    def file_system(self, name: str) -> FileSystem | None:
-        return self.full.get(name, _ROOM)
+    def space(self, folder: str) -> tuple[bool, int]:
+        return self.full.get(folder, _ROOM)
 
-    def may_open(self, name: str) -> bool:
-        return name not in self.closed
-
-    def may_fill(self, name: str) -> bool:
+    def may(self, name: str, mode: int) -> bool:
         return name not in self.closed
 
 

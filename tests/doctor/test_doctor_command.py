@@ -58,10 +58,10 @@ def test_a_usable_set_up_has_exit_code_0_and_plain_text_in_a_pipe(
         ("", "/dev/ttyUSB99", 1, ["port.exists"], ""),
         ("[cann]\nbitrat = 1", "", 2, ["config"], "Did you mean can?"),
         ('[dbc]\nfile = "none.dbc"', "", 2, ["config"], "none.dbc"),
-        ('[statistics]\nfile = "/proc/none/status.json"', "", 1, ["config.statistics"], ""),
-        ('[record]\ndirectory = "afile/x"', "", 1, ["config.record"], "is a file, not a folder"),
+        ('[statistics]\nfile = "/proc/none/status.json"', "", 1, ["config.folder"], ""),
+        ('[record]\ndirectory = "afile/x"', "", 1, ["config.folder"], "is a file, not a folder"),
         (
-            '[record]\ndirectory = "captures"\nmin_free_mb = 10000000', "", 1, ["config.record"],
+            '[record]\ndirectory = "captures"\nmin_free_mb = 10000000', "", 1, ["config.folder"],
             "nothing is written with less than 10000000 MB",
         ),
     ],

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.desk.doctor import line
-from kontronik_can_gw.desk.doctor.line import look
+from kontronik_can_gw.desk.doctor import ports
+from kontronik_can_gw.desk.doctor.ports import look
 
-PACKAGE = Path(line.__file__).parent
+PACKAGE = Path(ports.__file__).parent
 
 
 @pytest.fixture
@@ -34,9 +34,7 @@ def received(master: int) -> bytes:
 
 def test_nothing_is_written_and_no_echo_stays(terminal: tuple[int, int, str]) -> None:
     master, slave, name = terminal
-    found = look(name, alone=True)
-    assert found.trouble is None
-    assert found.even_parity is False, "a pseudo terminal has none"
+    assert look(name, alone=True)[0] == "none", "a pseudo terminal has no parity"
     os.write(master, b"KODL\r\n")
     assert received(master) == b""
     assert not termios.tcgetattr(slave)[3] & (termios.ECHO | termios.ICANON)
@@ -48,16 +46,13 @@ def test_a_port_that_somebody_may_have_set_up_is_not_touched(
     _, slave, name = terminal
     tty.setraw(slave)
     before = termios.tcgetattr(slave)
-    found = look(name, alone=False)
-    assert found.even_parity is None
+    assert look(name, alone=False)[0] == "set_up"
     assert termios.tcgetattr(slave) == before
 
 
 def test_what_cannot_be_opened_is_reported(tmp_path: Path) -> None:
-    found = look(str(tmp_path / "none"), alone=True)
-    assert found.trouble == "No such file or directory"
-    assert not found.busy
-    assert "not a working serial port" in str(look(os.devnull, alone=True).trouble)
+    assert look(str(tmp_path / "none"), alone=True)[0] == "No such file or directory"
+    assert "not a working serial port" in look(os.devnull, alone=True)[0]
 
 
 def test_no_module_of_doctor_can_write_to_a_device() -> None:
@@ -74,7 +69,7 @@ def test_no_module_of_doctor_can_write_to_a_device() -> None:
         if "open" in methods or any(
             isinstance(call, ast.Name) and call.id == "open" for call in calls
         ):
-            assert path.name == "line.py"
+            assert path.name == "ports.py"
 
 
 def test_even_parity_is_known_by_what_is_read_back() -> None:
@@ -86,5 +81,5 @@ def test_even_parity_is_known_by_what_is_read_back() -> None:
         (eight_even | termios.CSTOPB, termios.B115200),
         (eight_even, termios.B9600),
     )
-    assert line._is_ours([0, 0, eight_even, 0, termios.B115200, termios.B115200])
-    assert not any(line._is_ours([0, 0, flags, 0, speed, speed]) for flags, speed in wrong)
+    assert ports._is_ours([0, 0, eight_even, 0, termios.B115200, termios.B115200])
+    assert not any(ports._is_ours([0, 0, flags, 0, speed, speed]) for flags, speed in wrong)

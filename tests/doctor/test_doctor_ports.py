@@ -11,13 +11,13 @@ import pytest
 from doctor_trees import Tree, grave, only
 
 from kontronik_can_gw.desk.doctor.findings import Finding, Severity
-from kontronik_can_gw.desk.doctor.line import Line
-from kontronik_can_gw.desk.doctor.serial_ports import check_port
+from kontronik_can_gw.desk.doctor.ports import check_port
 from kontronik_can_gw.desk.doctor.service import unit_of
 
 OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
 BY_ID = "/dev/serial/by-id/usb-FTDI_A1234-port0"
-GOOD = Line(even_parity=True, errors={"framing": 0})
+GOOD = ("ok", {"framing": 0})
+Line = tuple[str, dict[str, int]]
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 RUN = ("python3", "-m", "kontronik_can_gw", "run")
 USB0, AMA0, S0 = "/dev/ttyUSB0", "/dev/ttyAMA0", "/dev/ttyS0"
@@ -101,27 +101,25 @@ GETTY = process("/sbin/agetty", "115200", "ttyAMA0", "vt220", opens=[AMA0])
 CONSOLE = file("/proc/cmdline", "console=tty1 console=ttyAMA0,115200 root=/dev/sda\n")
 GATEWAY = process(*RUN, opens=[USB0])
 INSTALLED = process("/usr/bin/python3", "/opt/bin/kontronik-can-gw", "run", "--wait", opens=[USB0])
-POWER = "/sys/devices/pci0/usb1/1-1/power/control"
 MINI_UART = uart("ttyS0", "serial8250", "brcm,bcm2835-aux-uart")
 
 
 @pytest.mark.parametrize(
     ("given", "port", "opened", "name", "severity", "said"),
     [
-        ([ftdi()], BY_ID, True, "port.exists", OK, "FT232R USB UART, driver ftdi_sio, serial number A1234"),
+        ([ftdi()], BY_ID, True, "port.exists", OK, "ttyUSB0, FT232R USB UART"),
         ([ftdi()], "/dev/ttyUSB7", False, "port.exists", ERROR, BY_ID),
         ([], USB0, False, "port.exists", ERROR, "Plug in the adapter"),
         ([], AMA0, False, "port.exists", ERROR, "enable_uart=1"),
         ([ftdi(), no_udev], USB0, True, "port.name", WARNING, "systemctl status systemd-udevd"),
         ([file("/dev/notes", "x")], "/dev/notes", False, "port.exists", ERROR, ""),
         ([pty], "/dev/pts/3", False, "port.exists", OK, "pseudo terminal"),
-        ([uart("ttyAMA0")], AMA0, True, "port.exists", OK, "driver uart-pl011"),
+        ([uart("ttyAMA0")], AMA0, True, "port.exists", OK, "ttyAMA0"),
         ([ftdi()], USB0, True, "port.name", WARNING, f'port = "{BY_ID}"'),
         ([ftdi(serial="")], USB0, True, "port.name", WARNING, "/dev/serial/by-path/pci-usb-0:1"),
         # who may open it
         ([ftdi(), closed], BY_ID, False, "port.permission", ERROR, "sudo usermod -aG dialout anna"),
         ([ftdi(), of_root, closed], BY_ID, False, "port.permission", ERROR, "chmod g+rw"),
-        ([ftdi(), systemd(User="made-up", DynamicUser="yes")], BY_ID, True, "port.permission", OK, "made-up may open it"),
         (
             [ftdi(), DEVICES, allows("char-ttyS", "char-ttyACM")],
             BY_ID, True, "port.device_kind", ERROR, "DeviceAllow=char-ttyUSB rw",
@@ -131,7 +129,7 @@ MINI_UART = uart("ttyS0", "serial8250", "brcm,bcm2835-aux-uart")
             BY_ID, True, "port.permission", ERROR, "usermod -aG dialout kontronik-can-gw",
         ),
         ([ftdi(), of_root, systemd()], BY_ID, True, "port.permission", ERROR, "chmod g+rw"),
-        ([ftdi(), of_root, closed, GATEWAY], BY_ID, False, "port.permission", NOTE, "chmod g+rw"),
+        ([ftdi(), of_root, closed, GATEWAY], BY_ID, False, "port.permission", OK, ""),
         # what else is on it
         ([ftdi(), process("/usr/bin/brltty")], BY_ID, True, "port.brltty", WARNING, "apt remove brltty"),
         ([uart("ttyAMA0"), GETTY], AMA0, False, "port.getty", ERROR, "systemctl disable --now serial-getty@ttyAMA0"),
@@ -143,9 +141,6 @@ MINI_UART = uart("ttyS0", "serial8250", "brcm,bcm2835-aux-uart")
         ([ftdi(), INSTALLED], BY_ID, False, "port.users", NOTE, "kontronik-can-gw (pid 78)"),
         # the line itself
         ([MINI_UART], S0, False, "port.parity", ERROR, "dtoverlay=disable-bt"),
-        ([ftdi(latency=16)], BY_ID, True, "port.latency", OK, "16 ms; the gateway asks for 1 ms"),
-        ([ftdi(latency=16), GATEWAY], BY_ID, False, "port.latency", WARNING, "latency_timer"),
-        ([ftdi(), file(POWER, "auto\n")], BY_ID, True, "port.autosuspend", NOTE, f"echo on | sudo tee {POWER}"),
     ],
 )  # fmt: skip
 def test_what_is_found_is_reported_and_the_port_is_opened_only_where_nobody_else_needs_it(
@@ -193,12 +188,12 @@ def test_a_port_that_only_the_running_gateway_may_open_is_no_error(tree: Tree) -
 @pytest.mark.parametrize(
     ("line", "name", "severity", "word"),
     [
-        (Line(even_parity=False), "port.parity", ERROR, "does not take"),
-        (Line(even_parity=None), "port.parity", NOTE, "not tried"),
-        (Line("Device or resource busy", busy=True), "port.parity", NOTE, "for himself"),
-        (Line(os.strerror(errno.EIO)), "port.parity", ERROR, "Input/output error"),
+        (("none", {}), "port.parity", ERROR, "does not take"),
+        (("set_up", {}), "port.parity", NOTE, "not tried"),
+        (("exclusive", {}), "port.parity", NOTE, "for himself"),
+        ((os.strerror(errno.EIO), {}), "port.parity", ERROR, "Input/output error"),
         (
-            Line(even_parity=True, errors={"framing": 3, "parity": 12, "break": 0}),
+            ("ok", {"framing": 3, "parity": 12, "break": 0}),
             *("port.line_errors", NOTE, "3 framing, 12 parity"),
         ),
     ],

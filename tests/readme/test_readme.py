@@ -9,35 +9,43 @@ import zipfile
 from pathlib import Path
 
 import cantools.database
-from readme_tables import PAGES, PROJECT, TABLES, configuration, with_tables
+from reference import FOLDER, pages
 
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.config.export import schema
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 
+PROJECT = FOLDER.parents[1]
+PAGES = {
+    path: path.read_text(encoding="utf-8")
+    for path in [
+        PROJECT / "README.md",
+        PROJECT / "CONTRIBUTING.md",
+        *sorted((PROJECT / "docs").rglob("*.md")),
+        *sorted((PROJECT / "examples").rglob("*.md")),
+    ]
+}
 README = PAGES[PROJECT / "README.md"]
-ALL = "\n".join(PAGES.values())
+ALL = "\n".join(text for path, text in PAGES.items() if path.parent != FOLDER)
 
 
-def test_the_tables_are_those_of_the_sources() -> None:
-    for path, text in PAGES.items():
-        assert with_tables(text) == text, f"{path.name}: run: python tests/readme/readme_tables.py"
-    for name in TABLES:
-        assert ALL.count(f"<!-- made: {name} -->\n") == 1, name
+def test_the_reference_is_that_of_the_sources() -> None:
+    made = {FOLDER / name: text for name, text in pages()}
+    found = {path: text for path, text in PAGES.items() if path.parent == FOLDER}
+    assert made == found, "run: make docs"
 
 
-def test_its_configuration_table_has_every_key_of_every_table() -> None:
-    rows = set(re.findall(r"^\| `([^`]+)` \|", configuration(), re.MULTILINE))
-    keys = set()
-    for name, table in schema()["properties"].items():
-        head, table = (f"[{name}]", table["items"]) if table["type"] == "array" else (name, table)
-        keys |= {
-            f"{head}.{key}"
-            for key, entry in table["properties"].items()
-            if "deprecated" not in entry
-        }
-    assert rows == keys
+def test_the_reference_has_every_key_of_every_table() -> None:
+    rows = set(re.findall(r"^\| (\w+) \|", PAGES[FOLDER / "configuration.md"], re.MULTILINE))
+    tables = schema()["properties"].values()
+    keys = {
+        key
+        for table in (table.get("items", table) for table in tables)
+        for key, entry in table["properties"].items()
+        if "deprecated" not in entry
+    }
+    assert rows - {"key"} == keys
 
 
 def anchors(text: str) -> set[str]:
@@ -60,9 +68,12 @@ def test_links_lead_to_files_and_headings() -> None:
 
 
 def test_every_page_is_found_from_the_front() -> None:
-    assert {path for path in PAGES if path.parent != PROJECT} == {
-        PROJECT / link for link in re.findall(r"\]\((docs/[^)#]+\.md)\)", README)
+    linked = {
+        (path.parent / link).resolve()
+        for path, text in PAGES.items()
+        for link in re.findall(r"\]\(([^):#]+\.md)", text)
     }
+    assert set(PAGES) - {PROJECT / "README.md"} <= linked
     assert README.count("\n") <= 230
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.cli.service_files import COMPANIONS, Choices, PlannedFile, planned
+from kontronik_can_gw.cli.service_files import COMPANIONS, planned
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
@@ -21,19 +21,28 @@ ENABLE = "no systemd-analyze on this machine: sudo apt-get install systemd"
 MAX_EXPOSED = 2.0
 
 
-def files(root: Path, **more: Any) -> dict[str, PlannedFile]:
-    """All files by their names, *.conf by its folder's."""
-    usual: dict[str, Any] = {"executable": "/bin/true", "home_visible": False, "group": "dialout"}
-    made = {Path(file.path): file for file in planned(Choices(**(usual | more)), root)}
-    return {(p.parent if p.suffix == ".conf" else p).name: file for p, file in made.items()}
+def files(**more: Any) -> dict[str, str]:
+    """Texts of all files by their names, *.conf by its folder's."""
+    usual: dict[str, Any] = {
+        "program": "/bin/true",
+        "companions": (),
+        "channel": "can0",
+        "bitrate": None,
+    }
+    made = {Path(place): text for place, text in planned(**(usual | more))}
+    return {(p.parent if p.suffix == ".conf" else p).name: text for p, text in made.items()}
 
 
 def units(folder: Path, beside: bool = False) -> list[Path]:
-    """The gateway's units in a folder, or those of the services beside it; the template as an instance."""
-    made = files(folder, companions=COMPANIONS if beside else ())
-    for name, file in made.items():
-        if name.endswith(".service"):
-            (folder / name.replace("@", "@left")).write_text(file.text)
+    """The gateway's units in a folder, or those of the services beside it; the template as an instance with its drop-in."""
+    made = files(companions=COMPANIONS if beside else ())
+    for name, text in made.items():
+        if name.endswith((".service", ".service.d")):
+            path = folder / name.replace("@", "@left")
+            if name.endswith(".d"):
+                path.mkdir()
+                path /= "instance.conf"
+            path.write_text(text)
     return [folder / name.replace("@", "@left") for name in (BESIDE if beside else NAMES)]
 
 
@@ -87,18 +96,19 @@ def test_the_service_is_hardly_exposed(tmp_path: Path, beside: bool) -> None:
 # --- line by line
 
 
-def test_both_units_differ_only_in_their_names(tmp_path: Path) -> None:
-    made = files(tmp_path)
-    plain, template = (settings(made[name].text) for name in NAMES)
-    assert {name for name in plain if plain[name] != template[name]} == {
-        "Description",
-        "ExecStart",
-        "StateDirectory",
-        "RuntimeDirectory",
+def test_an_instance_is_the_plain_unit_but_for_its_names() -> None:
+    made = files()
+    plain, own = settings(made[NAMES[0]]), settings(made[f"{NAMES[1]}.d"])
+    assert made[NAMES[0]] == made[NAMES[1]]
+    run = "/bin/true run --wait -c /etc/kontronik-can-gw"
+    assert plain["ExecStart"] == [f"{run}/gateway.toml"]
+    assert own.pop("Description") == [f"{plain['Description'][0]}, %i"]
+    folder = ["", "kontronik-can-gw-%i"]
+    assert own == {
+        "ExecStart": ["", f"{run}/%i.toml"],
+        "StateDirectory": folder,
+        "RuntimeDirectory": folder,
     }
-    assert plain["ExecStart"] == ["/bin/true run --wait -c /etc/kontronik-can-gw/gateway.toml"]
-    assert template["ExecStart"] == ["/bin/true run --wait -c /etc/kontronik-can-gw/%i.toml"]
-    assert template["StateDirectory"] == template["RuntimeDirectory"] == ["kontronik-can-gw-%i"]
 
 
 SETTINGS = {
@@ -110,33 +120,31 @@ SETTINGS = {
     "IPAddressDeny": ["any"],
     "CapabilityBoundingSet": [""],
     "AmbientCapabilities": [""],
-    "ProtectHome": ["yes"],
+    "ProtectHome": ["read-only"],
 }
 
 
-def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet(
-    tmp_path: Path,
-) -> None:
-    made = files(tmp_path)
-    unit = settings(made[NAMES[0]].text)
+def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet() -> None:
+    made = files()
+    unit = settings(made[NAMES[0]])
     assert {name: unit[name] for name in SETTINGS} == SETTINGS
     never = ("ExecStartPre", "RestartPrevent", "ExecCondition", "Condition")
     assert not [name for name in unit if name.startswith(never)]
 
 
-def test_metrics_are_for_this_machine_only(tmp_path: Path) -> None:
-    made = files(tmp_path, companions=["metrics"])
-    for name, configuration in (("", "gateway"), ("@", "%i")):
-        unit = settings(made[f"kontronik-can-gw-metrics{name}.service"].text)
-        assert unit["ExecStart"] == [
-            f"/bin/true metrics -c /etc/kontronik-can-gw/{configuration}.toml --listen ${{LISTEN}}"
-        ]
-        assert unit["Environment"] == ["LISTEN=127.0.0.1:9123"]
-        assert (unit["IPAddressDeny"], unit["IPAddressAllow"]) == (["any"], ["localhost"])
+def test_metrics_are_for_this_machine_only() -> None:
+    made = files(companions=["metrics"])
+    unit = settings(made["kontronik-can-gw-metrics.service"])
+    own = settings(made["kontronik-can-gw-metrics@.service.d"])
+    for shown, name in ((unit, "gateway"), (own, "%i")):
+        command = f"/bin/true metrics -c /etc/kontronik-can-gw/{name}.toml --listen ${{LISTEN}}"
+        assert shown["ExecStart"][-1] == command
+    assert unit["Environment"] == ["LISTEN=127.0.0.1:9123"]
+    assert (unit["IPAddressDeny"], unit["IPAddressAllow"]) == (["any"], ["localhost"])
 
 
-def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
-    unit = settings(files(tmp_path)[NAMES[0]].text)
+def test_it_may_open_serial_ports_and_nothing_else() -> None:
+    unit = settings(files()[NAMES[0]])
     assert unit["DevicePolicy"] == ["closed"]
     assert {"char-ttyUSB rw", "char-ttyACM rw", "char-ttyS rw", "char-ttyAMA rw"} <= set(
         unit["DeviceAllow"]
@@ -150,35 +158,29 @@ def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
     assert "PrivateDevices" not in unit
 
 
-def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it(tmp_path: Path) -> None:
+def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it() -> None:
     """In the plain unit's runtime folder, which systemd would remove with it; every instance and the publisher write there."""
-    made = files(tmp_path, companions=["mqtt"])
-    lines = [line for line in made["tmpfiles.d"].text.splitlines() if line.startswith("d ")]
+    made = files(companions=["mqtt"])
+    lines = [line for line in made["tmpfiles.d"].splitlines() if line.startswith("d ")]
     assert f"d {SYSTEM_FOLDER} 0755 kontronik-can-gw kontronik-can-gw -" in lines
     for name in (*NAMES, "kontronik-can-gw-mqtt.service", "kontronik-can-gw-mqtt@.service"):
-        unit = settings(made[name].text)
+        unit = settings(made[name])
         assert unit["ReadWritePaths"] == [f"-{SYSTEM_FOLDER}"]
         assert unit.get("RuntimeDirectoryPreserve", ["yes"]) == ["yes"]
         assert "lock" not in "".join(unit.get("RuntimeDirectory", []))
-    assert "RuntimeDirectoryPreserve" in settings(made[NAMES[0]].text)
-
-
-def test_nothing_is_left_to_be_filled_in(tmp_path: Path) -> None:
-    for bitrate in (None, 250_000):
-        for file in files(tmp_path, bitrate=bitrate, companions=COMPANIONS).values():
-            assert not re.search(r"@[A-Z]+@", file.text)
+    assert "RuntimeDirectoryPreserve" in settings(made[NAMES[0]])
 
 
 # --- network and udev
 
 
-def test_the_network_file_has_what_the_bus_needs(tmp_path: Path) -> None:
-    assert "BitRate=500000" in files(tmp_path)["50-kontronik-can-gw-can0.network.example"].text
-    made = files(tmp_path, bitrate=250_000, channel="can1")
-    network = settings(made["50-kontronik-can-gw-can1.network"].text)
+def test_the_network_file_has_what_the_bus_needs() -> None:
+    assert not [name for name in files() if name.startswith("50-")]
+    made = files(bitrate=250_000, channel="can1")
+    network = settings(made["50-kontronik-can-gw-can1.network"])
     bus = {"BitRate": ["250000"], "SamplePoint": ["87.5%"], "RestartSec": ["100ms"]}
     assert network == {"Name": ["can1"], "RequiredForOnline": ["no"], **bus}
-    link = settings(made["50-kontronik-can-gw-can1.link"].text)
+    link = settings(made["50-kontronik-can-gw-can1.link"])
     assert link == {"OriginalName": ["can1"], "TransmitQueueLength": ["128"]}
 
 
@@ -189,7 +191,7 @@ RULE = re.compile(
 
 def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
     """By the grammar of the keys in use, and by udev itself where it can (udevadm verify, systemd 254)."""
-    text = files(tmp_path)["70-kontronik-can-gw.rules"].text
+    text = files()["70-kontronik-can-gw.rules"]
     lines = [line.strip("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)]
     assert len(lines) == 6
     assert all(RULE.fullmatch(part) for line in lines for part in line.split(", "))
@@ -206,8 +208,8 @@ def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr + done.stdout
 
 
-def test_udev_rules_keep_modem_manager_away(tmp_path: Path) -> None:
-    text = files(tmp_path)["70-kontronik-can-gw.rules"].text
+def test_udev_rules_keep_modem_manager_away() -> None:
+    text = files()["70-kontronik-can-gw.rules"]
     # the gateway asks for it once echo is off, and nothing before that
     assert "latency_timer" not in text
     ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]

@@ -1,1 +1,1 @@
-"""Documentation generated from DBC and EDS in use, sources, error bits and states. ``facts`` collects, the rest renders."""
+"""What a gateway sends and what it means: ``tables`` of the DBC and EDS in use, values, errors and states; ``markdown`` renders them."""

@@ -1,69 +1,56 @@
-"""Renders sections as Markdown (CommonMark with GitHub's tables). All texts are escaped."""
+"""Renders tables as Markdown (CommonMark with GitHub's tables). All texts are escaped."""
 
 import re
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from typing import Any, NamedTuple
 
-
-class Code(str):
-    """A text that is a name in a program or a file."""
-
-    __slots__ = ()
+Row = dict[str, Any]
+_HEX = {"id": 3, "cob_id": 3, "code": 4}
+"""Columns of numbers that people write in hexadecimal, with digits."""
 
 
 class Table(NamedTuple):
-    """Cells are plain text or Code; every row is as long as ``head``."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-class Section(NamedTuple):
-    """``level`` 2 or 3. Empty blocks are left out."""
+    """Rows of plain data, all with the same keys: the columns. ``by``: a column with headings of their own for each of its values."""
 
     title: str
-    level: int
-    blocks: Sequence[str | Table]
+    text: Sequence[str] = ()
+    rows: Sequence[Row] = ()
+    by: str = ""
 
 
-def markdown(title: str, lead: Sequence[str], sections: Sequence[Section]) -> str:
-    """The Markdown text, ending with a line end. ``lead``: lines before the table of contents."""
-    blocks = [f"# {text(title)}", *map(text, lead), _contents(sections)]
-    for section in sections:
-        blocks.append(f"{'#' * section.level} {text(section.title)}")
-        blocks += [
-            _table(block) if isinstance(block, Table) else text(block)
-            for block in section.blocks
-            if block
-        ]
-    return "\n\n".join(blocks) + "\n"
+def markdown(title: str, lead: Iterable[str], tables: Iterable[Table]) -> str:
+    """The Markdown text, ending with a line end. Columns that are empty in all rows of a table are left out."""
+    blocks = [f"# {text(title)}", *map(text, lead)]
+    for table in tables:
+        blocks += [f"## {text(table.title)}", *map(text, table.text)]
+        if table.by:
+            for head, rows in groupby(table.rows, key=lambda row: row[table.by]):
+                blocks += [f"### {text(str(head))}", _rows(list(rows), table.by)]
+        elif table.rows:
+            blocks.append(_rows(table.rows))
+    return "\n\n".join(filter(None, blocks)) + "\n"
 
 
-def _contents(sections: Sequence[Section]) -> str:
-    titles = [section.title for section in sections if section.level == 2]
-    return "\n".join(f"* [{text(title)}](#{_anchor(title)})" for title in titles)
+def _rows(rows: Sequence[Row], without: str = "") -> str:
+    cells = [{key: _cell(key, value) for key, value in row.items()} for row in rows]
+    keys = [key for key in rows[0] if key != without and any(row[key] for row in cells)]
+    lines = [[text(key.replace("_", " ")) for key in keys], ["---"] * len(keys)]
+    lines += [[row[key] for key in keys] for row in cells]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _anchor(title: str) -> str:
-    """The anchor that GitHub makes from a heading."""
-    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
-
-
-def _table(table: Table) -> str:
-    rows = [table.head, ["---"] * len(table.head), *(map(cell, row) for row in table.rows)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-def cell(content: str) -> str:
-    """A cell of a table: one line, with bars escaped."""
-    if not isinstance(content, Code):
-        return text(content)
-    plain = " ".join(content.split())
-    if not plain:
-        return ""
-    ticks = "`" * (max(map(len, re.findall("`+", plain)), default=0) + 1)
-    pad = " " if plain.startswith("`") or plain.endswith("`") else ""
-    return f"{ticks}{pad}{plain}{pad}{ticks}".replace("|", "\\|")
+def _cell(key: str, value: object) -> str:
+    """A cell: None and False are empty, True is yes, a value table is ``0 Off, 1 On``."""
+    if value is None or isinstance(value, bool):
+        return "yes" if value else ""
+    if isinstance(value, int) and (key in _HEX or abs(value) > 0xFFFFFF):
+        return f"{value:0{_HEX.get(key, 1)}X}h"
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    if isinstance(value, Mapping):
+        return text(", ".join(f"{name} {word}" for name, word in value.items()))
+    return text(", ".join(map(str, value)) if isinstance(value, list) else str(value))
 
 
 def text(content: str) -> str:

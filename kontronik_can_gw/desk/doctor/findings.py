@@ -1,15 +1,10 @@
 """Findings of checks with severity and remedy, worded in checks.toml."""
 
 import tomllib
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-FORMAT = 1
-"""Version of the JSON document; its keys stay the same as long as this does."""
 
 
 class Severity(StrEnum):
@@ -46,33 +41,10 @@ class Findings:
     def __init__(self, group: str, **values: object) -> None:
         self.group = group
         self.found: list[Finding] = []
-        self._values = values
+        self.values = values
 
     def say(self, check: str, case: str, **values: object) -> None:
-        """Add a case of checks.toml under the name of its check."""
-        self.say_as(check, check, case, **values)
-
-    def say_as(self, name: str, check: str, case: str, **values: object) -> None:
-        """Add a case of a check that stands for several under another name."""
+        """Add a case of a check."""
         severity, *texts = wordings()[check][case]
-        filled = [text.format(**{**self._values, **values}) for text in texts]
-        self.found.append(Finding(self.group, name, Severity(severity), *filled))
-
-
-def count(findings: Iterable[Finding], severity: Severity) -> int:
-    return sum(finding.severity is severity for finding in findings)
-
-
-def document(
-    findings: Sequence[Finding], version: str, config: str, exit_code: int
-) -> dict[str, Any]:
-    """The report as one JSON document."""
-    return {
-        "format": FORMAT,
-        "version": version,
-        "config": config,
-        "exit_code": exit_code,
-        "errors": count(findings, Severity.ERROR),
-        "warnings": count(findings, Severity.WARNING),
-        "findings": [asdict(finding) for finding in findings],
-    }
+        filled = [text.format(**{**self.values, **values}) for text in texts]
+        self.found.append(Finding(self.group, check, Severity(severity), *filled))

@@ -1,83 +1,172 @@
-"""Checks the machine: clock, load, memory, power, log, versions."""
+"""What the checks see of the machine: files below a root, programs that only read, processes and users. Nothing is changed.
 
+Names are absolute paths on the machine; tests use another root.
+"""
+
+import contextlib
+import grp
 import os
-import platform
-import re
-import time
-from importlib.metadata import PackageNotFoundError, version
+import pwd
+import shutil
+import stat
+import subprocess
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
 
-from kontronik_can_gw import __version__
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings
-from kontronik_can_gw.desk.doctor.service import Unit, check_service
-from kontronik_can_gw.desk.doctor.system import System
-
-_PACKAGES = ("python-can", "canopen", "pyserial", "cantools", "rich")
-_FIRST_YEAR = 2024
-_MIN_MEMORY_KB = 64 * 1024
-_FREQUENCY = "/sys/devices/system/cpu/cpu0/cpufreq"
+_PROGRAM_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
+"""`ip` is not on every user's path."""
+_PATIENCE_S = 5.0
 
 
-def check_machine(system: System, unit: Unit | None, year: int | None = None) -> list[Finding]:
-    """All findings about the machine. ``year``: replaces that of the wall clock in tests."""
-    findings = Findings("Machine")
-    check_service(system, findings, unit)
-    year = time.gmtime().tm_year if year is None else year
-    findings.say("machine.clock", "wrong" if year < _FIRST_YEAR else "ok", year=year)
-    _processor(system, findings)
-    _memory(system, findings)
-    _power(system, findings)
-    if system.has_systemd:
-        is_kept = system.exists("/var/log/journal")
-        findings.say("machine.log", "ok" if is_kept else "lost")
-    _versions(findings)
-    return findings.found
+class Process(NamedTuple):
+    """A running program."""
+
+    pid: int
+    name: str
+    words: tuple[str, ...] = ()
+
+    @property
+    def is_gateway(self) -> bool:
+        """True for a gateway of ours: `kontronik-can-gw run`, or `python -m kontronik_can_gw run`."""
+        names = {word.rpartition("/")[2] for word in self.words[:4]}
+        return "run" in self.words[1:] and bool({"kontronik-can-gw", "kontronik_can_gw"} & names)
+
+    def __str__(self) -> str:
+        return f"{'kontronik-can-gw' if self.is_gateway else self.name} (pid {self.pid})"
 
 
-def _processor(system: System, findings: Findings) -> None:
-    number = os.cpu_count() or 1
-    load = (system.text("/proc/loadavg") or "").split()
-    if load:
-        processors = f"{number} processor{'s' * (number > 1)}"
-        case = "high" if float(load[0]) > 2 * number else "ok"
-        findings.say("machine.load", case, load=load[0], processors=processors)
-    governor = system.text(f"{_FREQUENCY}/scaling_governor")
-    if governor:
-        adapts = system.text(f"{_FREQUENCY}/scaling_driver") == "intel_pstate"
-        case = "powersave" if governor == "powersave" and not adapts else "ok"
-        findings.say("machine.governor", case, governor=governor)
+class User(NamedTuple):
+    """A user: name, user-ID and the IDs of all groups."""
+
+    name: str
+    uid: int
+    groups: frozenset[int]
+
+    def may(self, status: os.stat_result, bits: int) -> bool:
+        """True if the mode allows all of ``bits`` (4 read, 2 write, 1 enter or run)."""
+        shift = 6 if status.st_uid == self.uid else 3 if status.st_gid in self.groups else 0
+        return self.uid == 0 or status.st_mode >> shift & bits == bits
 
 
-def _memory(system: System, findings: Findings) -> None:
-    found = re.search(r"^MemAvailable: *(\d+)", system.text("/proc/meminfo") or "", re.MULTILINE)
-    if found is not None:
-        free = int(found[1])
-        case = "low" if free < _MIN_MEMORY_KB else "ok"
-        findings.say("machine.memory", case, megabytes=free // 1024)
+class Machine:
+    """The machine below ``root``."""
 
+    def __init__(self, root: Path = Path("/")) -> None:
+        self.root = root
 
-def _power(system: System, findings: Findings) -> None:
-    """Check for undervoltage, which a Raspberry Pi detects and which affects USB adapters first."""
-    for name in system.names("/sys/class/hwmon"):
-        folder = f"/sys/class/hwmon/{name}"
-        if system.text(f"{folder}/name") == "rpi_volt":
-            is_low = system.number(f"{folder}/in0_lcrit_alarm")
-            findings.say("machine.power", "low" if is_low else "ok")
+    def path(self, name: str) -> Path:
+        return self.root / name.lstrip("/")
 
+    def text(self, name: str) -> str:
+        """A small file's text; empty where it cannot be read."""
+        try:
+            return self.path(name).read_bytes().decode("utf-8", "replace").strip("\0\n ")
+        except OSError:
+            return ""
 
-def _versions(findings: Findings) -> None:
-    findings.say(
-        "machine.versions",
-        "ok",
-        version=__version__,
-        python=platform.python_version(),
-        kernel=platform.release(),
-        packages=", ".join(filter(None, map(_package, _PACKAGES))),
-    )
+    def names(self, folder: str) -> list[str]:
+        """Names in a folder; empty where it cannot be read."""
+        try:
+            return sorted(each.name for each in self.path(folder).iterdir())
+        except OSError:
+            return []
 
+    def exists(self, name: str) -> bool:
+        return self.status(name) is not None
 
-def _package(name: str) -> str:
-    """Its name and version; empty where it is not known."""
-    try:
-        return f"{name} {version(name)}"
-    except PackageNotFoundError:
+    def status(self, name: str) -> os.stat_result | None:
+        try:
+            return self.path(name).stat()
+        except OSError:
+            return None
+
+    def real(self, name: str) -> str:
+        """The path without symbolic links."""
+        root = os.path.realpath(self.root)
+        return os.path.realpath(self.path(name)).removeprefix("" if root == "/" else root) or "/"
+
+    def space(self, folder: str) -> tuple[bool, int]:
+        """Whether a folder's file system is read-only, and its free bytes: 0 where no more files can be made."""
+        found = os.statvfs(self.path(folder))
+        is_full = found.f_files and not found.f_favail
+        free = 0 if is_full else found.f_bavail * found.f_frsize
+        return bool(found.f_flag & os.ST_RDONLY), free
+
+    def may(self, name: str, mode: int) -> bool:
+        """True if this process may use a file or folder so (as for ``os.access``), access lists included."""
+        return os.access(self.path(name), mode)
+
+    def run(self, *command: str) -> str:
+        """Output of a program, whatever its exit code; empty where it is missing or takes too long."""
+        program = shutil.which(command[0], path=_PROGRAM_PATH)
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            if program is not None:
+                words, env = [program, *command[1:]], {**os.environ, "LC_ALL": "C"}
+                done = subprocess.run(
+                    words, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PATIENCE_S, env=env
+                )  # fmt: skip
+                return done.stdout.decode("utf-8", "replace")
         return ""
+
+    @property
+    def has_systemd(self) -> bool:
+        return self.exists("/run/systemd/system")
+
+    @cached_property
+    def user(self) -> User:
+        """The user of this process."""
+        name = str(os.geteuid())
+        with contextlib.suppress(KeyError):
+            name = pwd.getpwuid(os.geteuid()).pw_name
+        return User(name, os.geteuid(), frozenset((*os.getgroups(), os.getegid())))
+
+    def user_named(self, name: str, more_groups: str = "") -> User | None:
+        """A user with the groups of the system and ``more_groups``, names with spaces between; None where there is none."""
+        try:
+            found = pwd.getpwnam(name)
+        except KeyError:
+            return None
+        more = [group.gr_gid for group in grp.getgrall() if group.gr_name in more_groups.split()]
+        return User(name, found.pw_uid, frozenset([*os.getgrouplist(name, found.pw_gid), *more]))
+
+    def group_name(self, gid: int) -> str:
+        try:
+            return grp.getgrgid(gid).gr_name
+        except KeyError:
+            return str(gid)
+
+    @cached_property
+    def processes(self) -> dict[int, Process]:
+        """All visible processes except this one."""
+        found = {}
+        for pid in (int(name) for name in self.names("/proc") if name.isdigit()):
+            if pid != os.getpid() and (name := self.text(f"/proc/{pid}/comm")):
+                words = self.text(f"/proc/{pid}/cmdline").split("\0")
+                found[pid] = Process(pid, name, tuple(words))
+        return found
+
+    def openers(self, device: os.stat_result) -> tuple[list[Process], bool]:
+        """Processes that have a character device open or locked; False if there may be others that this user cannot see."""
+        found: dict[int, Process] = {}
+        complete = bool(self.processes) and self.exists("/proc/1/comm")
+        for pid, process in self.processes.items():
+            try:
+                numbers = list(self.path(f"/proc/{pid}/fd").iterdir())
+            except PermissionError:
+                complete = False
+                continue
+            except OSError:  # it ended meanwhile
+                continue
+            for number in numbers:
+                status = self.status(f"/proc/{pid}/fd/{number.name}")
+                if status and stat.S_ISCHR(status.st_mode) and status.st_rdev == device.st_rdev:
+                    found[pid] = process
+        # locks, which every user can see
+        place = f"{os.major(device.st_dev):02x}:{os.minor(device.st_dev):02x}:{device.st_ino}"
+        for words in map(str.split, self.text("/proc/locks").splitlines()):
+            if len(words) > 5 and words[5] == place and words[4] not in ("-1", str(os.getpid())):
+                pid = int(words[4])
+                unseen = Process(pid, "a program that we may not see")
+                found[pid] = self.processes.get(pid, unseen)
+        return [found[pid] for pid in sorted(found)], complete

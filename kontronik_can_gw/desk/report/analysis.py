@@ -107,9 +107,8 @@ class Analysis:
         self._flush()
         for esc in self._escs:
             esc.finish(self._last_ns)
-        times, columns = self._decimator.finish()
         lines = {}
-        for key, column in zip(self._drawn, columns, strict=True):
+        for key, column in zip(self._drawn, self._decimator.columns, strict=True):
             # a float signal may be infinite
             finite = [value if value is None or isfinite(value) else None for value in column]
             if any(value is not None for value in finite):
@@ -125,7 +124,7 @@ class Analysis:
             end_ns=self._last_ns,
             rows=self._rows,
             escs=[esc.found for esc in self._escs],
-            times=times,
+            times=self._decimator.times,
             lines=lines,
             events=self._events.in_order(),
             left_out=self._events.left_out,

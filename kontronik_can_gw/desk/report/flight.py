@@ -16,14 +16,6 @@ class Extreme(NamedTuple):
     time_ns: int
 
 
-class Resistance(NamedTuple):
-    """A resistance and its spread in ohm; ``stretches``: of how many pieces of the recording."""
-
-    value: float
-    spread: float
-    stretches: int
-
-
 class Segment(NamedTuple):
     """A period in one operating state; ``state`` is its number."""
 
@@ -74,7 +66,6 @@ class EscFlight:
     """V of the battery before the first load."""
     load_voltage: Extreme | None = None
     """V of the battery, minimum under load."""
-    resistance: Resistance | None = None
     gaps: int = 0
     longest_gap_ns: int = 0
     devices: list[str] = field(default_factory=list)

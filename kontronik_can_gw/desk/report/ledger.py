@@ -1,4 +1,4 @@
-"""Sums of one ESC: counters that reset or overflow, time, energy, load and resistance. One pass."""
+"""Sums of one ESC: counters that reset or overflow, time, energy, voltage at rest and under load. One pass."""
 
 import statistics
 from collections import deque
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from math import isfinite
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Number, Resistance
+from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Number
 from kontronik_can_gw.esc.telemetry import SECOND
 
 HOUR_NS = 3600 * SECOND
@@ -16,11 +16,6 @@ LOAD_CURRENT = 5.0
 """A: at or above it the battery is under load."""
 REST_NS = 2 * SECOND
 """The rest voltage is the mean over at most this time before the first load."""
-STRETCH_NS = 10 * SECOND
-MIN_PAIRS = 20
-MIN_SPREAD = 2.0
-"""A: minimum standard deviation of the current in a stretch."""
-MIN_STRETCHES = 3
 
 
 class Counter:
@@ -67,7 +62,7 @@ class Ledger:
 
     def __init__(self, found: EscFlight) -> None:
         self._found = found
-        self._battery = Battery(found)
+        self._rest: deque[tuple[int, float]] = deque()
         self._last: Load | None = None
         self._since_ns = 0
         self._turning_ns = 0
@@ -82,12 +77,11 @@ class Ledger:
             self._last = row
             voltage, current = row.voltage, row.current
             if voltage is not None and current is not None and isfinite(voltage + current):
-                self._battery.take(time_ns, voltage, current)
+                self._weigh(time_ns, voltage, current)
 
     def finish(self, end_ns: int, *, has_power: bool, has_speed: bool) -> None:
         """Account for the time until the end."""
         self._account(end_ns)
-        self._battery.finish()
         found = self._found
         if has_speed:
             found.turning_ns = self._turning_ns
@@ -110,59 +104,15 @@ class Ledger:
             self._turning_ns += length_ns
             self._turning_power += power * length_ns
 
-
-class Battery:
-    """Voltage at rest and under load, and an estimate of the internal resistance with all leads up to the ESC.
-
-    The open-circuit voltage falls as the battery empties, so one line through a whole flight would count that as resistance. So a line
-    is fitted to voltage over current in each ten seconds in which the current varies enough. The result is the median of the slopes,
-    with half of their interquartile range as spread.
-    """
-
-    def __init__(self, found: EscFlight) -> None:
-        self._found = found
-        self._rest: deque[tuple[int, float]] = deque()
-        self._loaded = False
-        self._begin_ns = 0
-        self._voltages: list[float] = []
-        self._currents: list[float] = []
-        self._slopes: list[float] = []
-
-    def take(self, time_ns: int, voltage: float, current: float) -> None:
-        """Take a pair (V, A)."""
-        if not self._voltages or time_ns - self._begin_ns >= STRETCH_NS:
-            self._fit()
-            self._begin_ns = time_ns
-        self._voltages.append(voltage)
-        self._currents.append(current)
+    def _weigh(self, time_ns: int, voltage: float, current: float) -> None:
+        """The battery's voltage (V) at rest before the first load, and the lowest under load."""
+        found, lowest = self._found, self._found.load_voltage
         if current >= LOAD_CURRENT:
-            if self._rest and not self._loaded:
-                self._found.rest_voltage = statistics.fmean(v for _, v in self._rest)
-            self._loaded = True
-            lowest = self._found.load_voltage
+            if lowest is None and self._rest:
+                found.rest_voltage = statistics.fmean(v for _, v in self._rest)
             if lowest is None or voltage < lowest.value:
-                self._found.load_voltage = Extreme(voltage, time_ns)
-        elif not self._loaded and abs(current) <= REST_CURRENT and voltage > 0:
+                found.load_voltage = Extreme(voltage, time_ns)
+        elif lowest is None and abs(current) <= REST_CURRENT and voltage > 0:
             self._rest.append((time_ns, voltage))
             while self._rest[0][0] < time_ns - REST_NS:
                 self._rest.popleft()
-
-    def finish(self) -> None:
-        """Estimate the resistance, where the data are sufficient."""
-        self._fit()
-        if len(self._slopes) < MIN_STRETCHES:
-            return
-        low, middle, high = statistics.quantiles(self._slopes, n=4, method="inclusive")
-        if middle > 0:
-            self._found.resistance = Resistance(middle, (high - low) / 2, len(self._slopes))
-
-    def _fit(self) -> None:
-        """Add the slope of the stretch that ends."""
-        voltages, self._voltages = self._voltages, []
-        currents, self._currents = self._currents, []
-        if len(currents) < MIN_PAIRS:
-            return
-        mean = statistics.fmean(currents)
-        spread = statistics.fmean((current - mean) ** 2 for current in currents) ** 0.5
-        if spread >= MIN_SPREAD:
-            self._slopes.append(-statistics.linear_regression(currents, voltages).slope)

@@ -19,8 +19,6 @@ from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
 
 HERE = Path(__file__).parent
-MAX_DEVICES = 8
-"""Limit for the devices of an ESC named in the head."""
 APART = 4
 """Lines whose greatest values are further apart than this factor have a plot each."""
 
@@ -193,10 +191,8 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
 
 
 def _device(esc: EscFlight) -> str:
-    """The device in a few words; if it was replaced, every device; empty where nothing is known."""
-    words = esc.devices[:MAX_DEVICES]
-    if len(esc.devices) > MAX_DEVICES:
-        words.append(f"and {len(esc.devices) - MAX_DEVICES} more changes")
+    """The device in a few words; if it was replaced, the first devices; empty where nothing is known."""
+    words = esc.devices[:8]
     if len(words) == 1 and esc.layout:
         words = [f"{words[0]}, layout {esc.layout}"]
     return ", then ".join(words)

@@ -15,30 +15,20 @@ class Plot(NamedTuple):
     lines: dict[str, str]
 
 
+# fmt: off
 PLOTS = (
-    Plot(
-        *("speed", "Speed", 0),
-        {"output_speed": "Output", "motor_speed": "Motor", "electrical_speed": "Electrical"},
-    ),
+    Plot("speed", "Speed", 0, {"output_speed": "Output", "motor_speed": "Motor", "electrical_speed": "Electrical"}),
     Plot("battery_voltage", "Battery voltage", 2, {"battery_voltage": "Battery"}),
     Plot("cell_voltage", "Mean cell voltage", 3, {"mean_cell_voltage": "Cell"}),
-    Plot(
-        *("current", "Current", 1),
-        {"battery_current": "Battery", "motor_current": "Motor", "peak_current": "Peak (held)"},
-    ),
+    Plot("current", "Current", 1, {"battery_current": "Battery", "motor_current": "Motor", "peak_current": "Peak (held)"}),
     Plot("power", "Battery power", 0, {"battery_power": "Power"}),
-    Plot(
-        *("temperature", "Temperature", 0),
-        {"power_stage_temperature": "Power stage", "bec_temperature": "BEC"},
-    ),
-    Plot(
-        *("throttle", "Throttle and output stage opening", 0),
-        {"throttle": "Throttle", "output_opening": "Opening"},
-    ),
+    Plot("temperature", "Temperature", 0, {"power_stage_temperature": "Power stage", "bec_temperature": "BEC"}),
+    Plot("throttle", "Throttle and output stage opening", 0, {"throttle": "Throttle", "output_opening": "Opening"}),
     Plot("pwm", "PWM input", 0, {"pwm_input": "PWM input"}),
     Plot("bec_voltage", "BEC voltage", 3, {"bec_voltage": "BEC voltage"}),
     Plot("bec_current", "BEC current", 3, {"bec_current": "BEC current"}),
 )
+# fmt: on
 
 MAXIMA = {
     "battery_power": ("Battery power", 0),

@@ -1,5 +1,6 @@
 """The numbers of a flight as HTML: tiles with the most important ones, and tables with a column for each ESC."""
 
+from collections.abc import Mapping
 from html import escape
 
 from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Flight
@@ -8,8 +9,6 @@ from kontronik_can_gw.desk.report.text import clock, duration, number
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
 
-Group = dict[str, str | None]
-"""HTML of a value by its label; None where it is not known."""
 _EXTREMES = (
     ("Peak power", "battery_power", 0),
     ("Peak battery current", "battery_current", 1),
@@ -51,37 +50,32 @@ def tiles(flight: Flight) -> str:
 
 def tables(flight: Flight) -> str:
     """A table for each group: a row for each number, a column for each ESC; unknown numbers are left out."""
-    names = [escape(esc.name) for esc in flight.escs]
-    heads = "".join(f'<th scope="col">{name}</th>' for name in names)
-    head = f"<thead><tr><td></td>{heads}</tr></thead>" if len(names) > 1 else ""
+    heads = "".join(f'<th scope="col">{escape(esc.name)}</th>' for esc in flight.escs)
+    head = f"<thead><tr><td></td>{heads}</tr></thead>" if len(flight.escs) > 1 else ""
     of_escs = [_numbers(esc, flight) for esc in flight.escs]
     html = ""
     for title, labels in of_escs[0].items():
         rows = ""
         for label in labels:
             values = [groups[title][label] for groups in of_escs]
-            if any(value is not None for value in values):
-                cells = "".join(f"<td>{value or '–'}</td>" for value in values)
-                rows += f'<tr><th scope="row">{label}</th>{cells}</tr>'
+            cells = "".join(f"<td>{value or '–'}</td>" for value in values)
+            rows += f'<tr><th scope="row">{label}</th>{cells}</tr>' if any(values) else ""
         if rows:
             caption = f"<caption>{title}</caption>"
             html += f'<table class="numbers">{caption}{head}<tbody>{rows}</tbody></table>'
     return html
 
 
-def _numbers(esc: EscFlight, flight: Flight) -> dict[str, Group]:
-    """The numbers of an ESC by group."""
-    rest, load = esc.rest_voltage, esc.load_voltage
-    charge = _value(esc.counted.get("consumed_charge"), 0, "mAh")
+def _numbers(esc: EscFlight, flight: Flight) -> dict[str, dict[str, str | None]]:
+    """HTML of the numbers of an ESC by group and label; None where it is not known."""
+    rest, load, counted = esc.rest_voltage, esc.load_voltage, esc.counted
+    charge = _value(counted.get("consumed_charge"), 0, "mAh")
     if charge and esc.charge_resets:
         charge += f" (the counter began again: {esc.charge_resets})"
     energy = _value(_energy_wh(esc), 1, "Wh")
     if energy and esc.energy_drawn is not None:
         energy += f" (power integrated: {number(esc.energy_drawn, 2)} Wh)"
     share = 100 * esc.telemetry_ns / max(1, flight.end_ns - flight.start_ns)
-    losses, crc_errors, dropped = (
-        _value(esc.counted.get(source), 0) for source in ("losses", "crc_errors", "dropped_bytes")
-    )
     return {
         "Use": {
             "Motor turning": None if esc.turning_ns is None else _bold(duration(esc.turning_ns)),
@@ -90,29 +84,33 @@ def _numbers(esc: EscFlight, flight: Flight) -> dict[str, Group]:
             "Charge used": charge,
             "Mean power while turning": _value(esc.power_turning, 0, "W"),
         },
-        "Maxima": {
-            label: _extreme(esc.maxima.get(source), digits, VALUES[source].unit, flight)
-            for source, (label, digits) in MAXIMA.items()
-        },
+        "Maxima": _extremes(MAXIMA, esc.maxima, flight),
         "Voltages": {
-            label: _extreme(esc.minima.get(source), digits, VALUES[source].unit, flight)
-            for source, (label, digits) in MINIMA.items()
-        }
-        | {
+            **_extremes(MINIMA, esc.minima, flight),
             "At rest before the first load": _per_cell(rest, esc),
             "Lowest under load": load and f"{_per_cell(load.value, esc)} {_at(load, flight)}",
             "Sag": None if rest is None or load is None else _per_cell(rest - load.value, esc),
-            "Internal resistance (estimate)": _resistance(esc),
         },
         "Quality of the data": {
             "With telemetry": f"{_value(share, 2, '%')} ({duration(esc.telemetry_ns)})",
             "Gaps": _bold(str(esc.gaps)),
             "Longest gap": duration(esc.longest_gap_ns) if esc.gaps else None,
-            "Losses of the link": losses,
-            "CRC errors": crc_errors,
-            "Bytes dropped": dropped,
+            "Losses of the link": _value(counted.get("losses"), 0),
+            "CRC errors": _value(counted.get("crc_errors"), 0),
+            "Bytes dropped": _value(counted.get("dropped_bytes"), 0),
         },
     }
+
+
+def _extremes(
+    quantities: Mapping[str, tuple[str, int]], found: Mapping[str, Extreme], flight: Flight
+) -> dict[str, str | None]:
+    def shown(source: str, digits: int) -> str | None:
+        extreme = found.get(source)
+        unit = VALUES[source].unit
+        return extreme and f"{_value(extreme.value, digits, unit)} {_at(extreme, flight)}"
+
+    return {label: shown(source, digits) for source, (label, digits) in quantities.items()}
 
 
 def _tile(label: str, value: str, aside: str = "", kind: str = "") -> str:
@@ -135,10 +133,6 @@ def _value(value: float | None, digits: int, unit: str = "") -> str | None:
     return None if value is None else f"{_bold(number(value, digits))} {unit}".rstrip()
 
 
-def _extreme(found: Extreme | None, digits: int, unit: str, flight: Flight) -> str | None:
-    return found and f"{_value(found.value, digits, unit)} {_at(found, flight)}"
-
-
 def _energy_wh(esc: EscFlight) -> float | None:
     """By the gateway's counter; integrated where there is none."""
     return esc.counted.get("energy_used", esc.energy_drawn)
@@ -148,15 +142,3 @@ def _per_cell(voltage: float | None, esc: EscFlight) -> str | None:
     if voltage is None or not esc.cells:
         return _value(voltage, 2, "V")
     return f"{_value(voltage / esc.cells, 3, 'V a cell')} ({number(voltage, 2)} V)"
-
-
-def _resistance(esc: EscFlight) -> str | None:
-    if esc.resistance is None:
-        return None
-    value, spread, stretches = (
-        1000 * esc.resistance.value,
-        1000 * esc.resistance.spread,
-        esc.resistance.stretches,
-    )
-    a_cell = f" ({number(value / esc.cells, 2)} mΩ a cell)" if esc.cells else ""
-    return f"{_bold(number(value, 1))} ± {number(spread, 1)} mΩ{a_cell}, {stretches} stretches"

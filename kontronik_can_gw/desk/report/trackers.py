@@ -1,13 +1,13 @@
 """What happens to one ESC, found in columns of values chunk by chunk: gaps, link, device, operating states, errors."""
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.report.flight import EscFlight, Event, Kind, Segment
 from kontronik_can_gw.desk.report.quantities import STATE_CLASSES, UNKNOWN_CLASS, class_of
-from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, State
-from kontronik_can_gw.esc.telemetry import MS, LinkState
+from kontronik_can_gw.esc.decoder import EscProtocol, State
+from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import VALUES
 
 Columns = Mapping[str, Sequence[Any]]
@@ -15,7 +15,7 @@ Columns = Mapping[str, Sequence[Any]]
 MAX_EVENTS = 5000
 """Limit for each kind of event: more are only counted."""
 MAX_SEGMENTS = 4000
-"""Limit for the state segments of an ESC: beyond it, the shortest are left out."""
+"""Limit for the state segments of an ESC: later ones are left out."""
 _WORD_BITS = 32
 _LINK_TEXTS = {
     LinkState.DEGRADED: "Link degraded: many bytes are damaged",
@@ -62,16 +62,12 @@ class Changes:
     def __init__(self, last: Any = None) -> None:
         self._last = last
 
-    def of(self, values: Sequence[Any]) -> list[tuple[int, Any]]:
+    def of(self, values: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         """Row and new value of each change."""
-        if values.count(self._last) == len(values):
-            return []
-        found = []
-        for row, value in enumerate(values):
+        for row, value in enumerate(values if values.count(self._last) != len(values) else ()):
             if value != self._last:
                 self._last = value
-                found.append((row, value))
-        return found
+                yield row, value
 
 
 class Link:
@@ -154,7 +150,6 @@ class States:
         self._state: int | None = None
         self._since_ns = 0
         self._group: int | None = None
-        self._shortest_ns = 0
 
     def take(self, times: Sequence[int], columns: Columns) -> None:
         """Take rows."""
@@ -169,14 +164,9 @@ class States:
 
     def finish(self, time_ns: int) -> None:
         """Close the segment of the last state."""
-        length_ns = time_ns - self._since_ns
-        if self._state is None or length_ns < self._shortest_ns:
-            return
         segments = self._found.segments
-        segments.append(Segment(self._since_ns, time_ns, self._state))
-        while len(segments) > MAX_SEGMENTS:
-            self._shortest_ns = max(MS, 2 * self._shortest_ns)
-            segments[:] = [s for s in segments if s.end_ns - s.begin_ns >= self._shortest_ns]
+        if self._state is not None and len(segments) < MAX_SEGMENTS:
+            segments.append(Segment(self._since_ns, time_ns, self._state))
 
     def _change_class(self, state: int | None, time_ns: int) -> None:
         group = None if state is None else class_of(state, self._states)
@@ -208,7 +198,7 @@ class Errors:
             if word not in sources and bit.text in sources
         ]
         self.is_known = bool(self._words or self._flags)
-        self._set: set[tuple[str, int]] = set()
+        self._set: set[tuple[int, str, int]] = set()
 
     def take(self, times: Sequence[int], present: Sequence[Any], columns: Columns) -> None:
         """Take rows; ``present``: None where telemetry is lost."""
@@ -223,26 +213,23 @@ class Errors:
                 self._change(word, int(flag), value, times[row], lost=is_lost)
 
     def _change(self, word: str, bit: int, value: Any, time_ns: int, *, lost: bool) -> None:
-        key = (word, bit)
+        key = (self._esc, word, bit)
         if not value and key in self._set:
             self._set.remove(key)
-            self._events.end((self._esc, *key), time_ns, lost=lost)
+            self._events.end(key, time_ns, lost=lost)
         elif value and key not in self._set:
             known = next((one for one in self._bits[word] if one == bit), None)
-            if known is not None and known.is_normal:
-                return
-            self._set.add(key)
-            self._events.begin((self._esc, *key), self._event(known, word, bit, time_ns))
-
-    def _event(self, known: ErrorBit | None, word: str, bit: int, time_ns: int) -> Event:
-        if known is None:
-            return Event(
+            event = Event(
                 "error", self._esc, time_ns, f"bit {bit}, unknown to this program", "error"
             )
-        prefix = "self-test: " if word == "selftest_errors" else ""
-        remedy = str(getattr(known, "remedy", "") or "")
-        text, severity = prefix + known.meaning, known.severity.value
-        return Event("error", self._esc, time_ns, text, severity, remedy)
+            if known is not None:
+                event.text, event.severity = known.meaning, known.severity.value
+                event.remedy = known.remedy
+                if word == "selftest_errors":
+                    event.text = f"self-test: {known.meaning}"
+            if known is None or not known.is_normal:
+                self._set.add(key)
+                self._events.begin(key, event)
 
 
 def state_name(number: int, states: Mapping[int, State]) -> str:

@@ -1,0 +1,232 @@
+"""Makes the tables of ``describe`` and of docs/reference. Nothing is defined here: each row is read from DBC, EDS, layout or definitions.
+
+Ids, indices and bit numbers are integers, times in ms. A physical value is raw * factor + offset.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import MISSING, fields
+from fractions import Fraction
+from pathlib import PurePath
+from typing import Any
+
+from kontronik_can_gw.canopen.dbc_names import pascal_case
+from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.config.keys import TABLES, shipped
+from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
+from kontronik_can_gw.desk.describe.markdown import Row, Table
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, State
+from kontronik_can_gw.esc.protocols import protocol_named
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.signals.plan import MessagePlan, Role, SendType, SignalPlan
+
+_AVAILABLE = {
+    Group.LIVE: "with fresh live data",
+    Group.INFO: "with info of the present device",
+    Group.LINK: "always",
+    Group.GATEWAY: "always",
+}
+_SEND_TYPES = {SendType.CYCLIC: "cyclic", SendType.EVENT: "event", SendType.ON_CHANGE: "on change"}
+
+
+# --- configuration
+
+
+def configuration() -> list[Table]:
+    """The keys of the TOML configuration."""
+    return [
+        Table(f"[[{name}]]" if name == "esc" else f"[{name}]", [kind.__doc__ or ""], _keys(kind))
+        for name, kind in TABLES.items()
+    ]
+
+
+def _keys(kind: Any) -> list[Row]:
+    rows = []
+    for f in fields(kind):
+        default = f.default if f.default_factory is MISSING else None
+        if isinstance(default, bool | Fraction):
+            default = str(default).lower()
+        shown = "required" if default is MISSING else None if default == () else default
+        rows.append(
+            {"key": f.name, "range": f.metadata["kind"].span, "default": shown}
+            | {"meaning": f.metadata["doc"]}
+        )
+    return rows
+
+
+# --- DBC
+
+
+def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
+    """Messages that the gateway sends, and their signals."""
+    found = {message.name: message for message in bus.database.messages}
+    plans = [(plan, found[plan.name]) for plan in bus.layout.messages]
+    comment = next((each.comment for each in bus.database.buses if each.comment), "")
+    file = f"{PurePath(bus.layout.file).name}, messages of {bus.layout.node}."
+    signals = [
+        {"message": plan.name, **_signal(signal, message.get_signal_by_name(signal.name), escs)}
+        for plan, message in plans
+        for signal in plan.signals
+    ]
+    return [
+        Table("Messages", [file, _line(comment)], [_message(*pair) for pair in plans]),
+        Table("Signals", [_SIGNALS], signals, by="message"),
+    ]
+
+
+_SIGNALS = "start counts as in DBC files; not available and error are raw values; page is the value of the multiplexer."
+
+
+def _message(plan: MessagePlan, message: Any) -> Row:
+    """A message. None: no cycle, or no minimum distance between two frames (``delay_ms``)."""
+    return {
+        "name": plan.name,
+        "id": plan.can_id,
+        "extended": plan.extended,
+        "fd": plan.fd,
+        "bytes": plan.length,
+        "sent": [word for flag, word in _SEND_TYPES.items() if flag in plan.send_type],
+        "cycle_ms": number(Fraction(plan.cycle_ns, MS)) or None,
+        "delay_ms": number(Fraction(plan.delay_ns, MS)) or None,
+        "meaning": _line(message.comment),
+    }
+
+
+def _signal(plan: SignalPlan, signal: Any, escs: Sequence[EscSettings]) -> Row:
+    """A signal. ``min`` and ``max`` are those of the DBC, else of what can be sent; ``shows``: the value, or the role of the bits."""
+    flag = plan.length == 1 and not plan.signed and plan.factor == 1 and plan.offset == 0
+    codes: tuple[int | None, int | None] = plan.not_available, plan.error
+    if plan.role is not Role.SOURCE or (flag and plan.numbers is None):
+        codes = (None, None)
+    limits = plan.limits if plan.is_float else (plan.low, plan.high)
+    low, high = sorted(float(raw * plan.factor + plan.offset) for raw in limits)
+    kind = "float" if plan.is_float else "signed" if plan.signed else "unsigned"
+    choices = {int(value): str(word) for value, word in (signal.choices or {}).items()}
+    notes = [f"{note[:1].upper()}{note[1:]}." for note in plan.notes]
+    several = plan.esc is not None and len(escs) > 1
+    return {
+        "signal": plan.name,
+        "start": signal.start,
+        "bits": plan.length,
+        "type": "flag" if flag else kind,
+        "big_endian": signal.byte_order == "big_endian",
+        "page": plan.page,
+        "factor": number(plan.factor),
+        "offset": number(plan.offset) or None,
+        "min": _finite(low if signal.minimum is None else signal.minimum),
+        "max": _finite(high if signal.maximum is None else signal.maximum),
+        "unit": plan.unit,
+        "not_available": codes[0],
+        "error": codes[1],
+        "shows": plan.role.value if plan.source is None else plan.source.name,
+        "esc": escs[plan.esc or 0].name if several else None,
+        "meaning": " ".join(filter(None, [_line(signal.comment), *notes])),
+        "names": {value: choices[value] for value in sorted(choices) if value not in codes},
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+# --- values, errors, states
+
+
+def values(escs: Sequence[EscSettings]) -> list[Table]:
+    """Every value that a signal or object can show; errors, states and devices."""
+    meanings = meanings_of(escs)
+    sources = [binding.source for binding in BINDINGS.values()]
+    others = {source.name: source for source in sources if source.name not in VALUES}
+    rows = [
+        {
+            "name": name,
+            "unit": value.unit,
+            "available": _AVAILABLE[value.group] + (", where supplied" if value.optional else ""),
+            "counter": value.rolls,
+            "objects": [_key(key) for key, each in BINDINGS.items() if each.source.name == name],
+            "only_objects": name in others,
+            "meaning": meanings.get(name, name.replace("_", " ").capitalize()),
+            "names": {int(key): word for key, word in value.names.items()},
+        }
+        for name, value in {**VALUES, **others}.items()
+    ]
+    protocols = protocols_of(escs)
+    operating = [(n, state.text, state) for p in protocols for n, state in p.states.items()]
+    return [
+        Table("Values", [_VALUES], rows),
+        _errors("Operating errors", "Bits of each live frame.", protocols),
+        _errors("Selftest errors", "Bits of the info frame, about once a second.", protocols),
+        _states("Operating", operating),
+        Table("Devices", [], [_device(p, device) for p in protocols for device in p.devices]),
+        _states("Link", [(n, pascal_case(n.name), state) for n, state in LINK_STATES.items()]),
+        _states("CAN", [(n, pascal_case(n.name), state) for n, state in CAN_STATES.items()]),
+        _states(
+            "Gateway", [(n, pascal_case(n.name), state) for n, state in GATEWAY_STATES.items()]
+        ),
+    ]
+
+
+_VALUES = "What a signal of a DBC of your own can be bound to, by its name or under [dbc.bind]; the signal's unit may be another."
+
+
+def _key(key: tuple[int, int]) -> str:
+    return f"{key[0]:04X}h:{key[1]:02X}"
+
+
+def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> Table:
+    word = title.lower().replace(" ", "_")
+    rows = [
+        {"bit": int(bit), "name": bit.text, "severity": bit.severity.value, **_about(bit)}
+        for protocol in protocols
+        for bit in protocol.errors.get(word, ())
+    ]
+    return Table(title, [text], rows)
+
+
+def _states(title: str, states: Iterable[tuple[int, str, Text | State]]) -> Table:
+    rows = [{"value": int(n), "name": name, **_about(state)} for n, name, state in states]
+    return Table(f"{title} states", [], rows)
+
+
+def _about(of: Text | State | ErrorBit) -> Row:
+    return {"meaning": of.meaning, "remedy": of.remedy}
+
+
+def _device(protocol: EscProtocol, device: int) -> Row:
+    """A kind of ESC; ``peak_current_of`` None: not known of what."""
+    live = [field for field in protocol.fields if not field.is_info]
+    return {
+        "value": device,
+        "name": protocol.devices[device],
+        "peak_current_of": protocol.peak_current_of.get(device),
+        "not_supplied": [field.name for field in live if device in field.not_on],
+    }
+
+
+def protocols_of(escs: Sequence[EscSettings]) -> list[EscProtocol]:
+    return list(dict.fromkeys(protocol_named(esc.protocol) for esc in escs))
+
+
+def meanings_of(escs: Sequence[EscSettings]) -> dict[str, str]:
+    """Meaning of each value: of a flag that of the bit, else the comment of the shipped signal bound to it."""
+    shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    found = {
+        plan.source.name: _line(
+            shown.database.get_message_by_name(m.name).get_signal_by_name(plan.name).comment
+        )
+        for m in shown.layout.messages
+        for plan in m.signals
+        if plan.source is not None
+    }
+    return found | {bit.text: bit.meaning for p in protocols_of(escs) for bit in p.bits.values()}
+
+
+def number(value: Fraction) -> int | float:
+    """A number as JSON has it."""
+    return value.numerator if value.denominator == 1 else float(value)
+
+
+def _line(comment: object) -> str:
+    return " ".join(str(comment or "").split())

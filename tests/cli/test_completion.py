@@ -1,0 +1,62 @@
+"""The completion scripts, made of the command line's parser, as the shells read them."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from command_line import run
+
+from kontronik_can_gw.cli import COMMANDS
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The script for bash, in a folder with some files."""
+    done = run("completion", "bash")
+    assert (done.code, done.err) == (0, "")
+    folder = tmp_path_factory.mktemp("completion")
+    for name in ("car.toml", "car.dbc", "car.bin"):
+        (folder / name).touch()
+    (folder / "script.bash").write_bytes(done.data)
+    return folder / "script.bash"
+
+
+ASKED = r"""
+    source "$0"
+    function=$(complete -p kontronik-can-gw | sed 's/.*-F \([^ ]*\).*/\1/')
+    COMP_WORDS=(kontronik-can-gw $1); COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); COMP_LINE="kontronik-can-gw $1"; COMP_POINT=${#COMP_LINE}
+    "$function" kontronik-can-gw "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
+    printf '%s\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("des", {"describe"}),
+        ("service st", {"status"}),
+        ("service status --l", {"--lines"}),
+        ("describe --dbc car.dbc --format j", {"json"}),
+        ("describe --dbc car", {"car.dbc"}),
+        ("run -c car", {"car.toml"}),
+        ("decode car", {"car.toml", "car.dbc", "car.bin"}),
+    ],
+)
+def test_bash_completes_commands_options_choices_and_files_of_the_right_kind(
+    script: Path, typed: str, offered: set[str]
+) -> None:
+    command = ["bash", "--norc", "-c", ASKED, str(script), typed]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=True, cwd=script.parent
+    )
+    assert set(done.stdout.split()) == offered
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_there_is_a_script_for_each_shell(shell: str) -> None:
+    done = run("completion", shell)
+    assert (done.code, done.err) == (0, "")
+    assert all(command in done.out for command in COMMANDS)
+    if interpreter := shutil.which(shell):
+        subprocess.run([interpreter, "-n"], input=done.data, check=True, timeout=60)

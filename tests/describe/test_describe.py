@@ -1,0 +1,296 @@
+"""The description is complete and true, as cantools and canopen read the same files; whatever they hold is shown as text."""
+
+import json
+from enum import IntEnum
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import canopen
+import cantools.database
+import pytest
+from canopen.objectdictionary import ODVariable
+from command_line import run
+from described import DBC, EDS, NASTY, NASTY_NAME, NASTY_UNIT, TWO_ESCS, configuration, nasty
+from described import described as text_of
+from hypothesis import example, given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+
+from kontronik_can_gw.canopen.data_types import TYPE_NAMES
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
+from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
+from kontronik_can_gw.desk.describe.markdown import Table, markdown
+from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.telemetry import LinkState
+from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.gateway_status import CanState, GatewayState
+
+Facts = dict[str, Any]
+
+
+def facts_of(*words: object) -> Facts:
+    found = json.loads(text_of(*words, "--format", "json"))
+    assert isinstance(found, dict)
+    return found
+
+
+@pytest.fixture(scope="module")
+def facts() -> Facts:
+    """The description of what is shipped."""
+    return facts_of()
+
+
+def holds(found: Facts, **expected: object) -> None:
+    assert {name: found[name] for name in expected} == expected
+
+
+# --- texts
+
+
+@pytest.mark.parametrize("kind", [OperatingError, SelfTestError, OperatingState, GatewayError])
+def test_each_error_and_state_has_a_meaning_of_its_own_and_a_remedy(kind: Any) -> None:
+    assert all(each.meaning.strip() == each.meaning != "" for each in kind)
+    assert all(each.remedy.endswith(".") for each in kind)
+    assert len({each.meaning for each in kind}) == len(kind)
+
+
+@pytest.mark.parametrize(
+    ("texts", "states"),
+    [(LINK_STATES, LinkState), (CAN_STATES, CanState), (GATEWAY_STATES, GatewayState)],
+)
+def test_each_state_of_line_controller_and_gateway_has_a_meaning_and_a_remedy(
+    texts: dict[IntEnum, tuple[str, str]], states: type[IntEnum]
+) -> None:
+    assert list(texts) == list(states)
+    assert all(meaning and remedy.endswith(".") for meaning, remedy in texts.values())
+
+
+# --- tables, as JSON
+
+
+def test_messages_and_signals_are_those_that_cantools_reads(facts: Facts) -> None:
+    database = cantools.database.load_file(DBC)
+    assert isinstance(database, cantools.database.Database)
+    told = {message["name"]: message for message in facts["messages"]}
+    rows = {(row["message"], row["signal"]): row for row in facts["signals"]}
+    assert set(told) == {message.name for message in database.messages}
+    assert set(rows) == {(m.name, signal.name) for m in database.messages for signal in m.signals}
+    for message in database.messages:
+        assert message.dbc is not None
+        holds(
+            told[message.name],
+            id=message.frame_id,
+            bytes=message.length,
+            meaning=message.comment,
+            extended=message.is_extended_frame,
+            fd=message.is_fd,
+            cycle_ms=message.cycle_time or None,
+            delay_ms=message.dbc.attributes["GenMsgDelayTime"].value or None,
+        )
+        assert ("cyclic" in told[message.name]["sent"]) == ("Cyclic" in str(message.send_type))
+        for signal in message.signals:
+            found = rows[message.name, signal.name]
+            names: dict[Any, Any] = {
+                str(text): int(number) for number, text in (signal.choices or {}).items()
+            }
+            holds(
+                found,
+                start=signal.start,
+                bits=signal.length,
+                big_endian=signal.byte_order == "big_endian",
+                unit=signal.unit or "",
+                factor=signal.scale,
+                offset=signal.offset or None,
+                min=signal.minimum,
+                max=signal.maximum,
+                not_available=names.pop("NotAvailable", None),
+                error=names.pop("Error", None),
+                names={str(number): text for text, number in names.items()},
+            )
+            assert (found["type"] == "signed") == signal.is_signed
+            assert found["meaning"].startswith(signal.comment)
+
+
+def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
+    dictionary: Any = canopen.import_od(str(EDS), node_id=0)
+    told = {row["object"]: row for row in facts["objects"]}
+    variables: dict[str, Any] = {
+        f"{index:04X}h:{sub:02X}": (item, variable)
+        for index, item in dictionary.items()
+        for sub, variable in (
+            {0: item} if isinstance(item, ODVariable) else item.subindices
+        ).items()
+    }
+    assert set(told) == set(variables)
+    for place, (item, variable) in variables.items():
+        found = told[place]
+        holds(
+            found,
+            access=variable.access_type,
+            type=TYPE_NAMES[variable.data_type],
+            pdo=variable.pdo_mappable,
+            min=variable.min,
+            max=variable.max,
+            node_id=variable.relative,
+            default=None if found["shows"] else variable.default,
+        )
+        assert found["name"].startswith(item.name) and found["name"].endswith(variable.name)
+
+
+def test_the_node_has_the_cob_ids_and_pdos_that_canopen_computes(facts: Facts) -> None:
+    ids = {row["cob_id"] for row in facts["cob-ids"] if row["node"] == "esc1, 1"}
+    assert {0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x601, 0x701} <= ids
+    dictionary: Any = canopen.import_od(str(EDS), node_id=1)
+    tried: dict[int, int] = {n: dictionary[0x1800 + n][1].default for n in range(6)}
+    assert {pdo["TPDO"] - 1: pdo["cob_id"] for pdo in facts["tpdos"]} == {
+        number: cob_id & 0x7FF for number, cob_id in tried.items() if not cob_id >> 31
+    }
+    for pdo in facts["tpdos"]:
+        parameters, mapping = dictionary[0x17FF + pdo["TPDO"]], dictionary[0x19FF + pdo["TPDO"]]
+        kind, inhibit, timer = (parameters[sub].default for sub in (2, 3, 5))
+        holds(pdo, type=kind, inhibit_ms=inhibit / 10, event_ms=timer)
+        mapped = [mapping[sub].default for sub in range(1, mapping[0].default + 1)]
+        named = [f"{m >> 16:04X}h:{m >> 8 & 0xFF:02X}" for m in mapped]
+        assert [text.split()[0] for text in pdo["mapped"]] == named
+
+
+def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
+    told = facts["emergencies"]
+    of_esc = {e["byte3"]: e for e in told if e["byte3"] != "FFh"}
+    dictionary: Any = canopen.import_od(str(EDS))
+    mask = dictionary[0x2100][6].default
+    assert set(of_esc) == {str(bit) for bit in range(32) if mask >> bit & 1}
+    assert str(int(OperatingError.PROGRAMMING_ALLOWED)) not in of_esc
+    expected: set[tuple[int, int | None]] = {error.value for error in GatewayError} | {(0, 0)}
+    code, detail = GatewayError.HEARTBEAT_LOST.value
+    expected = expected - {(code, detail)} | {(code, None)}
+    assert {(e["code"], e["byte4"]) for e in told if e["byte3"] == "FFh"} == expected
+    assert all(e["meaning"] and e["remedy"].endswith(".") for e in told)
+    holds(of_esc["0"], code=0x3220, register=0b101, name="undervoltage")
+
+
+def test_each_value_has_a_meaning_and_its_objects(facts: Facts) -> None:
+    told = {row["name"]: row for row in facts["values"]}
+    assert {name for name, row in told.items() if not row["only_objects"]} == set(VALUES)
+    assert all(row["meaning"] for row in told.values())
+    holds(
+        told["battery_voltage"], objects=["2000h:02", "6079h:00"], available="with fresh live data"
+    )
+    assert told["undervoltage"]["meaning"] == OperatingError.UNDERVOLTAGE.meaning
+
+
+def test_of_two_escs_each_has_its_signals_and_cob_ids(tmp_path: Path, facts: Facts) -> None:
+    two = facts_of("-c", configuration(tmp_path, TWO_ESCS))
+    voltages = [row for row in two["signals"] if row["shows"] == "battery_voltage"]
+    assert [(row["esc"], row["message"], row["signal"]) for row in voltages] == [
+        ("left", "LeftSpeed", "LeftBatteryVoltage"),
+        ("right", "RightSpeed", "RightBatteryVoltage"),
+    ]
+    assert [pdo["cob_id"] for pdo in two["tpdos"] if pdo["node"] == "right, 21"] == [
+        0x180 + 21, 0x280 + 21, 0x380 + 21, 0x480 + 21,
+    ]  # fmt: skip
+    assert two["objects"] == facts["objects"]
+
+
+def test_a_node_that_waits_for_lss_has_no_cob_ids_of_its_own(tmp_path: Path) -> None:
+    text = '[canopen]\nenabled = true\nnode_id = 255\nstore = "s"\n[[esc]]\nport = "/dev/ttyUSB0"\n'
+    found = facts_of("-c", configuration(tmp_path, text))
+    assert found["tpdos"] == []
+    assert {row["use"] for row in found["cob-ids"]} == {"NMT", "LSS"}
+
+
+def test_without_a_dbc_and_nodes_there_are_values_and_the_faults(tmp_path: Path) -> None:
+    text = '[dbc]\nenabled = false\n[[esc]]\nport = "/dev/ttyUSB0"\n'
+    found = facts_of(
+        "-c", configuration(tmp_path, text + '[canopen]\nenabled = true\nstore = "s"\n')
+    )
+    assert "signals" not in found and found["objects"] and found["values"]
+    found = facts_of("-c", configuration(tmp_path, '[[esc]]\nport = "/dev/ttyUSB0"\n'))
+    assert "objects" not in found
+    assert {e["byte3"] for e in found["emergencies"]} == {"FFh"}
+
+
+def test_the_same_files_give_the_same_text_without_a_path(tmp_path: Path) -> None:
+    file = tmp_path / "x.json"
+    assert run("describe", "--format", "json", "-o", file).code == 0
+    assert file.read_text(encoding="utf-8") == text_of("--format", "json")
+    assert str(DBC.parent) not in file.read_text(encoding="utf-8")
+
+
+# --- the document, read back by a parser that knows nothing of us
+
+
+class Page(HTMLParser):
+    """The texts of a page by the tag that they stand in."""
+
+    def __init__(self, markdown_text: str) -> None:
+        super().__init__()
+        self.texts: dict[str, list[str]] = {}
+        self._tag = ""
+        parser = MarkdownIt("commonmark").enable("table").enable("strikethrough")
+        raw = [
+            t.content
+            for token in parser.parse(markdown_text)
+            for t in (token, *(token.children or ()))
+            if "html" in t.type
+        ]
+        assert set(raw) <= {"<!-- -->"}, "nothing that is HTML in the source may come through"
+        self.feed(parser.render(markdown_text).replace("<!-- -->", ""))
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._tag = tag
+        self.texts.setdefault(tag, []).append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._tag = ""
+
+    def handle_data(self, data: str) -> None:
+        if self._tag:
+            self.texts[self._tag][-1] += data
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def test_every_text_of_the_tables_is_in_the_document(facts: Facts) -> None:
+    cells = {text for texts in Page(text_of()).texts.values() for text in texts}
+    for rows in facts.values():
+        for row in rows if isinstance(rows, list) else ():
+            assert {one_line(text) for text in row.values() if isinstance(text, str)} <= cells, row
+
+
+def test_markup_in_a_dbc_or_eds_is_shown_as_text(tmp_path: Path) -> None:
+    found = Page(text_of("-c", nasty(tmp_path))).texts
+    assert found.keys() == Page(text_of()).texts.keys()
+    comment = one_line(NASTY.replace("\\", "/"))
+    assert comment in found["p"]
+    assert NASTY_UNIT in found["td"]
+    assert any(text.startswith(comment) for text in found["td"])
+    assert any(text.startswith(NASTY_NAME) for text in found["td"])
+    assert "Foreign" not in found["h3"]
+
+
+texts = st.text(
+    st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=40
+)
+markup = st.text(st.sampled_from("|`*_[]()<>&\\#-+.!~=$:/1a \n\t\"'"), max_size=24)
+words = st.one_of(texts, markup)
+
+
+@given(words, words, words)
+@example("a|b", "`|`", "www.x.org")
+@example("1.", "1) x", "- x")
+@example("#", "x ##", "# x")
+@example("_a_", "a_b_c", "\\|")
+@example("&lt;", "<!--", "]]>")
+def test_any_text_comes_back_as_it_is(title: str, paragraph: str, cell: str) -> None:
+    table = Table(f"T {title}", [paragraph], [{"one": cell, "two": "x"}, {"one": "y", "two": ""}])
+    found = Page(markdown("All", [], [table])).texts
+    assert one_line(found["h2"][0]) == one_line(f"T {title}")
+    assert [one_line(text) for text in found.get("p", [])] == [one_line(paragraph)][
+        : bool(one_line(paragraph))
+    ]
+    assert [one_line(text) for text in found["td"]] == [one_line(cell), "x", "y", ""]

@@ -1,0 +1,63 @@
+"""The pages of docs/reference, made from their sources. ``make docs`` writes them."""
+
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from pathlib import Path
+
+from kontronik_can_gw.cli import COMMANDS
+from kontronik_can_gw.cli.arguments import Option, Rows
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
+from kontronik_can_gw.desk.describe.markdown import Row, Table, markdown
+from kontronik_can_gw.desk.describe.tables import configuration, dbc, values
+from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "reference"
+LEAD = "Made by make docs: change the sources, not this page."
+
+
+def pages() -> Iterator[tuple[str, str]]:
+    """Name and text of each page."""
+    bus, canopen = layout_of_dbc(shipped("dbc/kontronik_esc.dbc")), shipped_canopen([1])
+    made = {
+        "configuration": ("Configuration", configuration()),
+        "dbc": ("The shipped DBC", dbc(bus, bus.escs)),
+        "objects": ("CANopen objects of the shipped EDS", objects(canopen, bus.escs)),
+        "emergencies": ("CANopen emergencies", emergencies(canopen.eds, bus.escs)),
+        "values": ("Values, errors and states", values(bus.escs)),
+        "commands": ("Commands", list(_commands())),
+    }
+    for name, (title, tables) in made.items():
+        yield f"{name}.md", markdown(title, [LEAD], tables)
+
+
+def _commands() -> Iterator[Table]:
+    for name, line in COMMANDS.items():
+        module = import_module(f"kontronik_can_gw.cli.{name}")
+        text = [f"{line[:1].upper()}{line[1:]}."]
+        yield Table(name, text + module.EPILOG.split("\n\n"), list(_options(module.OPTIONS)))
+        for action, (about, options) in getattr(module, "ACTIONS", {}).items():
+            yield Table(f"{name} {action}", [about], list(_options(options)))
+
+
+def _options(rows: Rows) -> Iterable[Row]:
+    for row in rows:
+        if isinstance(row, Option):
+            typed, value = ", ".join(row.names), row.settings.get("metavar")
+            if value and typed.startswith("-"):
+                typed += f" {value}"
+            yield {
+                "option": value if value and not typed.startswith("-") else typed,
+                "choices": list(row.settings.get("choices") or ()),
+                "required": bool(row.settings.get("required")),
+                "meaning": row.settings["help"].replace("%%", "%"),
+            }
+        elif not isinstance(row, str):
+            yield from _options(row)
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    for name, text in pages():
+        (FOLDER / name).write_text(text, encoding="utf-8")
