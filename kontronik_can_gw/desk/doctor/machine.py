@@ -11,7 +11,7 @@ from kontronik_can_gw.desk.doctor.findings import Finding, Findings
 from kontronik_can_gw.desk.doctor.service import Unit, check_service
 from kontronik_can_gw.desk.doctor.system import System
 
-_PACKAGES = ("python-can", "canopen", "pyserial", "cantools", "rich")
+_PACKAGES = ("python-can", "pyserial", "cantools", "rich")
 _FIRST_YEAR = 2024
 _MIN_MEMORY_KB = 64 * 1024
 _FREQUENCY = "/sys/devices/system/cpu/cpu0/cpufreq"
