@@ -22,6 +22,9 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
     ("status", "--once"): "Leave it out: the state is shown once. watch kontronik-can-gw status shows it again and again.",
     ("status", "--interval"): "Type watch -n S kontronik-can-gw status.",
+    ("mqtt", "--remove-discovery"):
+        "Type mosquitto_sub -h BROKER -W 2 --remove-retained -t homeassistant/device/kontronik_GATEWAY/config, and for "
+        "each ESC -t homeassistant/device/kontronik_GATEWAY_ESC/config.",
     ("report", "--to"): "Type --until S.",
 }
 # fmt: on

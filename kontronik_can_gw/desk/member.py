@@ -65,12 +65,13 @@ class Member:
             for group in Group
         }
         """Those of each group."""
-        self._factors: dict[str, tuple[float, float]] = {}
+        self.factors: dict[str, tuple[float, float]] = {}
+        """Factor and offset of the values whose signal has another unit than their source."""
         for name, at in self.columns.items():
             unit = VALUES[name].unit
             factor, offset = units.conversion(view.reader.columns[at].unit or unit, unit) or (1, 0)
             if (factor, offset) != (1, 0):
-                self._factors[name] = float(factor), float(offset)
+                self.factors[name] = float(factor), float(offset)
 
     def has(self, *sources: str) -> bool:
         """True where the DBC has a signal for one of the sources."""
@@ -85,8 +86,8 @@ class Member:
         """A signal's value in the unit of its source; infinity, which a float signal can hold, is none."""
         if value is None or isinstance(value, str):
             return value
-        if source in self._factors:
-            factor, offset = self._factors[source]
+        if source in self.factors:
+            factor, offset = self.factors[source]
             value = round(value * factor + offset, 9)
         return value if math.isfinite(value) else None
 
