@@ -20,7 +20,6 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
     ("service", "--force"): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
-    ("status", "--once"): "Leave it out: the state is shown once. watch kontronik-can-gw status shows it again and again.",
     ("status", "--interval"): "Type watch -n S kontronik-can-gw status.",
     ("mqtt", "--remove-discovery"):
         "Type mosquitto_sub -h BROKER -W 2 --remove-retained -t homeassistant/device/kontronik_GATEWAY/config, and for "

@@ -107,8 +107,10 @@ class MqttClient:
                 # a key with a passphrase would ask for it on the terminal
                 client.tls_set(*files, keyfile_password="")
             except (OSError, ValueError) as error:
-                text = f"no certificate in PEM form, with its key (without passphrase): {error}"
-                raise OSError(f"{', '.join(filter(None, files))}: {text}") from None
+                why = getattr(error, "strerror", None) or error
+                raise OSError(
+                    f"{', '.join(filter(None, files))}: {why}. Certificates must be in PEM form, keys without passphrase."
+                ) from None
         if config.password_file is not None:
             password(config.password_file)
         # random, for the sake of a broker of many gateways
