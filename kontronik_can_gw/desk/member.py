@@ -160,8 +160,8 @@ class Member:
             return None
         number = int(whole or 0)
         found = [flag_of(bit) for bit in bits if number >> bit & 1 or values[bit] == 1]
-        for bit in set(range(32)).difference(bits):
-            if number >> bit & 1:
+        for bit in range(32):
+            if number >> bit & 1 and bit not in columns:
                 meaning = f"bit {bit} of {word}, which has no name"
                 found.append(Flag(f"bit{bit}", Severity.WARNING, meaning))
         return found if has_others else found or None

@@ -10,8 +10,13 @@ from kontronik_can_gw.desk.member import Flag
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.printable import printable
 
-LINKS = {"ok": "green", "degraded": "yellow", "-": "dim"}
-"""Styles of link states; any other is bad."""
+STATES = {
+    **dict.fromkeys(("ok", "error-active", "running"), "green"),
+    **dict.fromkeys(("degraded", "error-warning", "error-passive"), "yellow"),
+    "unknown": "",
+    "-": "dim",
+}
+"""Styles of states of a link, a CAN controller and a gateway; any other is bad."""
 _KINDS = {Severity.ERROR: ("ERROR", "bold red"), Severity.WARNING: ("WARNING", "yellow")}
 
 Part = str | tuple[str, str] | Text

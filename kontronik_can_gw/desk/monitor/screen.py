@@ -8,7 +8,7 @@ from rich.text import Text
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.member import Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
-    LINKS,
+    STATES,
     Part,
     alarm_lines,
     cut,
@@ -99,8 +99,7 @@ def _title(monitor: Monitor, source: Source) -> Text:
     made = line((f" {source.name} ", "bold reverse"))
     made.append(f"  {source.progress}" if source.is_file else f"  {monitor.file}", "dim")
     if (state := monitor.gateway.text("gateway_state")) is not None:
-        style = "green" if normalize(state) == "running" else "yellow"
-        made = line(made, "  gateway ", (words(state), style))
+        made = line(made, "  gateway ", (words(state), STATES.get(words(state), "yellow")))
     can_state = monitor.gateway.text("can_state") or "unknown"
     if normalize(can_state) not in ("unknown", "erroractive"):
         made = line(made, (f"  CAN {words(can_state)}", "yellow"))
@@ -122,7 +121,7 @@ def _link_part(esc: Esc) -> Part:
         link = words(esc.link)
     rate = esc.number("frame_rate")
     text = link if rate is None or link != "ok" else f"ok {rate:.0f} Hz"
-    return text, LINKS.get(link, "bold red")
+    return text, STATES.get(link, "bold red")
 
 
 def _state_part(esc: Esc) -> Part:

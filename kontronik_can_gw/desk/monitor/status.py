@@ -11,7 +11,7 @@ from rich.text import Text
 
 from kontronik_can_gw.desk.member import Flag, alarms_of, flag_of
 from kontronik_can_gw.desk.monitor.lines import (
-    LINKS,
+    STATES,
     Part,
     alarm_lines,
     line,
@@ -35,12 +35,6 @@ FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a document with values of another type raises."""
 _WIDTH = 80
-_CAN_STYLES = {
-    "error-active": "green",
-    "unknown": "",
-    "error-warning": "yellow",
-    "error-passive": "yellow",
-}
 _WIDTHS = {"ESC": 3, "link": 10, "Hz": 3, "age": 6, "V": 5, "A": 6, "1/min": 6, "°C": 3, "CRC": 5, "line": 4, "lost": 4}  # fmt: skip
 """Heads and widths of the table's columns."""
 
@@ -105,12 +99,13 @@ def judge(file: Path, document: Any, now: int) -> Seen:
 
 def _judge(file: Path, document: Document, now: int) -> Seen:
     age = now - document["monotonic_ns"]
-    age_s, troubles = age / SECOND, tuple(map(printable, _troubles(document)))
+    age_s = age / SECOND
     if age < -STALE_NS or not _is_alive(document["process"]):  # or the machine restarted since
         return Seen(file, NOT_RUNNING, "not running", (), age_s, document)
     if age > STALE_NS:
         text = f"does not answer since {duration(age)} (stopped, or the disk of its file is full)"
         return Seen(file, NOT_RUNNING, text, (), age_s, document)
+    troubles = tuple(map(printable, _troubles(document)))
     sentence = printable(document["gateway"]["state"])
     if troubles:
         sentence += f", {len(troubles)} fault{'s' if len(troubles) > 1 else ''}"
@@ -203,8 +198,8 @@ def _can_lines(document: Document) -> Iterator[Text]:
         text += f", {name} {number(rates.get(f'{name}_frames_per_s'))}/s"
     if errors := can["error_counters"]:
         text += f", error counters {errors[0]:.0f}/{errors[1]:.0f}"
-    style = _CAN_STYLES.get(can["state"], "bold red")
-    yield line(f"CAN {can['channel']}: ", (can["state"], style), text)
+    state = can["state"], STATES.get(can["state"], "bold red")
+    yield line(f"CAN {can['channel']}: ", state, text)
     shown = {"sent_frames": "sent", "dropped_frames": "dropped", "send_failures": "send failures"}
     shown |= {"bus_off_count": "bus-off", "id_conflicts": "id conflicts"}
     counts = ", ".join(f"{number(can['counters'][key])} {what}" for key, what in shown.items())
@@ -222,7 +217,7 @@ def _esc_rows(document: Document) -> Iterator[list[Part]]:
         )
         yield [
             esc["name"][:12],
-            (words(link)[:10], LINKS.get(link, "") if esc["fresh"] else "bold red"),
+            (words(link)[:10], STATES.get(link, "bold red") if esc["fresh"] else "bold red"),
             number(esc["frame_rate_hz"]),
             "-" if age is None else f"{age:.0f} ms" if age < 1000 else duration(round(age * MS)),
             number(values["battery_voltage"], 2),

@@ -22,7 +22,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 
 REFRESH_S = 0.15
-_QUIT = ("q", "\x03", "\x04", "")
+_QUIT = ("q", "\x03", "\x04")
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
@@ -55,8 +55,9 @@ def _live(
             source.pump(monitor.take, min(due, now + 0.1))
             monitor.advance(source.now())
             if fd is not None and select.select([fd], [], [], 0)[0]:
-                key = os.read(fd, 64).decode("ascii", "ignore").lower()
-                if key in _QUIT:  # or the terminal is closed
+                typed = os.read(fd, 64)
+                key = typed.decode("ascii", "ignore").lower()
+                if not typed or key in _QUIT:  # nothing: the terminal is closed
                     return
                 page, due = obey(key, source, monitor, page), now
 
