@@ -68,7 +68,7 @@ ONLY_IN = {
     "asammdf": ("desk",),
     "paho": ("desk",),
     "shtab": ("cli",),
-    "canopen": ("desk/monitor/demo.py",),
+    "canopen": (),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -20,6 +20,10 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
     ("service", "--force"): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
+    ("status", "--interval"): "Type watch -n S kontronik-can-gw status.",
+    ("mqtt", "--remove-discovery"):
+        "Type mosquitto_sub -h BROKER -W 2 --remove-retained -t homeassistant/device/kontronik_GATEWAY/config, and for "
+        "each ESC -t homeassistant/device/kontronik_GATEWAY_ESC/config.",
     ("report", "--to"): "Type --until S.",
 }
 # fmt: on

@@ -1,4 +1,4 @@
-"""``demo``: runs the whole gateway without hardware, vcan or privileges, and the monitor on its bus."""
+"""``demo``: shows the gateway at work without hardware, vcan or privileges: the monitor on a simulated bus."""
 
 import argparse
 import math
@@ -7,7 +7,7 @@ from threading import Event
 
 from kontronik_can_gw.cli.arguments import number_from, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.desk.monitor.demo import simulated_bus
+from kontronik_can_gw.desk.monitor.demo import DemoBus
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.watch import watch
 
@@ -18,16 +18,15 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "A simulated ESC on a pseudo terminal, the real gateway, python-can's in-process bus, a small CANopen master, "
-    "and the monitor, which knows the DBC. Exit code: 0 at its end, 1 something in it failed, 2 wrong usage."
+    "A simulated ESC, the gateway, the canopen package as master of its node, and the monitor, which knows the DBC. "
+    "Exit code: 0 at its end, 2 wrong usage. The same with ports and a bus: simulate, run, monitor."
 )
 
 
 def main(args: argparse.Namespace) -> int:
-    stop = Event()
-    with stopping_on_signals(stop.set), simulated_bus(args.seed, stop) as bus:
-        monitor = Monitor(bus.bus)
-        end = time.monotonic() + (args.seconds or math.inf)
+    stop, end, bus = Event(), time.monotonic() + args.seconds, DemoBus(args.seed)
+    monitor = Monitor(bus.bus)
+    with stopping_on_signals(stop.set):
         watch(bus, monitor, None, lambda: stop.is_set() or time.monotonic() >= end, say)
-    say(f"{monitor.frames} CAN frames decoded, 0 bytes sent to the ESC")
+    say(f"{monitor.view.frames} CAN frames decoded")
     return 0

@@ -43,18 +43,17 @@ EPILOG = "A gateway that does not run is answered with 503: Prometheus's up is 0
 
 def main(args: argparse.Namespace) -> int:
     try:
-        from kontronik_can_gw.desk.metrics_server import MetricsServer
+        from kontronik_can_gw.desk.metrics import server_of
     except ImportError:
         raise RunError("needs prometheus-client: pip install 'kontronik-can-gw[metrics]'") from None
     file = args.file or _status_file(args.config)
     host, port = args.listen
-    stopped = threading.Event()
-    with stopping_on_signals(stopped.set):
-        server = MetricsServer(file, host, port)
+    stopped, server = threading.Event(), server_of(file, host, port)
+    with server, stopping_on_signals(stopped.set):
+        threading.Thread(target=server.serve_forever, daemon=True).start()
         shown = f"[{host}]" if ":" in host else host
-        say(f"http://{shown}:{server.port}/metrics serves {file}")
+        say(f"http://{shown}:{server.server_port}/metrics serves {file}")
         stopped.wait()
-        server.close()
     return 0
 
 

@@ -11,7 +11,6 @@ from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.bus_layout import bus_layout, given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.desk.monitor.model import Monitor
-from kontronik_can_gw.desk.monitor.screen import file_of
 from kontronik_can_gw.desk.monitor.watch import once, watch
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.desk.sources import Bus, Recording, Source, can_config
@@ -39,7 +38,7 @@ UART bytes or a CAN log (candump .log, .asc, .blf, .trc, .mf4), played in real
 time; a pipe, or - for standard input, is first read to its end (into TMPDIR).
 
 keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it,
-      n and p next and previous ESC, a all, space pause (FILE)
+      n and p next and previous, 0 all, space pause (FILE)
 
 A value beyond a limit is marked with ! and !!: power stage and BEC from 80 and
 100 degC, a cell from 3.5 and 3.3 V down. The limits are the monitor's own.
@@ -55,25 +54,6 @@ frame came (--once), or something cannot be opened; 2 wrong usage
 
 
 def main(args: argparse.Namespace) -> int:
-    _check_usage(args)
-    with _source_of(args) as source:
-        monitor, stop = Monitor(source.bus), Event()
-        with stopping_on_signals(stop.set):
-            if not args.once:
-                watch(source, monitor, args.interval, stop.is_set, say)
-                say(
-                    f"{monitor.frames} frames of {file_of(monitor)} seen on {source.name}, none sent"
-                )
-                return 0
-            document = once(source, monitor, args.timeout or _ONCE_S, stop.is_set)
-        if stop.is_set():
-            return 130
-        is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
-        print(printable_json(document, ascii_only=not is_utf8))
-        return 0
-
-
-def _check_usage(args: argparse.Namespace) -> None:
     if args.file is None and args.speed is not None:
         raise UserError("--speed: is for a FILE, not for the bus. Leave it out.")
     if args.file is not None and (args.interface is not None or args.channel is not None):
@@ -82,6 +62,20 @@ def _check_usage(args: argparse.Namespace) -> None:
         )
     if args.timeout is not None and not args.once:
         raise UserError("--timeout: is for --once. Leave it out.")
+    stop = Event()
+    with _source_of(args) as source, stopping_on_signals(stop.set):
+        monitor = Monitor(source.bus)
+        if not args.once:
+            watch(source, monitor, args.interval, stop.is_set, say)
+            count = monitor.view.frames
+            say(f"{count} frames of {monitor.file} seen on {source.name}, none sent")
+            return 0
+        document = once(source, monitor, args.timeout or _ONCE_S, stop.is_set)
+        if stop.is_set():
+            return 130
+    is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
+    print(printable_json(document, ascii_only=not is_utf8))
+    return 0
 
 
 @contextmanager

@@ -5,7 +5,8 @@ import logging
 import re
 import socket
 import time
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -13,18 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.cli.arguments import LAYOUT, option
 from kontronik_can_gw.cli.bus_layout import bus_layout, given_layout
-from kontronik_can_gw.cli.common import logging_to_stderr, say, stopping_on_signals
+from kontronik_can_gw.cli.common import logging_to_stderr, stopping_on_signals
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.config.parse import mqtt_with
-from kontronik_can_gw.desk.mqtt.broker import Broker, check
-from kontronik_can_gw.desk.mqtt.discovery import is_ours
-from kontronik_can_gw.desk.mqtt.messages import Publisher
-from kontronik_can_gw.desk.mqtt.topics import OFFLINE, Topics
+from kontronik_can_gw.desk.mqtt.messages import Publisher, Topics
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.sources import Bus, Recording, Source, can_config
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.systemd import Notifier
@@ -38,11 +35,9 @@ _STOP_S = 0.3
 _LAST_S = 2.0
 """Time at the end of a recording to send pending messages."""
 _TURN_S = 0.02
-"""Maximum time between two turns: delay of what is due, and of a signal."""
-_STATUS_NS = 500 * MS
+"""Time between two turns: delay of what is due, and of a signal."""
 _FILES = ("ca_file", "cert_file", "key_file", "password_file")
 _KEYS = ("broker", "tls", *_FILES, "username", "gateway", "topic", "rate", "retain", "discovery")
-_DEFAULT_DISCOVERY = "homeassistant"
 # fmt: off
 OPTIONS = (
     option("FILE", "publish a recording, in its own time, instead of the bus", type=Path, nargs="?"),
@@ -63,9 +58,7 @@ OPTIONS = (
     option("--retain", "let the broker keep the last states", default=None),
     option("--rate HZ", "states of each ESC in a second, 0.01 to 20 (default 1)", type=float),
     option("--discovery PREFIX", "announce each value to Home Assistant (prefix, default homeassistant)",
-           nargs="?", const=_DEFAULT_DISCOVERY),
-    option("--remove-discovery", "clear the broker's retained discovery of this gateway and end; "
-                                 "if the gateway is offline, its own topics too"),
+           nargs="?", const="homeassistant"),
 )
 # fmt: on
 EPILOG = (
@@ -77,29 +70,30 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    with logging_to_stderr():
-        return _main(args)
-
-
-def _main(args: argparse.Namespace) -> int:
+    try:
+        from kontronik_can_gw.desk.mqtt.client import MqttClient
+    except ImportError:
+        raise RunError("needs paho-mqtt 2: pip install 'kontronik-can-gw[mqtt]'") from None
     if args.file is None and args.discovery is not None and Path(args.discovery).is_file():
         raise UserError(f"--discovery {args.discovery}: is a file. Give FILE before the options.")
     if args.file is not None and (args.interface or args.channel):
         raise UserError("--interface, --channel: are for the bus, not for a recording")
-    bus = bus_layout(args) if args.file is None else given_layout(args)
-    settings = _settings(args, bus)
-    topics = Topics(settings.topic, settings.gateway or host_name())
-    broker = Broker(settings, f"kontronik-can-gw-{topics.gateway}")
-    for warning in check(broker):
-        log.warning("%s", warning)
-    if args.remove_discovery:
-        return _remove(broker, topics, settings.discovery or _DEFAULT_DISCOVERY)
-    with closing(Locks()) as locks:
-        if locks.hold([f"{broker.place}/mqtt/{topics.gateway}"]):
+    with logging_to_stderr(), closing(Locks()) as locks:
+        bus = bus_layout(args) if args.file is None else given_layout(args)
+        settings = _settings(args, bus)
+        topics = Topics(settings.topic, settings.gateway or host_name())
+        try:
+            client = MqttClient(settings, f"kontronik-can-gw-{topics.gateway}", topics.of("online"))
+        except OSError as error:
+            raise RunError(str(error)) from None
+        if locks.hold([f"{settings.address}/mqtt/{topics.gateway}"]):
             raise RunError(
-                f"another process on this machine publishes as {topics.gateway} to {broker}. End it, or give another --gateway."
+                f"another process on this machine publishes as {topics.gateway} to {client}. End it, or give another --gateway."
             )
-        _publish(args, bus, broker, topics)
+        with _source_of(args, bus) as source:
+            publisher = Publisher(source.bus, topics, settings, is_replay=source.is_file)
+            log.info("publishing %s below %s/", ", ".join(publisher.escs) or "no ESC", topics.of())
+            _publish(source, publisher, client)
     return 0
 
 
@@ -126,115 +120,54 @@ def _settings(args: argparse.Namespace, bus: BusLayout | None) -> MqttConfig:
     return settings
 
 
-def _remove(broker: Broker, topics: Topics, discovery: str) -> int:
-    """Clear the retained discovery, and all other retained topics of a gateway that is not online."""
-    from kontronik_can_gw.desk.mqtt.client import remove
-
-    kept: dict[str, bytes] = {}
-
-    def wanted(topic: str, payload: bytes) -> bool:
-        kept[topic] = payload
-        return topic.startswith(f"{discovery}/") and is_ours(payload, topics)
-
-    # its own client id, so that no other client is disconnected
-    by_hand = replace(broker, client_id=f"{broker.client_id}-remove")
-    removed = remove(by_hand, [f"{discovery}/device/+/config", f"{topics.base}/#"], wanted)
-    if kept.get(topics.online) == OFFLINE:
-        removed += remove(by_hand, [f"{topics.base}/#"], lambda _topic, _payload: True)
-    elif topics.online in kept:
-        say(f"{topics.gateway} is online: only its discovery was cleared")
-    for topic in removed:
-        say(f"{topic}: cleared")
-    if not removed:
-        say(f"{broker} keeps nothing of {topics.gateway}")
-    return 0
-
-
-def _publish(
-    args: argparse.Namespace, bus: BusLayout | None, broker: Broker, topics: Topics
-) -> None:
-    """Publish the bus, or the recording, until a signal or its end."""
-    from kontronik_can_gw.desk.mqtt.client import MqttClient
-
-    def publisher(bus: BusLayout) -> Publisher:
-        how, is_replay = broker.config, args.file is not None
-        return Publisher(
-            bus, topics, how.rate, retain=how.retain, discovery=how.discovery, replay=is_replay
-        )
-
-    notifier, client = Notifier(), MqttClient(broker, topics.online)
+@contextmanager
+def _source_of(args: argparse.Namespace, bus: BusLayout | None) -> Iterator[Source]:
+    """The bus, or the recording."""
     if args.file is None:
         assert bus is not None
         can = can_config(bus, args.interface, args.channel)
-        with Bus(bus, can, notifier.present) as live:
-            _Run(live, publisher(bus), client, notifier).run()
+        with Bus(bus, can, patient=Notifier().present) as live:
+            yield live
         return
     with open_input(args.file, bus) as recorded:
         recording = Recording(recorded, 1.0)
         if recording.ended:
             raise RunError(f"{recorded.name}: has no frames of the gateway")
-        _Run(recording, publisher(recorded.bus), client, notifier).run()
+        yield recording
         for line in recorded.damage:
             log.warning("%s: %s", recorded.name, line)
 
 
-class _Run:
-    """Publishes from the source to the broker, until a signal or the end of the source."""
-
-    def __init__(
-        self, source: Source, publisher: Publisher, client: "MqttClient", notifier: Notifier
-    ) -> None:
-        self._source, self._publisher = source, publisher
-        self._client, self._notifier = client, notifier
-        self._conditions = FaultLog()
-        self._stopping = Event()
-        self._due_ns = self._status_ns = 0
-
-    def run(self) -> None:
-        with stopping_on_signals(self._stopping.set):
-            names = ", ".join(self._publisher.escs) or "no ESC"
-            log.info("publishing %s below %s/", names, self._publisher.topics.base)
-            self._client.start()
-            self._notifier.ready("started")
-            try:
-                while not self._source.ended:
-                    if self._stopping.is_set():
-                        return
-                    self._source.pump(self._publisher.take, time.monotonic() + _TURN_S)
-                    self._turn()
-                self._finish()
-            finally:
-                self._notifier.stopping("ending")
-                self._client.stop(_STOP_S)
-
-    def _turn(self) -> None:
-        """Publish due messages, report faults, feed the watchdog."""
-        now, source = time.monotonic_ns(), self._source
-        if now < self._due_ns:
-            return
-        self._due_ns = now + round(_TURN_S * SECOND)
-        wall = source.wall_ns()
-        messages = self._publisher.messages(source.now(), time.time_ns() if wall is None else wall)
-        for message in messages:
-            self._client.offer(message)
-        self._client.turn(now)
-        if source.problem:
-            self._conditions.begin("CAN", source.problem, now)
-        else:
-            self._conditions.end("CAN", "the CAN interface works", now)
-        self._conditions.advance(now)
-        self._notifier.watchdog()
-        if now - self._status_ns > _STATUS_NS:
-            self._status_ns = now
-            state = "connected" if self._client.connected else self._client.problem or "connecting"
-            self._notifier.status(f"{state}; CAN: {source.problem or 'ok'}")
-
-    def _finish(self) -> None:
-        """Send what is pending at the end of a recording. RunError if the broker does not take it."""
-        end = time.monotonic() + _LAST_S
-        while self._client.waiting and not self._stopping.is_set() and time.monotonic() < end:
-            self._client.turn(time.monotonic_ns())
-            time.sleep(0.01)
-        if self._client.waiting and not self._stopping.is_set():
-            why = self._client.problem or f"{self._client.broker}: not fast enough"
-            raise RunError(f"the end of the recording was not published. {why}")
+def _publish(source: Source, publisher: Publisher, client: "MqttClient") -> None:
+    """Publish from the source to the broker, until a signal or the end of the source."""
+    stop, notifier, faults = Event(), Notifier(), FaultLog()
+    with stopping_on_signals(stop.set):
+        client.start()
+        notifier.ready("started")
+        try:
+            while not source.ended and not stop.is_set():
+                due = time.monotonic() + _TURN_S
+                while not source.ended and time.monotonic() < due:
+                    source.pump(publisher.take, due)
+                now, wall = time.monotonic_ns(), source.wall_ns()
+                for message in publisher.messages(source.now(), wall or time.time_ns()):
+                    client.offer(message)
+                client.turn(now)
+                if source.problem:
+                    faults.begin("CAN", source.problem, now)
+                else:
+                    faults.end("CAN", "the CAN interface works", now)
+                faults.advance(now)
+                notifier.watchdog()
+                state = "connected" if client.problem == "" else client.problem or "connecting"
+                notifier.status(f"{state}; CAN: {source.problem or 'ok'}")
+            end = time.monotonic() + _LAST_S
+            while client.waiting and not stop.is_set() and time.monotonic() < end:
+                client.turn(time.monotonic_ns())
+                time.sleep(_TURN_S)
+            if client.waiting and not stop.is_set():
+                why = client.problem or "not fast enough"
+                raise RunError(f"the end of the recording was not published: {client}: {why}")
+        finally:
+            notifier.stopping("ending")
+            client.stop(_STOP_S)

@@ -4,18 +4,13 @@ import argparse
 import json
 import time
 from pathlib import Path
-from threading import Event
 
 from rich.console import Console
-from rich.text import Text
 
-from kontronik_can_gw.cli.arguments import JSON, number_from, option
-from kontronik_can_gw.cli.common import stopping_on_signals
+from kontronik_can_gw.cli.arguments import JSON, option
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.parse import load
-from kontronik_can_gw.desk.monitor import terminal
-from kontronik_can_gw.desk.monitor.lines import BAD, FAINT, line, wrapped
-from kontronik_can_gw.desk.monitor.status import Seen, look_at, screen
+from kontronik_can_gw.desk.monitor.status import Seen, lines_of, look_at
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.printable import printable, printable_json
 
@@ -35,13 +30,12 @@ OPTIONS = (
         option("-c --config FILE", "the gateway with this TOML configuration", type=Path),
         option("--file FILE", "the gateway with this statistics file", type=Path),
     ),
-    option("--once", "show it once, as in a pipe (default on a terminal: live)"),
+    option("--once", "the default: kept for scripts of before"),
     JSON,
-    option("--interval S", "live: interval in seconds (default 1)", type=number_from(0.1, 3600), default=1.0),
 )
 # fmt: on
 EPILOG = (
-    "Default: all gateways that run as a service. Exit code 0: running and healthy (also at the end of the live display); "
+    "Default: all gateways that run as a service. Live: watch kontronik-can-gw status. Exit code 0: running and healthy; "
     "1: running, but an ESC is not heard or nothing gets onto the CAN bus; 2: wrong usage; 3: not running, or no answer for 3 s."
 )
 
@@ -50,24 +44,19 @@ def main(args: argparse.Namespace) -> int:
     config = None if args.config is None else load(args.config)
     given = args.file if config is None else config.statistics_path
     seen = _look(given, config)
+    if not seen and args.json:
+        print(json.dumps({"gateways": []}))
     if not seen:
-        if args.json:
-            print(json.dumps({"gateways": []}))
         raise NotRunning(_no_file(config))
     if args.json:
         print(printable_json({"gateways": [each.as_json() for each in seen]}))
         return max(each.code for each in seen)
     if all(each.document is None for each in seen):
         raise NotRunning(*(each.sentence for each in seen))
-    console = Console(highlight=False)
-    if not args.once and terminal.is_screen(console):
-        _live(console, given, config, args.interval)
-        return 0
-    for text in _joined([screen(each) for each in seen]):
-        if console.is_terminal:
-            console.print(text, soft_wrap=True)
-        else:
-            print(text.plain.rstrip())
+    console = Console(highlight=False, soft_wrap=True)
+    for number, each in enumerate(seen):
+        for text in ([""] if number else []) + list(lines_of(each)):
+            console.print(text)
     return max(each.code for each in seen)
 
 
@@ -95,30 +84,3 @@ def _no_file(config: Config | None) -> str:
         f"no gateway runs as a service: there is no {RUN_FOLDER}/{PROGRAM}/status.json. "
         f"Start it: sudo systemctl start {PROGRAM}; or name the file of another one: --file, or -c and its configuration."
     )
-
-
-def _joined(parts: list[list[Text]]) -> list[Text]:
-    """The gateways one after the other."""
-    return [each for part in parts for each in ([*part, line()])][:-1]
-
-
-def _live(console: Console, given: Path | None, config: Config | None, interval: float) -> None:
-    """Refresh the display until a key, SIGINT or SIGTERM."""
-    stop = Event()
-
-    def draw(size: tuple[int, int], keys: bool) -> list[Text]:
-        width, height = size
-        seen = _look(given, config)
-        share = max(3, (height - 1 - len(seen)) // max(1, len(seen)))
-        lines = _joined([screen(each, (width, share)) for each in seen])
-        lines = (lines or wrapped(_no_file(config), BAD, width))[: height - 1]
-        for each in lines:
-            each.truncate(width, overflow="ellipsis")
-        blank = [line()] * (height - 1 - len(lines))
-        return [*lines, *blank, line(("q quit" if keys else "Ctrl-C ends", FAINT))]
-
-    def step(until_s: float) -> bool:
-        return not stop.wait(max(0.0, until_s - time.monotonic()))
-
-    with stopping_on_signals(stop.set):
-        terminal.show(console, draw, step, interval)

@@ -4,17 +4,20 @@ Values are addressed by the names of values.py, not of signals, so any DBC works
 """
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.esc.decoder import Severity
+from kontronik_can_gw.esc.decoder import ErrorBit, Severity
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import Value
 
 _WORDS = {"operating_errors": Group.LIVE, "selftest_errors": Group.INFO}
+_SEVERITIES = list(Severity)
 
 
 class Flag(NamedTuple):
@@ -28,12 +31,28 @@ class Flag(NamedTuple):
     is_normal: bool = False
 
 
+def flag_of(bit: ErrorBit) -> Flag:
+    """The flag of a bit that has a name."""
+    summary, normal = bit.is_summary, bit.is_normal
+    return Flag(bit.text, bit.severity, bit.meaning, bit.remedy, summary, normal)
+
+
+def alarms_of(flags: Iterable[Flag]) -> list[Flag]:
+    """What to show, errors first: no normal bits, and no summary of bits that are shown anyway."""
+    found = [flag for flag in flags if not flag.is_normal]
+    shown = {flag.severity for flag in found if not flag.is_summary}
+    found = [flag for flag in found if not flag.is_summary or flag.severity not in shown]
+    return sorted(found, key=lambda flag: _SEVERITIES.index(flag.severity))
+
+
 class Member:
     """The gateway (``settings`` and ``index`` None) or an ESC. ``columns``: of each of its values in the layout, the first."""
 
     def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
         self.view, self.index = view, index
         self.name = "" if settings is None else settings.name
+        self.cells = None if settings is None else settings.cell_count
+        """As configured; None where not."""
         self.protocol = protocol_named(None if settings is None else settings.protocol)
         self.columns: dict[str, int] = {}
         for at, column in enumerate(view.reader.columns):
@@ -46,21 +65,31 @@ class Member:
             for group in Group
         }
         """Those of each group."""
-        self._flags = {
-            word: {bit: self.columns.get(bit.text) for bit in self.protocol.errors.get(word, ())}
-            for word in _WORDS
-        }
-        """The bits of each error word, and the columns of those that are signals of their own."""
+        self.factors: dict[str, tuple[float, float]] = {}
+        """Factor and offset of the values whose signal has another unit than their source."""
+        for name, at in self.columns.items():
+            unit = VALUES[name].unit
+            factor, offset = units.conversion(view.reader.columns[at].unit or unit, unit) or (1, 0)
+            if (factor, offset) != (1, 0):
+                self.factors[name] = float(factor), float(offset)
 
     def has(self, *sources: str) -> bool:
         """True where the DBC has a signal for one of the sources."""
         return any(source in self.columns for source in sources)
 
     def value(self, source: str) -> Value:
-        """The value as the DBC has it; infinity, which a float signal can hold, is none."""
+        """The value in the unit of its source."""
         at = self.columns.get(source)
-        value = None if at is None else self.view.values[at]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
+        return None if at is None else self.converted(source, self.view.values[at])
+
+    def converted(self, source: str, value: Value) -> Value:
+        """A signal's value in the unit of its source; infinity, which a float signal can hold, is none."""
+        if value is None or isinstance(value, str):
+            return value
+        if source in self.factors:
+            factor, offset = self.factors[source]
+            value = round(value * factor + offset, 9)
+        return value if math.isfinite(value) else None
 
     def number(self, source: str) -> float | None:
         """The value of a numeric source."""
@@ -77,6 +106,20 @@ class Member:
     def is_known(self, group: Group) -> bool:
         """True while any value of a group is available, flags apart."""
         return any(self.view.values[at] is not None for at in self.of_group[group])
+
+    @property
+    def link(self) -> str | None:
+        """The link state's name; None where it is not available.
+
+        It has its own message, which comes up to a cycle later than values after a gap: while there are values the link is good.
+        """
+        link = self.text("link_state")
+        is_old = link is not None and normalize(link) not in ("ok", "degraded")
+        return (
+            VALUES["link_state"].names[LinkState.OK]
+            if is_old and self.is_known(Group.LIVE)
+            else link
+        )
 
     @property
     def state(self) -> str | None:
@@ -109,21 +152,16 @@ class Member:
 
         Flags have no code for "not available": they count while another value of their group is known.
         """
-        group, values = _WORDS[word], self.view.values
-        columns = [self.columns.get(word), *self._flags[word].values()]
-        has_others = bool(self.of_group[group])
-        is_valid = self.is_known(group) or not has_others
-        if not is_valid or all(at is None or values[at] is None for at in columns):
+        group, bits = _WORDS[word], self.protocol.errors.get(word, ())
+        columns = {bit: self.columns.get(bit.text) for bit in bits}
+        values = {bit: None if at is None else self.view.values[at] for bit, at in columns.items()}
+        has_others, whole = bool(self.of_group[group]), self.number(word)
+        if (has_others and not self.is_known(group)) or {whole, *values.values()} == {None}:
             return None
-        number = int(self.number(word) or 0)
-        bits = self._flags[word]
-        found = [
-            Flag(bit.text, bit.severity, bit.meaning, bit.remedy, bit.is_summary, bit.is_normal)
-            for bit, at in bits.items()
-            if number >> bit & 1 or (at is not None and values[at] == 1)
-        ]
+        number = int(whole or 0)
+        found = [flag_of(bit) for bit in bits if number >> bit & 1 or values[bit] == 1]
         for bit in range(32):
-            if number >> bit & 1 and bit not in bits:
+            if number >> bit & 1 and bit not in columns:
                 meaning = f"bit {bit} of {word}, which has no name"
                 found.append(Flag(f"bit{bit}", Severity.WARNING, meaning))
         return found if has_others else found or None

@@ -17,7 +17,7 @@ from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.metrics import families
-from kontronik_can_gw.desk.monitor.status import _alarms
+from kontronik_can_gw.desk.monitor.status import alarms as alarms_of
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
 from kontronik_can_gw.errors import UserError
@@ -303,5 +303,5 @@ def test_metrics_and_screen_of_both_in_one_document() -> None:
     }
     assert counted["kontronik_esc_live_v4_total", "old"] == 1
     assert ("kontronik_esc_live_v4_total", "kiss") not in counted
-    alarms = [(alarm.text, alarm.remedy[:9]) for alarm in _alarms(document)]
-    assert ("old ERROR: battery voltage too low", "Stop soon") in alarms
+    alarms = [(name, flag.meaning, flag.remedy[:9]) for name, flag in alarms_of(document)]
+    assert ("old ", "battery voltage too low", "Stop soon") in alarms

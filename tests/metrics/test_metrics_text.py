@@ -8,8 +8,8 @@ from prometheus_client import CollectorRegistry, Metric, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench, with_nodes
 
+from kontronik_can_gw.desk.metrics import _Collected
 from kontronik_can_gw.desk.metrics import families as made
-from kontronik_can_gw.desk.metrics_server import Collected
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.runtime.snapshot import CanFacts, PortFacts, StoreFacts
@@ -22,7 +22,7 @@ UNITS = (
 
 def metrics(document: dict[str, Any]) -> str:
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(Collected(made(document, 0.5)))
+    registry.register(_Collected(made(document, 0.5)))
     return generate_latest(registry).decode()
 
 

@@ -12,8 +12,8 @@ from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.desk.monitor.model import Monitor
-from kontronik_can_gw.desk.monitor.quantities import HISTORY_S
+from kontronik_can_gw.desk.member import alarms_of
+from kontronik_can_gw.desk.monitor.model import HISTORY_S, Monitor
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
@@ -68,6 +68,7 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
         else:
             assert (track.low, track.high) == (None, None)
     monitor.reset()
+    track = esc.tracks["battery_current"]
     assert (track.low, track.high, list(track.history)) == (None, None, [])
 
 
@@ -102,7 +103,10 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
     esc = monitor.escs[0]
     assert all(esc.value(source) is None for source in esc.units)
     assert (esc.state, esc.link, esc.device_text, esc.active) == (None, None, "", [])
-    assert (monitor.gateway_state, monitor.can_state) == (None, None)
+    assert (monitor.gateway.text("gateway_state"), monitor.gateway.text("can_state")) == (
+        None,
+        None,
+    )
     assert monitor.silent_ns >= 5 * SECOND_NS
     assert esc.tracks["battery_voltage"].high is not None, "extremes stay"
 
@@ -142,13 +146,14 @@ def test_errors_have_their_meaning_and_come_first() -> None:
     )
     (esc,) = watched(ONE, flight(ONE, 3, [with_errors(*bits)])).escs
     assert {active.name for active in esc.active} == {bit.text for bit in bits}
-    assert [(active.name, active.severity) for active in esc.alarms] == [
+    alarms = alarms_of(esc.active)
+    assert [(active.name, active.severity) for active in alarms] == [
         ("undervoltage", Severity.ERROR),
         ("test_eeprom_empty", Severity.ERROR),
         ("power_stage_overtemp_warning", Severity.WARNING),
     ]
-    assert esc.alarms[0].meaning == OperatingError.UNDERVOLTAGE.meaning
-    assert esc.alarms[0].remedy == OperatingError.UNDERVOLTAGE.remedy
+    assert alarms[0].meaning == OperatingError.UNDERVOLTAGE.meaning
+    assert alarms[0].remedy == OperatingError.UNDERVOLTAGE.remedy
 
 
 def test_infinity_of_a_float_signal_is_no_value() -> None:
@@ -213,7 +218,7 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout)
     assert esc.number("power_stage_temperature") == pytest.approx(60.05)
     assert esc.tracks["battery_voltage"].low == 22.2
     assert esc.state == "RPMControl"
-    assert [(active.name, active.severity) for active in esc.alarms] == [
+    assert [(active.name, active.severity) for active in alarms_of(esc.active)] == [
         ("undervoltage", Severity.ERROR),
         ("bit30", Severity.WARNING),
     ]

@@ -16,7 +16,7 @@ from simulated_bus import Clock, flight, layout_of, write_log
 from kontronik_can_gw.cli import monitor
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk import member, sources
-from kontronik_can_gw.desk.monitor import esc_monitor, model, screen, terminal, watch
+from kontronik_can_gw.desk.monitor import model, screen, watch
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.sources import Recording
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions, SimulatedEsc
@@ -56,17 +56,7 @@ def document(done: Done) -> dict[str, Any]:
 def test_nothing_in_the_monitor_can_send() -> None:
     """The way to the bus has no method to send with, and its sources call none."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
-    for module in (
-        monitor,
-        member,
-        esc_monitor,
-        model,
-        screen,
-        sources,
-        terminal,
-        watch,
-        bus_listener,
-    ):
+    for module in (monitor, member, model, screen, sources, watch, bus_listener):
         for node in ast.walk(ast.parse(inspect.getsource(module))):
             if isinstance(node, ast.Attribute):
                 assert "send" not in node.attr, f"{module.__name__}:{node.lineno}"
@@ -113,7 +103,7 @@ def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) 
     assert found["time"].startswith("2023-11-14T")
     assert found["frames"] == len(bench.sent)
     assert all(20 < esc["values"]["battery_voltage"] < 26 for esc in found["escs"])
-    assert "  e1  link " in run("monitor", file, "--speed", 20, "--interval", 0.1).out
+    assert "\ne1 " in run("monitor", file, "--speed", 20, "--interval", 0.1).out
     done = run("monitor", file, "--dbc", DBC)
     assert (done.code, done.out) == (2, "")
     assert "x.kcap: is a capture, which holds its own DBC. Leave -c and --dbc out." in done.err

@@ -15,7 +15,7 @@ from command_line import refused, written
             ["--broker", "127.0.0.1:1", "--username", "x", "--password-file", "empty"], 1,
             "has no password on its first line",
         ),
-        (["--broker", "127.0.0.1:1", "--tls", "--ca-file", "empty"], 1, "is not a certificate in PEM form"),
+        (["--broker", "127.0.0.1:1", "--tls", "--ca-file", "empty"], 1, "empty: [X509: NO_CERTIFICATE"),
         (["--broker", "127.0.0.1:1", "--interface", "socketcan", "--channel", "no0"], 1, "no0"),
         (["--broker", "127.0.0.1:1", "--discovery", "empty"], 2, "is a file. Give FILE before the options."),
     ],

@@ -13,9 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_errors
 
-from kontronik_can_gw.desk.mqtt.discovery import entity, is_ours
-from kontronik_can_gw.desk.mqtt.messages import IDENTITY_NS, MAX_CHANGES, MIN_PAUSE_NS, Publisher
-from kontronik_can_gw.desk.mqtt.topics import Message, Topics
+from kontronik_can_gw.config.keys import MqttConfig
+from kontronik_can_gw.desk.mqtt.messages import (
+    IDENTITY_NS,
+    MIN_PAUSE_NS,
+    Message,
+    Publisher,
+    Topics,
+)
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
     ErrorWindow,
@@ -40,7 +45,7 @@ bus_of = cache(layout_of)
 
 
 def publisher(*names: str, rate: float = 1, **options: Any) -> Publisher:
-    return Publisher(bus_of(names), TOPICS, rate, **options)
+    return Publisher(bus_of(names), TOPICS, MqttConfig(rate=rate, **options))
 
 
 Published = list[tuple[int, Message]]
@@ -60,7 +65,9 @@ def run(made: Publisher, frames: Timed, until_s: float, step_ns: int = STEP_NS) 
 
 
 def states(published: Published, esc: str = "esc1") -> list[tuple[int, dict[str, Any]]]:
-    return [(now, json.loads(m.payload)) for now, m in published if m.topic == TOPICS.state(esc)]
+    return [
+        (now, json.loads(m.payload)) for now, m in published if m.topic == TOPICS.of(esc, "state")
+    ]
 
 
 def snake(signal: str, prefix: str) -> str:
@@ -89,7 +96,7 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
 def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str, ...]) -> None:
     bus = layout_of(names)
     frames = flight(bus, 12)
-    made = Publisher(bus, TOPICS, 1)
+    made = publisher(*names)
     last = run(made, frames, 12)
     flags = {bit.text for bits in (OperatingError, SelfTestError) for bit in bits}
     for index, name in enumerate(names):
@@ -140,7 +147,9 @@ def test_the_rate_is_held_whenever_it_is_asked(rate: float, steps: list[int]) ->
     for step in [0, *steps]:
         now += step * MS
         told += [
-            now for message in made.messages(now, now) if message.topic == TOPICS.state("esc1")
+            now
+            for message in made.messages(now, now)
+            if message.topic == TOPICS.of("esc1", "state")
         ]
         if now >= first:
             expected.setdefault((now - first) // period, now)
@@ -182,22 +191,23 @@ def test_a_new_kind_of_state_and_a_lost_link_are_reported_at_once_and_a_new_spee
     lost = next(now for now, found in states(published) if found["link_state"] == "Lost")
     assert lost - 6 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway itself waits for the time-out
     assert len(states(published)) <= 8
-    available = [(now, m.payload) for now, m in published if m.topic == TOPICS.available("esc1")]
+    available = [
+        (now, m.payload) for now, m in published if m.topic == TOPICS.of("esc1", "available")
+    ]
     assert [payload for _, payload in available] == [b"online", b"offline"]
 
 
 def test_what_comes_and_goes_is_bounded() -> None:
     windows = tuple(
         ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS)
-        for start in range(0, 60 * SECOND_NS, 60 * MS)
+        for start in range(0, 20 * SECOND_NS, 60 * MS)
     )
     options = EscOptions(profile=QUIET.profile, faults=Faults(errors=windows))
-    frames = flight(layout_of(["esc1"]), 60, [options])
-    times = [now for now, _ in states(run(publisher("esc1", rate=0.01), frames, 60))]
+    frames = flight(layout_of(["esc1"]), 20, [options])
+    times = [now for now, _ in states(run(publisher("esc1", rate=0.01), frames, 20))]
     gaps = [b - a for a, b in pairwise(times)]
+    assert len(times) > 50
     assert min(gaps) >= MIN_PAUSE_NS
-    assert MAX_CHANGES <= len(times) <= MAX_CHANGES + 60 + 2
-    assert max(gaps) <= 1.3 * SECOND_NS
 
 
 def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -> None:
@@ -205,7 +215,7 @@ def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -
     frames = [entry for entry in flight(bus, 10) if not 4 * SECOND_NS < entry[0] < 9 * SECOND_NS]
     published = run(publisher("esc1"), frames, 10)
     for esc in ("esc1", ""):
-        told = [(now, m.payload) for now, m in published if m.topic == TOPICS.available(esc)]
+        told = [(now, m.payload) for now, m in published if m.topic == TOPICS.of(esc, "available")]
         assert [payload for _, payload in told] == [b"online", b"offline", b"online"]
     assert 7 * SECOND_NS <= told[1][0] <= 7.3 * SECOND_NS
     assert 9 * SECOND_NS <= told[2][0] <= 9.3 * SECOND_NS
@@ -220,7 +230,7 @@ def test_lasting_is_what_must_be_known_later_and_it_comes_before_the_state() -> 
     for _, message in published:
         assert message.lasting is message.retain is not message.topic.endswith("/state")
     topics = [message.topic for _, message in published]
-    assert topics.index(TOPICS.available("esc1")) < topics.index(TOPICS.state("esc1"))
+    assert topics.index(TOPICS.of("esc1", "available")) < topics.index(TOPICS.of("esc1", "state"))
     kept = run(publisher("esc1", retain=True), [], 1)
     assert all(message.retain for _, message in kept)
 
@@ -257,7 +267,7 @@ def discovered(published: Published) -> dict[str, dict[str, Any]]:
 def of_two() -> Published:
     """What is published of a flight of two ESCs."""
     bus = layout_of(["left", "right"])
-    return run(Publisher(bus, TOPICS, 1, discovery="homeassistant"), flight(bus, 3), 3)
+    return run(publisher("left", "right", discovery="homeassistant"), flight(bus, 3), 3)
 
 
 def components(found: dict[str, dict[str, Any]]) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -295,8 +305,7 @@ def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_
             assert "options" not in component
 
 
-def test_names_are_written_as_people_write_them() -> None:
-    columns = {column.source: column for column in SignalReader(layout_of(["esc1"]).layout).columns}
+def test_names_are_written_as_people_write_them(of_two: Published) -> None:
     shown = {
         "bec_voltage": "BEC voltage",
         "pwm_input": "PWM input",
@@ -304,9 +313,9 @@ def test_names_are_written_as_people_write_them() -> None:
         "min_bec_temperature": "Min BEC temperature",
         "battery_voltage": "Battery voltage",
     }
-    for source, name in shown.items():
-        component = entity(source, columns[source])
-        assert component is not None and component["name"] == name
+    found = discovered(of_two)[TOPICS.discovery("homeassistant", "left")]["components"]
+    assert {source: found[source]["name"] for source in shown} == shown
+    assert found["battery_voltage"]["suggested_display_precision"] == 2
 
 
 def discoveries(published: Iterable[tuple[int, Message]]) -> list[tuple[int, dict[str, Any]]]:
@@ -330,14 +339,3 @@ def test_an_esc_that_does_not_identify_itself_is_announced_nevertheless() -> Non
     assert "sw_version" not in found["device"]
     assert IDENTITY_NS <= now <= IDENTITY_NS + 1.6 * SECOND_NS
     assert discoveries(run(publisher("esc1", discovery="ha"), [], 10)) == []
-
-
-def test_only_the_discovery_of_this_gateway_is_ours(of_two: Published) -> None:
-    mine, other = (json.dumps(device).encode() for device in list(discovered(of_two).values())[:2])
-    assert is_ours(mine, TOPICS)
-    assert is_ours(other, TOPICS)
-    assert not is_ours(mine, Topics("fleet", "boat2"))
-    assert not is_ours(mine, Topics("fleet2", "boat"))
-    other_program = b'{"origin": {"name": "x"}, "availability": []}'
-    for text in (b"", b"{}", b"[]", b"3", b"x", b'{"origin": 3}', other_program):
-        assert not is_ours(text, TOPICS)

@@ -1,34 +1,26 @@
-"""Lines of text for a terminal, made printable: words, numbers, tables, sparklines. Pure."""
+"""Lines of text for a terminal, made printable: words, numbers, tables. Pure."""
 
+import re
 import textwrap
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
 
 from rich.text import Text
 
+from kontronik_can_gw.desk.member import Flag
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.printable import printable
 
-GOOD, POOR, BAD, FAINT, TITLE = "green", "yellow", "bold red", "dim", "bold"
-
-LINKS = {"ok": GOOD, "degraded": POOR, "-": FAINT}
-"""Styles of link states; any other is bad."""
-_SEVERITIES = {Severity.ERROR: BAD, Severity.WARNING: POOR, Severity.STATUS: ""}
+STATES = {
+    **dict.fromkeys(("ok", "error-active", "running"), "green"),
+    **dict.fromkeys(("degraded", "error-warning", "error-passive"), "yellow"),
+    "unknown": "",
+    "-": "dim",
+}
+"""Styles of states of a link, a CAN controller and a gateway; any other is bad."""
+_KINDS = {Severity.ERROR: ("ERROR", "bold red"), Severity.WARNING: ("WARNING", "yellow")}
 
 Part = str | tuple[str, str] | Text
 """Text without a style, text with a style of rich, or a finished part of a line."""
-
-
-class Glyphs(NamedTuple):
-    """Characters available on the terminal. ``levels``: of a sparkline, lowest first."""
-
-    levels: str = "▁▂▃▄▅▆▇█"
-    degree: str = "°C"
-    rule: str = "╌"
-
-
-UNICODE = Glyphs()
-ASCII = Glyphs("_.,-~=*#", "degC", "-")
 
 
 def line(*parts: Part) -> Text:
@@ -43,102 +35,63 @@ def line(*parts: Part) -> Text:
     return made
 
 
-def wrapped(text: str, style: str, width: int | None) -> list[Text]:
-    """The text as lines of this width; None: one line."""
-    if width is None:
-        return [line((text, style))]
+def wrapped(text: str, style: str, width: int) -> list[Text]:
+    """The text as lines of this width."""
     parts = textwrap.wrap(text, max(20, width), subsequent_indent="    ", break_on_hyphens=False)
     return [line((part, style)) for part in parts]
 
 
-def ends(left: Text, right: Text, width: int) -> Text:
-    """A line with text at both ends; the left one is cut where they do not fit."""
-    left.truncate(max(0, width - right.cell_len), overflow="ellipsis", pad=True)
-    return line(left, right)
-
-
 def table(
-    rows: Sequence[Sequence[Part]], width: int | None, left: int = 1, least: Sequence[int] = ()
+    rows: Sequence[Sequence[Part]], width: int, left: int, least: Sequence[int]
 ) -> list[Text]:
     """Lines of aligned columns; those that do not fit are left out from the right.
 
     ``left``: number of left-aligned columns. ``least``: their minimum widths, so that a live table does not jump.
     """
     cells = [[line(part) for part in row] for row in rows]
-    widths = [max(cell.cell_len for cell in column) for column in zip(*cells, strict=True)]
-    widths = [max(pair) for pair in zip(widths, [*least, *[0] * len(widths)], strict=False)]
-    while width is not None and sum(widths) + len(widths) - 1 > width and len(widths) > 1:
+    widths = [
+        max(wide, *(cell.cell_len for cell in column))
+        for wide, column in zip(least, zip(*cells, strict=True), strict=True)
+    ]
+    while sum(widths) + len(widths) - 1 > width and len(widths) > 1:
         widths.pop()
-    lines = []
     for row in cells:
-        made = line()
-        for number, wide in enumerate(widths):
-            row[number].align("left" if number < left else "right", wide)
-            made.append_text(row[number]).append(" " if number < len(widths) - 1 else "")
-        lines.append(made)
-    return lines
+        for number, (cell, wide) in enumerate(zip(row, widths, strict=False)):
+            cell.align("left" if number < left else "right", wide)
+    return [line(Text(" ").join(row[: len(widths)])) for row in cells]
 
 
-def cut(lines: list[Text], height: int | None, rest: str) -> list[Text]:
-    """The lines that fit; the last one counts those left out, followed by the text ``rest``."""
-    if height is None or len(lines) <= height:
-        return lines
-    more = f"... and {len(lines) - height + 1} {rest}"
-    return [*lines[: max(0, height - 1)], line((more, FAINT))][: max(0, height)]
-
-
-class Alarm(NamedTuple):
-    """Something wrong, in words, and what to do."""
-
-    severity: Severity
-    text: str
-    remedy: str = ""
-
-
-def alarm_lines(alarms: Sequence[Alarm], width: int | None, room: int | None) -> list[Text]:
-    """Errors before warnings, with remedies where there is room."""
-    found = sorted(alarms, key=lambda alarm: list(_SEVERITIES).index(alarm.severity))
+def alarm_lines(alarms: Iterable[tuple[str, Flag]], width: int, room: int = 999) -> list[Text]:
+    """Errors and warnings, each after a name, with remedies where there is room."""
     lines: list[Text] = []
     for with_remedy in (True, False):
         lines = []
-        for severity, text, remedy in found:
-            lines += wrapped(text, _SEVERITIES[severity], width)
-            if remedy and with_remedy:
-                lines += wrapped(f"  -> {remedy}", "", width)
-        if room is None or len(lines) <= room:
-            break
-    return cut(lines, room, "lines more of errors and warnings")
+        for name, flag in alarms:
+            kind, style = _KINDS.get(flag.severity, ("note", ""))
+            lines += wrapped(f"{name}{kind}: {flag.meaning}", style, width)
+            if flag.remedy and with_remedy:
+                lines += wrapped(f"  -> {flag.remedy}", "", width)
+        if len(lines) <= room:
+            return lines
+    return cut(lines, room)
+
+
+def cut(lines: list[Text], room: int) -> list[Text]:
+    """The lines that fit; the last one counts those left out."""
+    if len(lines) <= room:
+        return lines
+    more = line((f"... and {len(lines) - room + 1} lines more: enlarge the terminal", "dim"))
+    return [*lines[: max(0, room - 1)], more][: max(0, room)]
+
+
+def words(text: str) -> str:
+    """A name as people write it: ``SpoolUpFromStill`` -> ``spool up from still``, ``RpmControl`` -> ``RPM control``."""
+    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]", text)
+    return " ".join(
+        part if len(part) > 1 and part.isupper() else part.lower() for part in parts
+    ).replace("rpm", "RPM")
 
 
 def number(value: float | None, digits: int = 0) -> str:
     """A formatted value in groups of three digits; a dash where it is not available."""
     return "-" if value is None else f"{value:,.{digits}f}".replace(",", " ")
-
-
-def duration(seconds: float) -> str:
-    """A time span in words."""
-    whole = max(0, int(seconds))
-    if whole < 100:
-        return f"{whole} s"
-    if whole < 6000:
-        return f"{whole // 60} min"
-    if whole < 48 * 3600:
-        return f"{whole // 3600} h {whole // 60 % 60} min"
-    return f"{whole // 86_400} days {whole // 3600 % 24} h"
-
-
-def age_text(milliseconds: float | None) -> str:
-    """The age of data."""
-    if milliseconds is None:
-        return "-"
-    return f"{milliseconds:.0f} ms" if milliseconds < 10_000 else duration(milliseconds / 1000)
-
-
-def compact(count: float | None) -> str:
-    """A count in four or five characters."""
-    if count is None:
-        return "-"
-    for limit, divisor, unit in ((100_000, 1, ""), (10**8, 1000, "k"), (10**11, 10**6, "M")):
-        if count < limit:
-            return f"{int(count) // divisor}{unit}"
-    return f"{int(count) // 10**9}G"

@@ -1,23 +1,28 @@
 """Watching a source: a live screen with keys, lines without a terminal, or one document."""
 
+import contextlib
+import io
+import os
+import select
+import sys
+import termios
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Console
+from rich.live import Live
 from rich.text import Text
 
-from kontronik_can_gw.desk.monitor import terminal
-from kontronik_can_gw.desk.monitor.lines import ASCII, UNICODE
 from kontronik_can_gw.desk.monitor.model import Monitor
-from kontronik_can_gw.desk.monitor.screen import Choice, file_of, notices, plain_lines, screen
+from kontronik_can_gw.desk.monitor.screen import alarms, notices, screen, table_of
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 
 REFRESH_S = 0.15
-PLAIN_LINE_S = 1.0
+_QUIT = ("q", "\x03", "\x04")
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
@@ -29,99 +34,108 @@ def watch(
     """Show the source until a key, ``stopped``, or without a terminal the end of a file. ``say`` takes notices."""
     console = Console(highlight=False)
     monitor.advance(source.now())
-    if terminal.is_screen(console):
+    if console.is_terminal and not console.is_dumb_terminal:
         _live(console, source, monitor, interval or REFRESH_S, stopped)
     else:
-        _lines(source, monitor, interval or PLAIN_LINE_S, stopped, say)
+        _lines(source, monitor, interval or 1.0, stopped, say)
 
 
 def _live(
     console: Console, source: Source, monitor: Monitor, interval: float, stopped: Stopped
 ) -> None:
-    choice = Choice()
-    glyphs = ASCII if console.options.ascii_only else UNICODE
+    """Draw the screen each ``interval`` seconds and after each key."""
+    page, due = 0, time.monotonic()
+    with _keys() as fd, Live(console=console, screen=True, auto_refresh=False) as live:
+        while not stopped():
+            now = time.monotonic()
+            if now >= due:
+                lines = screen(monitor, source, console.size, page, fd is not None)
+                live.update(Text("\n").join(lines), refresh=True)
+                due = max(due + interval, now + interval / 2)
+            source.pump(monitor.take, min(due, now + 0.1))
+            monitor.advance(source.now())
+            if fd is not None and select.select([fd], [], [], 0)[0]:
+                typed = os.read(fd, 64)
+                key = typed.decode("ascii", "ignore").lower()
+                if not typed or key in _QUIT:  # nothing: the terminal is closed
+                    return
+                page, due = obey(key, source, monitor, page), now
 
-    def draw(size: tuple[int, int], keys: bool) -> list[Text]:
-        return screen(monitor, source, size, choice, glyphs, keys)
 
-    def step(until_s: float) -> bool:
-        source.pump(monitor.take, until_s)
-        monitor.advance(source.now())
-        return not stopped()
-
-    terminal.show(console, draw, step, interval, lambda key: obey(key, source, monitor, choice))
-
-
-def obey(key: str, source: Source, monitor: Monitor, choice: Choice) -> None:
-    """Do what a key asks for."""
+def obey(key: str, source: Source, monitor: Monitor, page: int) -> int:
+    """Do what a key asks for; return the number of the ESC whose page is shown then, 0 for all."""
     count = len(monitor.escs)
     match key:
         case "r":
             monitor.reset()
         case "n" | "p":
-            start = -1 if key == "n" else 0
-            step = 1 if key == "n" else -1
-            choice.esc = ((start if choice.esc is None else choice.esc) + step) % count
-        case "a" | "0" | "\x1b":
-            choice.esc = None
+            return (page + (1 if key == "n" else -1)) % (count + 1)
         case " " if source.is_file:
             source.paused = not source.paused
         case digit if digit.isdecimal() and int(digit) <= count:
-            choice.esc = int(digit) - 1
+            return int(digit)
+    return page
+
+
+@contextlib.contextmanager
+def _keys() -> Iterator[int | None]:
+    """Have single keys read without echo; Ctrl-C and Ctrl-Z are keys too. None where standard input is no terminal of ours."""
+    try:
+        fd = sys.stdin.fileno()
+        before = termios.tcgetattr(fd)
+        works = os.tcgetpgrp(fd) == os.getpgrp()
+    except (OSError, ValueError, AttributeError, io.UnsupportedOperation, termios.error):
+        works = False
+    if not works:
+        yield None
+        return
+    single = before[3] & ~(termios.ECHO | termios.ICANON | termios.ISIG)
+    termios.tcsetattr(fd, termios.TCSADRAIN, [*before[:3], single, *before[4:]])
+    try:
+        yield fd
+    finally:
+        with contextlib.suppress(OSError, termios.error):  # the terminal is closed
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
 def _lines(source: Source, monitor: Monitor, interval: float, stopped: Stopped, say: Say) -> None:
-    """Print plain lines, without terminal control."""
-    due = time.monotonic() + interval
+    """Print the table again and again, without terminal control."""
     before: list[str] = []
-    while not stopped():
-        source.pump(monitor.take, due)
+    while not stopped() and not source.ended:
+        due = time.monotonic() + interval
+        while time.monotonic() < due and not source.ended and not stopped():
+            source.pump(monitor.take, due)
         monitor.advance(source.now())
-        if time.monotonic() < due and not source.ended:
-            continue
-        due = max(due + interval, time.monotonic())  # missed lines are not made up for
-        texts = [text for text, _ in notices(monitor, source)]
-        # a notice without its duration, which changes all the time
-        news = [
-            text.rpartition(" for ")[0] if text.startswith("no frames") else text for text in texts
-        ]
-        for text, new in zip(texts, news, strict=True):
-            if new not in before:
+        news = [text for text, _ in notices(monitor, source)]
+        for text in news:
+            if text not in before:
                 say(text)
-        if before and not texts:
+        if before and not news:
             say(f"{source.name}: frames come")
         before = news
-        for each in plain_lines(monitor):
-            print(each, flush=True)
-        if source.ended:
-            return
+        for line in (*table_of(monitor.escs, 80), *alarms(monitor.escs, 80)):
+            print(line.plain.rstrip(), flush=True)
 
 
 def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> dict[str, Any]:
     """The document after each cyclic message has come, or ``timeout`` (s); of a file that at its end. RunError without a frame."""
-    deadline = time.monotonic() + timeout
-    while not stopped() and not source.ended and (source.is_file or not monitor.is_complete):
+    end = time.monotonic() + timeout
+    while not stopped() and not source.ended:
         now = time.monotonic()
-        if not source.is_file and now >= deadline:
+        if not source.is_file and (monitor.is_complete or now >= end):
             break
-        source.pump(monitor.take, min(deadline, now + REFRESH_S))
+        source.pump(monitor.take, now + REFRESH_S)
     monitor.advance(source.now())
-    file = file_of(monitor)
-    if not monitor.frames and not stopped():
+    file, name, wall = monitor.file, source.name, source.wall_ns()
+    if not monitor.view.frames and not stopped():
         if source.is_file:
-            raise RunError(f"{source.name}: holds no frame of {file}. Give its DBC (--dbc).")
-        silence = f"no frame of {file} on {source.name} for {timeout:g} s."
+            raise RunError(f"{name}: holds no frame of {file}. Give its DBC (--dbc).")
+        silence = f"no frame of {file} on {name} for {timeout:g} s."
         raise RunError(source.problem or " ".join([silence, *source.hints]))
-    wall = source.wall_ns()
-    head = {
-        "time": None if wall is None else _iso(wall),
-        "file" if source.is_file else "interface": source.name,
+    moment = None if wall is None else datetime.fromtimestamp(wall / SECOND, UTC).astimezone()
+    return {
+        "time": None if moment is None else moment.isoformat(timespec="milliseconds"),
+        "file" if source.is_file else "interface": name,
         "dbc": file,
+        **monitor.document(),
     }
-    return head | monitor.document()
-
-
-def _iso(wall_ns: int) -> str:
-    """Date and time with the offset of this machine's zone."""
-    moment = datetime.fromtimestamp(wall_ns / SECOND, UTC).astimezone()
-    return moment.isoformat(timespec="milliseconds")

@@ -1,34 +1,32 @@
 """Home Assistant's discovery: which entity shows which value, with unit, device class and availability. Pure."""
 
-import json
-from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.desk.mqtt.topics import Topics
-from kontronik_can_gw.desk.mqtt.values import Published
 from kontronik_can_gw.esc.values import VALUES, Group
-from kontronik_can_gw.signals.unpacker import Column
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.desk.mqtt.messages import Published, Topics
 
 PROGRAM = "kontronik-can-gw"
-_MEASURED: dict[str, tuple[str, str | None]] = {
-    "V": ("V", "voltage"),
-    "A": ("A", "current"),
-    "W": ("W", "power"),
-    "degC": ("°C", "temperature"),
-    "Hz": ("Hz", "frequency"),
-    "ms": ("ms", "duration"),
-    "1/min": ("rpm", None),
-    "%": ("%", None),
-    "us": ("µs", None),
+_UNITS: dict[str, tuple[str | None, str | None, str]] = {
+    "V": ("V", "voltage", "measurement"),
+    "A": ("A", "current", "measurement"),
+    "W": ("W", "power", "measurement"),
+    "°C": ("°C", "temperature", "measurement"),
+    "Hz": ("Hz", "frequency", "measurement"),
+    "ms": ("ms", "duration", "measurement"),
+    "1/min": ("rpm", None, "measurement"),
+    "%": ("%", None, "measurement"),
+    "µs": ("µs", None, "measurement"),
+    "Wh": ("Wh", "energy", "total_increasing"),
+    "mAh": ("mAh", None, "total_increasing"),
+    "s": ("s", "duration", "total_increasing"),
 }
-"""Our unit: Home Assistant's unit and device class. Speed and charge have no class, and % here is neither humidity nor battery."""
-_TOTALS: dict[str, tuple[str, str | None]] = {
-    "Wh": ("Wh", "energy"),
-    "mAh": ("mAh", None),
-    "s": ("s", "duration"),
-}
-"""Values that only grow until the ESC or the gateway restarts."""
+"""Our unit: Home Assistant's unit, device class and state class. Speed and charge have none, and % is neither humidity nor battery.
+
+What grows does so until the ESC or the gateway restarts.
+"""
 _DIAGNOSTIC = {Group.LINK, Group.INFO, Group.GATEWAY}
 _OF_USE = {"energy_used", "motor_run_time", "link_state"}
 _UPPER = {"bec", "pwm", "crc", "can", "id", "esc", "eeprom"}
@@ -63,14 +61,13 @@ _ERROR_ENTITIES: dict[str, dict[str, Any]] = {
 }
 
 
-def device(topics: Topics, member: Published, columns: Sequence[Column]) -> dict[str, Any]:
+def device(topics: "Topics", member: "Published") -> dict[str, Any]:
     """The discovery of the gateway or of an ESC: one device with all its entities."""
-    identifier = topics.identifier(member.name)
-    online = {"topic": topics.online}
+    identifier, online = topics.identifier(member.name), {"topic": topics.of("online")}
     components: dict[str, dict[str, Any]] = {}
-    for source, at in member.no_flags.items():
-        if (component := entity(source, columns[at])) is not None:
-            components[source] = component
+    for source in member.no_flags:
+        if source not in _LEFT_OUT:
+            components[source] = entity(source, member)
     if member.index is not None and member.has(*member.protocol.bits, *member.protocol.errors):
         components |= _ERROR_ENTITIES
     if member.has("operating_state", "operating_state_raw"):
@@ -80,20 +77,20 @@ def device(topics: Topics, member: Published, columns: Sequence[Column]) -> dict
         if key in VALUES and VALUES[key].group is Group.LINK:
             # values of the link are valid, and most useful, while the ESC sends nothing
             components[key] |= {
-                "availability": [online, {"topic": topics.available()}],
+                "availability": [online, {"topic": topics.of("available")}],
                 "availability_mode": "all",
             }
     return {
         "device": {"identifiers": [identifier], **_about(topics, member)},
         "origin": {"name": PROGRAM, "sw_version": __version__},
-        "availability": [online, {"topic": topics.available(member.name)}],
+        "availability": [online, {"topic": topics.of(member.name, "available")}],
         "availability_mode": "all",
-        "state_topic": topics.state(member.name),
+        "state_topic": topics.of(member.name, "state"),
         "components": components,
     }
 
 
-def _about(topics: Topics, member: Published) -> dict[str, Any]:
+def _about(topics: "Topics", member: "Published") -> dict[str, Any]:
     if member.index is None:
         return {"name": f"KONTRONIK gateway {topics.gateway}", "model": PROGRAM}
     name, (model, firmware) = f"{topics.gateway} {member.name}", member.identity
@@ -102,11 +99,9 @@ def _about(topics: Topics, member: Published) -> dict[str, Any]:
     return about if firmware is None else about | {"sw_version": firmware}
 
 
-def entity(source: str, column: Column) -> dict[str, Any] | None:
-    """Home Assistant's entity of a value; None where another one shows the same."""
-    if source in _LEFT_OUT:
-        return None
-    about = VALUES[source]
+def entity(source: str, member: "Published") -> dict[str, Any]:
+    """Home Assistant's entity of a value."""
+    about, column = VALUES[source], member.view.reader.columns[member.columns[source]]
     made: dict[str, Any] = {
         "platform": "sensor",
         "name": _in_words(source),
@@ -119,31 +114,18 @@ def entity(source: str, column: Column) -> dict[str, Any] | None:
         return made | {"device_class": "enum", "options": options}
     if about.names:  # sent as a plain number
         return made
-    own = column.unit or about.unit
-    unit, kind = _TOTALS.get(own) or _MEASURED.get(own) or (own, None)
-    grows = own in _TOTALS or (own not in _MEASURED and about.rolls)
-    if unit:
-        made["unit_of_measurement"] = unit
-    made["state_class"] = "total_increasing" if grows else "measurement"
-    if kind is not None:
-        made["device_class"] = kind
-    if column.digits is not None:
-        made["suggested_display_precision"] = column.digits
-    return made
+    counts = "total_increasing" if about.rolls else "measurement"
+    unit, kind, made["state_class"] = _UNITS.get(about.unit, (about.unit or None, None, counts))
+    digits = None if source in member.factors else column.digits
+    known = {
+        "unit_of_measurement": unit,
+        "device_class": kind,
+        "suggested_display_precision": digits,
+    }
+    return made | {key: value for key, value in known.items() if value is not None}
 
 
 def _in_words(source: str) -> str:
     words = [word.upper() if word in _UPPER else word for word in source.split("_")]
     text = " ".join("ESCs" if word == "escs" else word for word in words)
     return text[0].upper() + text[1:]
-
-
-def is_ours(payload: bytes, topics: Topics) -> bool:
-    """True for the discovery of this gateway or one of its ESCs, published by any version."""
-    try:
-        found = json.loads(payload)
-        return (
-            found["origin"]["name"] == PROGRAM and {"topic": topics.online} in found["availability"]
-        )
-    except (ValueError, KeyError, TypeError):
-        return False

@@ -9,92 +9,163 @@ Every topic but those of discovery begins with ``<topic>/<gateway>/``; ESC is th
     ESC/state         JSON: every value of the ESC
 
 A state is published at a fixed rate, and at once when errors, the kind of operating state, the link or the availability change. Such
-changes are at least 0.2 s apart, and limited to one a second after a burst of 30.
+changes are at least 0.2 s apart.
 """
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
+from kontronik_can_gw.config.keys import MqttConfig
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.desk.member import Flag, Member
 from kontronik_can_gw.desk.mqtt.discovery import device
-from kontronik_can_gw.desk.mqtt.topics import OFFLINE, ONLINE, Message, Topics
-from kontronik_can_gw.desk.mqtt.values import Published
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.decoder import Severity
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader
 
+ONLINE, OFFLINE = b"online", b"offline"
 MIN_PAUSE_NS = 200 * MS
-MAX_CHANGES = 30
+SILENCE_NS = 3 * SECOND
+"""After this time without a frame the gateway is not available."""
 IDENTITY_NS = 6 * SECOND
 """Time to wait for device and firmware: an ESC sends them about every second, some every five."""
-_CHANGE_EVERY_NS = SECOND
 _FIRST_NS = SECOND // 2
 """Delay of the first state, so that the first frames of all messages can arrive."""
 
 
-class _Timing:
-    """When the state of one member is published."""
+class Message(NamedTuple):
+    """A message to publish. ``lasting``: retained, and published again after each reconnection."""
 
-    def __init__(self, period: int) -> None:
-        self._period = period
+    topic: str
+    payload: bytes
+    lasting: bool = False
+    retain: bool = False
+
+
+@dataclass(frozen=True)
+class Topics:
+    """The topics of one gateway. ``esc`` empty: the gateway's own."""
+
+    prefix: str
+    gateway: str
+
+    def of(self, *levels: str) -> str:
+        """The topic below this gateway's; empty levels are left out."""
+        return "/".join(filter(None, (self.prefix, self.gateway, *levels)))
+
+    def discovery(self, prefix: str, esc: str = "") -> str:
+        return f"{prefix}/device/{self.identifier(esc)}/config"
+
+    def identifier(self, esc: str = "") -> str:
+        """Home Assistant's identifier of a device, constant as long as gateway and ESC keep their names."""
+        return "_".join(filter(None, ("kontronik", self.gateway, esc)))
+
+
+class Published(Member):
+    """What is published of the gateway or an ESC, and when."""
+
+    def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
+        super().__init__(view, settings, index)
+        self.heard_ns: int | None = None
+        """Time of the newest live value."""
+        self.first_heard_ns: int | None = None
+        self.identity: tuple[str | None, str | None] = (None, None)
+        """Device and firmware last known."""
+        self.announced: tuple[str | None, str | None] | None = None
+        """Those of the published discovery."""
+        self._kinds = {normalize(each.text): each.kind for each in self.protocol.states.values()}
         self._due: int | None = None
         self._shown: tuple[object, ...] | None = None
         self._published_ns = 0
-        self._budget, self._budget_ns = float(MAX_CHANGES), 0
 
-    def publishes(self, notable: tuple[object, ...], now: int) -> bool:
-        """True if the state is to be published now: it is due, or something notable has changed."""
+    def is_available(self, now: int) -> bool:
+        """True while frames of the gateway, or live values of the ESC, come."""
+        if self.index is None:
+            last = self.view.last_ns
+            return last is not None and now - last <= SILENCE_NS
+        columns = self.of_group[Group.LIVE] or self.no_flags.values()
+        return any(self.view.values[at] is not None for at in columns)
+
+    def is_due(self, now: int, period: int) -> bool:
+        """True if the state is to be published now: it is time, or something notable has changed."""
         if self._due is None:
             self._due = now + _FIRST_NS
+        notable = self._notable(now)
         if now >= self._due:
             # on a fixed grid; missed times are skipped
-            self._due += self._period * ((now - self._due) // self._period + 1)
-        elif self._shown is None or notable == self._shown or not self._may_change(now):
+            self._due += period * ((now - self._due) // period + 1)
+        elif self._shown in (None, notable) or now - self._published_ns < MIN_PAUSE_NS:
             return False
         self._shown, self._published_ns = notable, now
         return True
 
-    def _may_change(self, now: int) -> bool:
-        """True if a change may be published now, within the pause and the rate limit."""
-        if now - self._published_ns < MIN_PAUSE_NS:
-            return False
-        grown = self._budget + (now - self._budget_ns) / _CHANGE_EVERY_NS
-        self._budget, self._budget_ns = min(MAX_CHANGES, grown), now
-        if self._budget < 1:
-            return False
-        self._budget -= 1
-        return True
+    def _notable(self, now: int) -> tuple[object, ...]:
+        """The values whose change is published at once."""
+        available = self.is_available(now)
+        if self.index is None:
+            return available, self.value("can_state"), self.value("gateway_state")
+        errors, selftest = self.flags("operating_errors"), self.flags("selftest_errors")
+        return available, errors, selftest, self._kind(), self.value("link_state")
+
+    def document(self, now: int) -> dict[str, Any]:
+        """All values as JSON."""
+        heard = self.view.last_ns if self.index is None else self.heard_ns
+        age = None if heard is None else (now - heard) // MS
+        made: dict[str, Any] = {"available": self.is_available(now), "age": age}
+        values = {source: self.value(source) for source in self.no_flags}
+        if self.index is None:
+            return made | values
+        errors, is_error = self.flags("operating_errors"), Severity.ERROR
+        made["motor"] = self._kind()
+        made["errors"] = _in_words(errors)
+        made["problem"] = None if errors is None else any(e.severity is is_error for e in errors)
+        made |= {"selftest": _in_words(self.flags("selftest_errors")), "link_state": None}
+        return made | values | {"firmware": self.firmware}
+
+    def is_news(self, now: int) -> bool:
+        """True where device and firmware are others than announced: once they are known, or stay unknown for long.
+
+        Not before, since the retained discovery of an earlier run may be more complete. What was known stays.
+        """
+        device, firmware = self.identity
+        self.identity = self.device or device, self.firmware or firmware
+        first = self.first_heard_ns
+        waited = first is not None and now - first >= IDENTITY_NS
+        is_settled = self.index is None or None not in self.identity or waited
+        return is_settled and self.identity != self.announced
+
+    def _kind(self) -> str | None:
+        return self._kinds.get(normalize(self.state or ""))
+
+
+def _in_words(flags: Sequence[Flag] | None) -> list[dict[str, str]] | None:
+    if flags is None:
+        return None
+    return [{"name": f.name, "severity": f.severity.value, "meaning": f.meaning} for f in flags]
 
 
 class Publisher:
     """Takes frames, returns messages. ``now``: nanoseconds of one clock; ``wall_ns``: Unix time."""
 
     def __init__(
-        self,
-        bus: BusLayout,
-        topics: Topics,
-        rate: float,
-        *,
-        retain: bool = False,
-        discovery: str | None = None,
-        replay: bool = False,
+        self, bus: BusLayout, topics: Topics, config: MqttConfig, is_replay: bool = False
     ) -> None:
-        self.topics = topics
-        self.view = View(SignalReader(bus.layout))
-        self._retain, self._discovery, self._replay = retain, discovery, replay
-        columns = self.view.reader.columns
+        self._topics, self._config, self._is_replay = topics, config, is_replay
+        self._view = View(SignalReader(bus.layout))
+        columns = self._view.reader.columns
         indices = sorted({column.esc for column in columns if column.esc is not None})
-        self._members = [Published(self.view, None, None)]
-        self._members += [Published(self.view, bus.escs[index], index) for index in indices]
-        self._timings = [_Timing(round(SECOND / rate)) for _ in self._members]
+        self._members = [Published(self._view, None, None)]
+        self._members += [Published(self._view, bus.escs[index], index) for index in indices]
         self._live = {at: m for m in self._members for at in m.of_group[Group.LIVE]}
-        self._published: dict[str, bytes] = {}
+        self._lasting: dict[str, bytes] = {}
         """Lasting messages as published, by topic."""
-        self._discovered: dict[str, tuple[str | None, str | None]] = {}
-        """Device and firmware in the published discovery, by topic."""
 
     @property
     def escs(self) -> list[str]:
@@ -103,55 +174,36 @@ class Publisher:
 
     def take(self, frame: CanFrame, now: int) -> None:
         """Take a frame."""
-        for first, values in self.view.take(frame.key, frame.data, now) or ():
+        for first, values in self._view.take(frame.key, frame.data, now) or ():
             for at, value in enumerate(values, first):
                 if value is not None and at in self._live:
-                    self._live[at].heard(now)
+                    member = self._live[at]
+                    member.heard_ns = now
+                    member.first_heard_ns = member.first_heard_ns or now
 
     def messages(self, now: int, wall_ns: int) -> list[Message]:
         """The messages to publish now."""
-        self.view.expire(now)
+        self._view.expire(now)
         made: list[Message] = []
-        for member, timing in zip(self._members, self._timings, strict=True):
-            if timing.publishes(member.notable(now), now):
-                made += self._lasting(member, now)
-                state: dict[str, Any] = {"time": iso(wall_ns)}
-                if self._replay:
-                    state["replay"] = True
-                topic = self.topics.state(member.name)
-                made.append(
-                    Message(topic, _json(state | member.document(now)), retain=self._retain)
-                )
+        time = {"time": iso(wall_ns)} | ({"replay": True} if self._is_replay else {})
+        for member in self._members:
+            if member.is_due(now, round(SECOND / self._config.rate)):
+                for topic, payload in self._lasting_of(member, now).items():
+                    if self._lasting.get(topic) != payload:
+                        made.append(Message(topic, payload, lasting=True, retain=True))
+                        self._lasting[topic] = payload
+                topic, state = self._topics.of(member.name, "state"), time | member.document(now)
+                made.append(Message(topic, _json(state), retain=self._config.retain))
         return made
 
-    def _lasting(self, member: Published, now: int) -> list[Message]:
-        """Availability and discovery, where they are not published as they are now."""
-        wanted = self._discovery_of(member, now)
-        available = member.is_available(now)
-        wanted[self.topics.available(member.name)] = ONLINE if available else OFFLINE
-        news = {t: payload for t, payload in wanted.items() if self._published.get(t) != payload}
-        self._published |= news
-        return [
-            Message(topic, payload, lasting=True, retain=True) for topic, payload in news.items()
-        ]
-
-    def _discovery_of(self, member: Published, now: int) -> dict[str, bytes]:
-        """The new discovery of a member: once device and firmware are known, or stay unknown for long.
-
-        Not before, since the retained discovery of an earlier run may be more complete.
-        """
-        member.update_identity()
-        if self._discovery is None:
-            return {}
-        topic, known = self.topics.discovery(self._discovery, member.name), member.identity
-        first = member.first_heard_ns
-        waited = first is not None and now - first >= IDENTITY_NS
-        if self._discovered.get(topic) == known or not (
-            member.index is None or None not in known or waited
-        ):
-            return {}
-        self._discovered[topic] = known
-        return {topic: _json(device(self.topics, member, self.view.reader.columns))}
+    def _lasting_of(self, member: Published, now: int) -> dict[str, bytes]:
+        """Availability and, where it is new, discovery."""
+        available = ONLINE if member.is_available(now) else OFFLINE
+        found = {self._topics.of(member.name, "available"): available}
+        if (prefix := self._config.discovery) is not None and member.is_news(now):
+            member.announced = member.identity
+            found[self._topics.discovery(prefix, member.name)] = _json(device(self._topics, member))
+        return found
 
 
 def _json(made: dict[str, Any]) -> bytes:
