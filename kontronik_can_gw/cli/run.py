@@ -78,7 +78,7 @@ class _Run:
     """Runs the gateway, from its configuration to its end."""
 
     def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
-        from kontronik_can_gw.runtime.snapshot import program_facts
+        from kontronik_can_gw.runtime.facts import program_facts
 
         self._args, self._notifier = args, notifier
         self._path = config_file(args.config)

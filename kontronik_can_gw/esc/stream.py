@@ -9,6 +9,8 @@ one interval. An adapter that bundles bytes adds what it holds them back for (1 
 
 from collections import deque
 from collections.abc import Iterator
+from copy import copy
+from typing import Any, Self
 
 from kontronik_can_gw.esc.decoder import Counters, Data, Decoder, Reading
 from kontronik_can_gw.esc.drawn import Drawn
@@ -61,13 +63,19 @@ class EscStream(EscTelemetry):
         self._interval_ns = 0  # between live frames, as usual; 0: not known
         self._window_ns = now
         self._window_counters = self.base
-        self._diagnosis_counters = self.base  # at the start of the window before
 
     @property
     def counters(self) -> Counters:
         """Counters of the whole stream so far."""
         found: Counters = self.decoder.counters
         return found
+
+    def frozen(self) -> Self:
+        twin = copy(self)
+        decoder: Any = copy(self.decoder)
+        decoder.counters = self.counters.copy()
+        twin.drawn, twin.decoder = copy(self.drawn), decoder
+        return twin
 
     def apply(self, settings: EscSettings) -> None:
         super().apply(settings)
@@ -177,7 +185,7 @@ class EscStream(EscTelemetry):
             self.frame_rate = None
             self._interval_ns = 0
             self._window_ns = when
-            self._window_counters = self._diagnosis_counters = self.counters.copy()
+            self._window_counters = self.counters.copy()
         return events | Event.LIVE
 
     def _accept_info(self, data: Data, when: int, bound: int) -> int:
@@ -227,7 +235,6 @@ class EscStream(EscTelemetry):
             or dropped * _DEGRADED_DROPPED_SHARE > received
         )
         self._window_ns = now
-        self._diagnosis_counters = old
         self._window_counters = new.copy()
         if self.up:
             return Event.SECOND | self._set_link(LinkState.DEGRADED if bad else LinkState.OK)

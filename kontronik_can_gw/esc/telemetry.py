@@ -7,7 +7,7 @@ or not known of the device now on the line, is None.
 from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
-from typing import Any
+from typing import Any, Self
 
 from kontronik_can_gw.esc.decoder import Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -98,11 +98,14 @@ class EscTelemetry:
     base: Counters
     base_losses: int
     base_line_errors: int
-    _diagnosis_counters: Counters
 
     @property
     def counters(self) -> Counters:
         """Counters of the whole stream so far."""
+        raise NotImplementedError
+
+    def frozen(self) -> Self:
+        """What is known now, as a copy that nobody changes: any thread may read it."""
         raise NotImplementedError
 
     def apply(self, settings: EscSettings) -> None:
@@ -137,7 +140,3 @@ class EscTelemetry:
         """Let the counters that are shown relative to ``base`` begin anew; the stream's own go on."""
         self.base = self.counters.copy()
         self.base_losses, self.base_line_errors = self.losses, self.line_errors
-
-    def diagnosis(self) -> str | None:
-        """Why no frame comes, in words, from the bytes of one to two seconds; None while frames come."""
-        return None if self.up else self.counters.diagnosis(self._diagnosis_counters)

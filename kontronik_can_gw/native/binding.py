@@ -123,7 +123,8 @@ class WrongObject(RuntimeError):
 def load(path: Path) -> Any:
     """The shared object with its functions declared. WrongObject where it cannot be used."""
     try:
-        library = c.CDLL(str(path))
+        library: Any = c.PyDLL(str(path))  # other threads of Python run only while a turn waits
+        library.kcg_turn = c.CDLL(str(path)).kcg_turn
         for name, (result, *arguments) in _FUNCTIONS.items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, arguments

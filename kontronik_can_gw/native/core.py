@@ -18,8 +18,6 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import Slot, Slots
 
 _LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"
-_OF_ITS_OWN = Event.SECOND | Event.LINK
-"""Followed here in any case."""
 
 
 class NativeCore:
@@ -68,7 +66,7 @@ class NativeCore:
 
     def _choose_events(self) -> None:
         """Be given the events that somebody in Python follows."""
-        events = _OF_ITS_OWN | self._slots.triggers
+        events = Event.LINK | self._slots.triggers  # which is followed here in any case
         for wanted, _ in self._followers:
             events |= wanted
         self.reports_live = bool(events & Event.LIVE)
@@ -117,7 +115,6 @@ class NativeCore:
         """Nothing: this core packs when it hands over."""
 
     def _follow(self, esc: int, events: int, now: int) -> None:
-        self.escs[esc].follow(events)
         if events & Event.LINK:
             self.link_changes.append(esc)
         for wanted, follow in self._followers:

@@ -2,17 +2,16 @@
 
 import struct
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 from kontronik_can_gw.esc.decoder import SECOND_NS, Counters, Data
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 
 _STREAM = COUNTS.index("long_run_bytes") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""
-_COUNT = {name: COUNTS.index(name) for name in ("losses", "late_frames", "suspect_frames")}
 
 
 class NativeDrawn:
@@ -54,42 +53,27 @@ class NativeEsc(EscTelemetry):
         assert self.protocol.wire is not None
         self._forms = [(struct.Struct("<" + codes), kind) for codes, kind in self.protocol.wire]
         self._generation = -1
-        self._link_before = LinkState.NEVER_SEEN
         self._readings: tuple[Data | None, ...] = (None,) * 4
         self._counters_of = type(self.protocol.make().counters)
         self.drawn = NativeDrawn(state)
         self.line_errors = self.base_losses = self.base_line_errors = 0
         self.apply(settings)
-        self.base = self._window_counters = self._diagnosis_counters = self.counters
+        self.base = self.counters
 
-    def follow(self, events: int) -> None:
-        """Keep the counters of the begin of the second before, for ``diagnosis``."""
-        came_up = False
-        if events & Event.LINK:
-            before, self._link_before = self._link_before, self.link
-            came_up = self.link is LinkState.OK and before not in (LinkState.OK, LinkState.DEGRADED)
-        if came_up or events & Event.SECOND:
-            counters = self.counters
-            self._diagnosis_counters = counters if came_up else self._window_counters
-            self._window_counters = counters
+    def frozen(self) -> Self:
+        twin = object.__new__(type(self))
+        state = type(self._state).from_buffer_copy(self._state)
+        twin.__dict__ |= self.__dict__ | {"_state": state, "drawn": NativeDrawn(state)}
+        return twin
+
+    @property
+    def up(self) -> bool:
+        return bool(self._state.has_live)
 
     @property
     def counters(self) -> Counters:
         found: Counters = self._counters_of(*self._state.count[:_STREAM])
         return found
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if (place := _COUNT.get(name)) is not None:
-            self._state.count[place] = value  # as a capture of a later part begins with
-        else:
-            super().__setattr__(name, value)
-
-    def __getattr__(self, name: str) -> Any:
-        if (place := _COUNT.get(name)) is not None:
-            return self._state.count[place]
-        if (read := _READ.get(name)) is None:
-            raise AttributeError(name)
-        return read(self)
 
     def reading(self, place: int) -> Data | None:
         """Live data, info, and the newest ever of both; None where there is none."""
@@ -124,6 +108,22 @@ _READ: dict[str, Callable[[NativeEsc], Any]] = {
     "last_info_ns": lambda esc: esc._state.last_info_ns if esc._state.had_info else None,
     "info_bound_ns": lambda esc: esc._state.info_bound if esc._state.has_info else None,
 }
+for _name, _read in _READ.items():
+    setattr(NativeEsc, _name, property(_read))
+
+
+def _count(place: int) -> property:
+    def read(self: NativeEsc) -> Any:
+        return self._state.count[place]
+
+    def write(self: NativeEsc, value: int) -> None:
+        self._state.count[place] = value  # as a capture of a later part begins with
+
+    return property(read, write)
+
+
+for _name in ("losses", "late_frames", "suspect_frames"):
+    setattr(NativeEsc, _name, _count(COUNTS.index(_name)))
 
 
 def _member(name: str, place: int, kind: Callable[[int], Any] | None) -> property:
@@ -144,6 +144,9 @@ class NativeStatus:
 
     def __init__(self, gateway: Any) -> None:
         self._gateway = gateway
+
+    def __copy__(self) -> "NativeStatus":
+        return NativeStatus(tuple(self._gateway))
 
 
 _KINDS: dict[str, Callable[[int], Any]] = {"state": GatewayState, "can_state": CanState}

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping
 
+from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.fault_log import FaultLog
@@ -25,6 +26,9 @@ class EscLog:
         self._diagnosis_due = 0
         self._diagnosed: set[str] = set()
         self._lost_counters = (0, 0)
+        self._since: Counters | None = self._esc.counters.copy()
+        """Counters at a time before that of ``_sampled``; None: not known since telemetry came."""
+        self._sampled: tuple[int, Counters] | None = None
 
     @property
     def complaint(self) -> str:
@@ -75,12 +79,26 @@ class EscLog:
         else:
             conditions.say(logging.INFO, said)
 
+    @property
+    def diagnosis(self) -> str | None:
+        """Why no frame comes, in words, from the bytes of the last seconds; None while frames come, and shortly after."""
+        if self._esc.up or self._since is None:
+            return None
+        return self._esc.counters.diagnosis(self._since)
+
     def diagnose(self, line_errors: Mapping[str, int], now: int) -> None:
-        """Log why nothing comes, each reason once."""
+        """Log why nothing comes, each reason once. To be called all the time."""
+        if self._esc.up:
+            self._since = self._sampled = None
+            return
+        if self._sampled is None:
+            self._sampled = now, self._esc.counters.copy()
+        elif now - self._sampled[0] >= SECOND:
+            self._since, self._sampled = self._sampled[1], (now, self._esc.counters.copy())
         if not self._diagnosis_due or now < self._diagnosis_due:
             return
         self._diagnosis_due = now + DIAGNOSIS_NS
-        diagnosis = self._esc.diagnosis()
+        diagnosis = self.diagnosis
         if diagnosis and diagnosis not in self._diagnosed:
             self._diagnosed.add(diagnosis)
             text = f"{self._esc.settings.name}: no telemetry: {diagnosis}{_in_words(line_errors)}"

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
@@ -10,6 +10,7 @@ from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.esc_log import EscLog
+from kontronik_can_gw.runtime.facts import PortFacts
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Poller, StuckCheck
 from kontronik_can_gw.runtime.retry import Retry
@@ -20,7 +21,6 @@ from kontronik_can_gw.runtime.serial_port import (
     device_of,
     is_mini_uart,
 )
-from kontronik_can_gw.runtime.snapshot import PortFacts
 from kontronik_can_gw.runtime.usb_adapters import Identity, find_adapter, identity_at
 
 MAX_RETRY_NS = SECOND
@@ -59,9 +59,11 @@ class EscPort:
         self._noted = poller.noted(index)
         self._retry = Retry(MAX_RETRY_NS)
         self.log = EscLog(index, gateway, conditions)
-        self._counted: dict[str, int] = {}
+        self._counted: Mapping[str, int] = {}
         self._stuck = StuckCheck(self._noted)
         self._lost_since: int | None = None
+        self._facts: tuple[int, PortFacts] | None = None
+        """Of the fault log's state with this number; None: of another state of the port."""
 
     @property
     def name(self) -> str:
@@ -69,6 +71,12 @@ class EscPort:
 
     def facts(self) -> PortFacts:
         """For the statistics."""
+        changes, is_down = self._conditions.changes, not self._gateway.escs[self._index].up
+        if is_down or self._facts is None or self._facts[0] != changes:
+            self._facts = changes, self._facts_now()
+        return self._facts[1]
+
+    def _facts_now(self) -> PortFacts:
         return PortFacts(
             self.name,
             self.path if self.port is None else self.port.path,
@@ -77,6 +85,7 @@ class EscPort:
             max(0, self.reopened),
             dict(self.line_errors),
             self._lost_since,
+            self.log.diagnosis,
         )
 
     def open(self, now: int, wait: bool, others: tuple[Identity | None, ...] = ()) -> None:
@@ -96,7 +105,7 @@ class EscPort:
         noted = self._noted
         noted.empty_ns, noted.undrained_ns, noted.is_plain = self._clock(), NEVER, False
         port.discard()  # what came before we listened has no time
-        self.port = port
+        self.port, self._facts = port, None
         self.identity = port.identity()
         self.reopened += 1
         self._lost_since = None
@@ -162,7 +171,7 @@ class EscPort:
         if self.port is not None:
             self._poller.unregister(self.port.fileno())
             self.port.close()
-            self.port = None
+            self.port = self._facts = None
 
     def is_stuck(self) -> bool:
         """True if the loop does not serve this port."""
@@ -172,20 +181,21 @@ class EscPort:
         """Count line errors, look at the port's settings; say why nothing comes."""
         if self.port is None:
             return
-        self._count(self.port.line_errors())
+        if (counts := self.port.line_errors()) is not self._counted:
+            self._count(counts)
         if not self.port.settings_hold():
             text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
             self._conditions.event(f"{self.name}: settings", text, now)
         self.log.diagnose(self.line_errors, now)
 
-    def _count(self, counts: dict[str, int]) -> None:
+    def _count(self, counts: Mapping[str, int]) -> None:
         for kind, count in counts.items():
             # the driver's own begin anew with each plugging in
             new = max(0, count - self._counted.get(kind, 0))
             self.line_errors[kind] = self.line_errors.get(kind, 0) + new
             if kind != "break":  # a break is a framing error too
                 self._gateway.escs[self._index].line_errors += new
-        self._counted = counts
+        self._counted, self._facts = counts, None
 
     def _failed(self, reason: str, now: int, quiet: bool = False) -> None:
         self.due = self._retry.failed(now)

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -10,16 +11,12 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.esc_port import EscPort
+from kontronik_can_gw.runtime.facts import CanFacts, ProgramFacts, gateway_facts
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.process import ProcessFacts, process_facts
-from kontronik_can_gw.runtime.snapshot import (
-    CanFacts,
-    ProgramFacts,
-    name_in_words,
-    snapshot,
-)
+from kontronik_can_gw.runtime.snapshot import name_in_words, snapshot
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.worker import Report
@@ -95,11 +92,12 @@ class Housekeeping:
                 self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
 
     def publish(self, now: int) -> None:
-        """Hand the statistics' thread a document, if it is time."""
+        """Hand the statistics' thread what a document is made of, if it is time."""
         statistics = self._statistics
         if statistics.wanted(now):
-            document = snapshot(
-                self._gateway,
+            make = partial(
+                snapshot,
+                gateway_facts(self._gateway),
                 now=now,
                 wall=time.time(),
                 program=self._program,
@@ -110,7 +108,7 @@ class Housekeeping:
                 log_lines=list(self._conditions.recent),
                 recorder=None if self._recorder is None else self._recorder.facts,
             )
-            statistics.publish(document)
+            statistics.publish(now, make)
         self._log(statistics.reports(now), now)
 
     def _process_now(self, now: int) -> ProcessFacts:

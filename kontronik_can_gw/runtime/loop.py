@@ -16,11 +16,11 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.esc_port import EscPort
+from kontronik_can_gw.runtime.facts import ProgramFacts
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import Bounds, Handler, Poller
-from kontronik_can_gw.runtime.snapshot import ProgramFacts
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
@@ -165,9 +165,9 @@ class Loop:
             return None
         due = min(can.due, housekeeping.wake_due, self.gateway.next_deadline(with_core=False))
         due = min([due, *(esc.due for esc in self._lost)])
-        leave = min(housekeeping.due, can.controller.due)
         max_turn = can.transmitter.max_turn_ns()
         max_late = max(MIN_HELD_UP_NS, max_turn)
+        leave = housekeeping.due  # what the controller says is asked for with it
         return self._poller.turn(can, Bounds(self._now, due, leave, period, max_late, max_turn))
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:

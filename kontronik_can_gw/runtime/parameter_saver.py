@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.esc_port import EscPort
-from kontronik_can_gw.runtime.snapshot import StoreFacts
+from kontronik_can_gw.runtime.facts import StoreFacts
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.storage import Stored

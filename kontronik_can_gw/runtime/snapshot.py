@@ -1,26 +1,40 @@
 """What the gateway knows of itself, as one JSON document for people and programs.
 
-A snapshot is made by the loop's thread from the gateway and from facts about what the loop owns. Every value in it was fresh when it was
-made, or is null.
+A snapshot is made of what the loop's thread copied at one moment, of the gateway and of what the loop owns, in any thread. Every value in
+it was fresh at that moment, or is null.
 """
 
-import os
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import fields
 from enum import Enum
-from functools import lru_cache
-from pathlib import Path
+from functools import cache, lru_cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw import __version__
 from kontronik_can_gw.esc.decoder import Data, EscProtocol, Severity, bit_texts
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscTelemetry
-from kontronik_can_gw.esc.values import VALUES, Group, Value, physical, steps, steps_of, values_of
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.esc.values import (
+    VALUES,
+    Divisor,
+    Group,
+    Kind,
+    Value,
+    physical,
+    steps,
+    steps_of,
+    values_of,
+)
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED
-from kontronik_can_gw.runtime.process import ProcessFacts, pid_namespace, start_ticks
+from kontronik_can_gw.runtime.facts import (
+    CanFacts,
+    GatewayFacts,
+    PortFacts,
+    ProgramFacts,
+    StoreFacts,
+    utc,
+)
+from kontronik_can_gw.runtime.process import ProcessFacts
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import RecorderFacts
@@ -37,73 +51,8 @@ _OTHERWISE = ("variant", "device_raw", "firmware_main", "firmware_sub")
 Document = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class PortFacts:
-    """What the loop knows of one ESC's port. ``lost_since_ns``: monotonic, None while it is open."""
-
-    name: str
-    path: str
-    open: bool
-    complaint: str = ""
-    reopened: int = 0
-    line_errors: Mapping[str, int] = field(default_factory=dict)
-    lost_since_ns: int | None = None
-
-
-@dataclass(frozen=True)
-class CanFacts:
-    """What the loop knows of the CAN interface; its state and its counters are in GatewayStatus."""
-
-    interface: str
-    channel: str
-    bitrate: int | None
-    open: bool
-    complaint: str = ""
-    stalled: bool = False
-    restart_ms: int | None = None
-    error_counters: tuple[int, int] | None = None
-    """Transmit and receive error counter of the controller, where known."""
-
-
-@dataclass(frozen=True)
-class StoreFacts:
-    """Parameters that wait for the disk, and why the last saving failed ('' where it did not)."""
-
-    waiting: int = 0
-    last_error: str = ""
-
-
-@dataclass(frozen=True)
-class ProgramFacts:
-    """What stays the same while the process runs. ``started``: wall clock at start, UTC; ``ticks``: start time in /proc."""
-
-    configuration: str
-    version: str = __version__
-    pid: int = 0
-    ticks: int = 0
-    pid_namespace: str = ""
-    started: str = ""
-
-
-def program_facts(configuration: Path | str) -> ProgramFacts:
-    """About this process."""
-    pid = os.getpid()
-    return ProgramFacts(
-        str(Path(configuration).absolute()),
-        pid=pid,
-        ticks=start_ticks(pid),
-        pid_namespace=pid_namespace(),
-        started=utc(time.time()),
-    )
-
-
-def utc(wall: float) -> str:
-    """Wall clock seconds as text."""
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall))
-
-
 def snapshot(
-    gateway: Gateway,
+    gateway: GatewayFacts,
     *,
     now: int,
     wall: float,
@@ -130,13 +79,13 @@ def snapshot(
             "pid_namespace": program.pid_namespace,
             "started": program.started,
             "uptime_s": _seconds(now - status.started_ns),
-            **asdict(process),
+            **vars(process),
         },
         "gateway": {
             "state": name_in_words(status.state.name),
             "esc_count": status.esc_count,
             "escs_ok": status.escs_ok,
-            "core": gateway.core.language,
+            "core": gateway.core,
             "core_reason": gateway.core_note or None,
         },
         "can": _can(can, status),
@@ -145,11 +94,10 @@ def snapshot(
             _esc(esc, port, status, now) for esc, port in zip(gateway.escs, ports, strict=True)
         ],
         "nodes": [
-            _node(port.name, *found)
-            for port, found in zip(ports, gateway.node_states(), strict=False)
+            _node(port.name, *found) for port, found in zip(ports, gateway.nodes, strict=False)
         ],
         "store": store and {"waiting": store.waiting, "last_error": store.last_error or None},
-        "recording": None if recorder is None else asdict(recorder),
+        "recording": None if recorder is None else vars(recorder),
         "log": list(log_lines)[-LOG_LINES:],
     }
 
@@ -174,7 +122,7 @@ def _can(can: CanFacts, status: GatewayStatus) -> Document:
         "complaint": can.complaint or None,
         "restart_ms": can.restart_ms,
         "error_counters": None if can.error_counters is None else list(can.error_counters),
-        "counters": {name: getattr(status, name) for name in _STATUS_COUNTERS},
+        "counters": dict(zip(_STATUS_COUNTERS, _counters_of(status), strict=True)),
     }
 
 
@@ -230,7 +178,7 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         },
         "link": name_in_words(esc.link.name),
         "fresh": live is not None,
-        "diagnosis": esc.diagnosis() if live is None and port.open else None,
+        "diagnosis": port.diagnosis if live is None and port.open else None,
         "protocol": protocol.name,
         "layout": protocol.layout_text(esc.layout),
         "device": protocol.device_text(info),
@@ -248,18 +196,43 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         },
         **_words(protocol, live, info),
         "values": {
-            **_physical(esc, _LIVE, lambda value: steps_of(value, esc, live)),
-            **_physical(esc, _INFO, lambda value: steps_of(value, esc, info)),
-            **_physical(esc, _LINK, lambda value: steps(value, esc, status, now)),
+            **_of_reading(esc, _LIVE, live),
+            **_of_reading(esc, _INFO, info),
+            **{
+                name: physical(value, esc, steps(value, esc, status, now))
+                for name, value, *_ in _rows(protocol, _LINK)
+            },
         },
     }
 
 
-def _physical(
-    esc: EscTelemetry, names: Sequence[str], found: Callable[[Value], int | None]
-) -> Document:
-    values = values_of(esc.protocol)
-    return {name: physical(values[name], esc, found(values[name])) for name in names}
+def _of_reading(esc: EscTelemetry, names: tuple[str, ...], reading: Data | None) -> Document:
+    """Values of live data or information."""
+    if reading is None:
+        return dict.fromkeys(names)
+    found: Document = {}
+    for name, value, word, per_unit in _rows(esc.protocol, names):
+        if word is None:
+            found[name] = physical(value, esc, steps_of(value, esc, reading))
+        else:  # as ``physical`` has it
+            found[name] = reading[word] if per_unit == 1 else round(reading[word] / per_unit, 6)
+    return found
+
+
+@cache
+def _rows(
+    protocol: EscProtocol, names: tuple[str, ...]
+) -> tuple[tuple[str, Value, int | None, int], ...]:
+    """Name, value, the place of its word where that is all of it, and steps of a unit."""
+    values = values_of(protocol)
+    return tuple(
+        (name, values[name], _whole(values[name]), values[name].per_unit) for name in names
+    )
+
+
+def _whole(value: Value) -> int | None:
+    is_whole = value.kind is Kind.WIRE and value.supplied and not value.not_on
+    return value.words[0] if is_whole and value.divisor is Divisor.ONE else None
 
 
 def _words(protocol: EscProtocol, live: Data | None, info: Data | None) -> Document:
@@ -271,10 +244,15 @@ def _words(protocol: EscProtocol, live: Data | None, info: Data | None) -> Docum
         "errors": alarms.get(Severity.ERROR),
         "warnings": alarms.get(Severity.WARNING),
         "statuses": alarms.get(Severity.STATUS),
-        "selftest_errors": None
-        if selftest is None
-        else bit_texts(selftest, protocol.errors.get("selftest_errors", ())),
+        "selftest_errors": _selftest(protocol, selftest),
     }
+
+
+@lru_cache(maxsize=256)
+def _selftest(protocol: EscProtocol, word: int | None) -> list[str] | None:
+    if word is None:
+        return None
+    return bit_texts(word, protocol.errors.get("selftest_errors", ()))
 
 
 @lru_cache(maxsize=256)
@@ -312,3 +290,4 @@ _STATUS_COUNTERS = tuple(
     for f in fields(GatewayStatus)
     if f.type in (int, "int") and f.name not in ("esc_count", "escs_ok", "started_ns")
 )
+_counters_of = attrgetter(*_STATUS_COUNTERS)

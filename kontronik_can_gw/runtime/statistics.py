@@ -1,8 +1,8 @@
 """The gateway's document of itself (snapshot.py), once a second, to a file that is replaced.
 
 What may touch what: everything is called by the loop's thread; only ``_work``, ``_fail``, ``_end`` and the file's methods run in the
-worker's. The newest document and the mark of a write in progress go from one to the other by single assignments, so that no disk holds
-the loop up.
+worker's. What the newest document is made of and the mark of a write in progress go from one to the other by single assignments, so that
+neither a disk nor the making holds the loop up.
 """
 
 import contextlib
@@ -11,6 +11,7 @@ import json
 import os
 import stat
 import time
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -38,9 +39,11 @@ class Statistics:
         self.due: int | None = None
         """When the next document is wanted; None: never."""
         self._faults = Faults()
-        self._newest: Document | None = None
+        self._newest: Callable[[], Document] | None = None
+        """Makes the newest document."""
+        self._made: Callable[[], Document] | None = None
         self._written: Document | None = None
-        """The last document; of the worker's thread."""
+        """What made the last document, and that; of the worker's thread."""
         self._writing_since: int | None = None
         self._locks = Locks()
         self._worker: Worker[None] | None = None
@@ -65,11 +68,11 @@ class Statistics:
         """True once a second, where anybody wants a document."""
         return self.due is not None and now >= self.due
 
-    def publish(self, document: Document) -> None:
-        """Let this be the newest document; never blocks. It is not to be changed any more."""
+    def publish(self, now: int, make: Callable[[], Document]) -> None:
+        """Let this be what makes the newest document, that of ``now``; never blocks. It is called in the thread."""
         if self._worker is not None and not self._worker.is_ending:
-            self.due = document["monotonic_ns"] + PERIOD_NS
-            self._newest = document
+            self.due = now + PERIOD_NS
+            self._newest = make
             self._worker.put(None)  # without room it is awake already
 
     def reports(self, now: int) -> list[Report]:
@@ -90,13 +93,14 @@ class Statistics:
 
     def _work(self, _items: list[None]) -> None:
         """Write the newest document."""
-        document, before = self._newest, self._written
-        if document is None or document is before:
+        make = self._newest
+        if make is None or make is self._made:
             return
-        self._written = document
+        self._made = make
         if self._worker is not None and not self._worker.is_ending:
+            before, self._written = self._written, make()
             text = json.dumps(
-                with_rates(document, before), ensure_ascii=False, separators=(",", ":")
+                with_rates(self._written, before), ensure_ascii=False, separators=(",", ":")
             )
             self._writing_since = time.monotonic_ns()
             try:

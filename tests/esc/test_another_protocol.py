@@ -27,16 +27,10 @@ from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group, _all_values, values_of
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, ProgramFacts, gateway_facts
 from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.serial_port import SerialPort
-from kontronik_can_gw.runtime.snapshot import (
-    CanFacts,
-    PortFacts,
-    ProgramFacts,
-    _esc,
-    _words,
-    snapshot,
-)
+from kontronik_can_gw.runtime.snapshot import _esc, _words, snapshot
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 from .kiss import GAP_NS, KISS, Kiss, frame
@@ -287,7 +281,7 @@ def test_metrics_and_screen_of_both_in_one_document() -> None:
     undervoltage = LiveData(operating_errors=1)
     flight.send(encode(undervoltage, Layout.V4), frame(20, 2_400, 1_234, 55, 210))
     document = snapshot(
-        flight.gateway,
+        gateway_facts(flight.gateway),
         now=flight.now,
         wall=0,
         program=ProgramFacts("mixed.toml"),

@@ -513,7 +513,7 @@ def test_info_without_news_is_forgotten_after_its_time_out_and_not_before() -> N
     assert telemetry.live is not None
 
 
-# --- counters and diagnosis
+# --- counters
 
 
 def test_the_counters_are_those_of_the_whole_stream() -> None:
@@ -527,27 +527,6 @@ def test_the_counters_are_those_of_the_whole_stream() -> None:
     assert (counters.crc_errors, counters.dropped_bytes) == (1, 60)
     assert counters.bytes == 20 + 40 + 40 + 38 + 44 + 40 + 38
     assert telemetry.suspect_frames == 1
-
-
-def test_there_is_no_diagnosis_while_telemetry_comes_and_one_when_not() -> None:
-    telemetry = alive(SECOND)
-    assert telemetry.diagnosis() is None
-    telemetry.advance(SECOND + TIMEOUT + 1)
-    for second in range(2, 6):
-        telemetry.advance(second * SECOND + TIMEOUT)
-    said = telemetry.diagnosis()
-    assert said is not None
-    assert said.startswith("no bytes")
-
-
-def test_the_diagnosis_does_not_depend_on_how_long_ago_the_second_began() -> None:
-    telemetry = esc()
-    for n in range(1, 61):
-        read(telemetry, bytes((0x55, 0xAA)) * 10, n * 50 * MS - MS)
-        telemetry.advance(n * 50 * MS)
-        said = telemetry.diagnosis()
-        assert said is not None
-        assert said.startswith("bytes but never KOD"), f"after {n * 50} ms"
 
 
 # --- deadlines

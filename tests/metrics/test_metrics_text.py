@@ -10,9 +10,10 @@ from statistics_bench import Bench, with_nodes
 
 from kontronik_can_gw.desk.metrics import _Collected
 from kontronik_can_gw.desk.metrics import families as made
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
-from kontronik_can_gw.runtime.snapshot import CanFacts, PortFacts, StoreFacts
+from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, StoreFacts
 
 UNITS = (
     "volts", "amperes", "watts", "joules", "coulombs", "celsius", "ratio", "seconds", "bytes", "hertz",
@@ -145,9 +146,8 @@ def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_whe
 ):
     bench = Bench(1)
     bench.run(3)
-    esc = bench.gateway.escs[0]
-    assert isinstance(esc.live, LiveData)
-    esc.live = esc.live._replace(operating_errors=1 << OperatingError.OVERVOLTAGE | 1 << 30)
+    errors = LiveData(operating_errors=1 << OperatingError.OVERVOLTAGE | 1 << 30)
+    bench.gateway.receive_bytes(0, encode(errors, Layout.V4), bench.now, bench.now)
     samples = families(bench.document())["kontronik_operating_error"].samples
     assert len(samples) == len(OperatingError) + 1
     known = {s.labels["error"]: s.labels["severity"] for s in samples}

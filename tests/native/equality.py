@@ -130,7 +130,7 @@ STATE = (
         "counters",
     ),
     *("frame_rate", "losses", "late_frames", "suspect_frames", "live_ns", "last_info_ns"),
-    *("info_bound_ns", "pole_pairs", "output_divisor", "gear_denominator", "_diagnosis_counters"),
+    *("info_bound_ns", "pole_pairs", "output_divisor", "gear_denominator"),
 )
 
 

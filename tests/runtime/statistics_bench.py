@@ -10,14 +10,15 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.process import ProcessFacts
-from kontronik_can_gw.runtime.snapshot import (
+from kontronik_can_gw.runtime.facts import (
     CanFacts,
     PortFacts,
     ProgramFacts,
     StoreFacts,
-    snapshot,
+    gateway_facts,
 )
+from kontronik_can_gw.runtime.process import ProcessFacts
+from kontronik_can_gw.runtime.snapshot import snapshot
 from kontronik_can_gw.signals.plan import Layout
 
 START = 1000 * SECOND
@@ -74,7 +75,7 @@ class Bench:
         """The document now, as a reader of the file gets it."""
         names = [esc.settings.name for esc in self.gateway.escs]
         document = snapshot(
-            self.gateway,
+            gateway_facts(self.gateway),
             now=self.now if at is None else at,
             wall=1_700_000_000.5,
             program=program,

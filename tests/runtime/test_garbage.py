@@ -16,18 +16,12 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, ProgramFacts, gateway_facts
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings
-from kontronik_can_gw.runtime.snapshot import (
-    CanFacts,
-    Document,
-    PortFacts,
-    ProgramFacts,
-    snapshot,
-    with_rates,
-)
+from kontronik_can_gw.runtime.snapshot import Document, snapshot, with_rates
 
 FRAMES = 3000
 START = range(1, 100)
@@ -131,7 +125,7 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
             recorder.note(gateway, now)
             recorder.reports(now)
         if turn % 20 == 0:
-            document = snapshot(gateway, now=now, can=can, **facts)  # type: ignore[arg-type]
+            document = snapshot(gateway_facts(gateway), now=now, can=can, **facts)  # type: ignore[arg-type]
             document = with_rates(document, before[-1] if before else None)
             written += len(json.dumps(document))
             before[:] = [document]

@@ -4,23 +4,45 @@ import os
 from dataclasses import fields, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import pytest
-from statistics_bench import Bench
+from statistics_bench import PROGRAM, Bench
 
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, state_text
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.runtime.process import process_facts, start_ticks
-from kontronik_can_gw.runtime.snapshot import (
-    LOG_LINES,
-    PortFacts,
-    program_facts,
-)
+from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
+from kontronik_can_gw.runtime.process import ProcessFacts, process_facts, start_ticks
+from kontronik_can_gw.runtime.snapshot import LOG_LINES, snapshot
 from kontronik_can_gw.runtime.statistics import default_file
+
+
+def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> None:
+    bench = Bench()
+    bench.run(3)
+    facts: dict[str, Any] = {
+        "now": bench.now,
+        "wall": 0.0,
+        "program": PROGRAM,
+        "process": ProcessFacts(),
+        "ports": [PortFacts(f"esc{n}", "/dev/null", True) for n in (1, 2)],
+        "can": CanFacts("socketcan", "can0", 500_000, True),
+    }
+    moment = gateway_facts(bench.gateway)
+    document = snapshot(moment, **facts)
+    bench.silent = {1}
+    bench.run(2)
+    bench.gateway.escs[0].line_errors += 1
+    bench.gateway.status.sent_frames += 1
+    bench.gateway.core.apply(0, EscSettings("another", 3))
+    assert snapshot(moment, **facts) == document
+    assert snapshot(gateway_facts(bench.gateway), **facts)["escs"] != document["escs"]
+    assert document["escs"][1]["fresh"]
 
 
 def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
@@ -95,15 +117,14 @@ def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> No
 
 def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_error() -> None:
     bench = Bench(1)
-    bench.run(1)
-    esc = bench.gateway.escs[0]
-    assert esc.live is not None
     word = (
         1 << OperatingError.UNDERVOLTAGE
         | 1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING
+        | 1 << OperatingError.PROGRAMMING_ALLOWED
         | 1 << 31
     )
-    esc.live = esc.live._replace(operating_errors=word | 1 << OperatingError.PROGRAMMING_ALLOWED)
+    frame = encode(LiveData(operating_errors=word), Layout.V4)
+    bench.gateway.receive_bytes(0, frame, bench.now, bench.now)
     (shown,) = bench.document()["escs"]
     assert shown["errors"] == ["undervoltage", "bit31"]
     assert shown["warnings"] == ["power_stage_overtemp_warning"]

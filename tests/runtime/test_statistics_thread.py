@@ -8,6 +8,7 @@ import stat
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,12 @@ def number_in(file: Path) -> int:
         return 0
 
 
+def publish(statistics: Statistics, number: int) -> None:
+    statistics.publish(number * SECOND, partial(numbered, number))
+
+
 def put(statistics: Statistics, file: Path, number: int) -> None:
-    statistics.publish(numbered(number))
+    publish(statistics, number)
     until(lambda: number_in(file) == number)
 
 
@@ -106,7 +111,7 @@ def test_a_document_is_wanted_at_once_and_then_once_a_second(
     file: Path, statistics: Statistics
 ) -> None:
     assert statistics.wanted(0)
-    statistics.publish(numbered(5))
+    publish(statistics, 5)
     assert not statistics.wanted(5 * SECOND + PERIOD_NS - 1)
     assert statistics.wanted(5 * SECOND + PERIOD_NS)
     assert statistics.due == 6 * SECOND
@@ -127,12 +132,12 @@ def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = StuckDisk(monkeypatch)
-    statistics.publish(numbered(1))
+    publish(statistics, 1)
     assert disk.stuck.wait(PATIENCE)
     now = statistics._writing_since
     assert now is not None
     for number in range(2, 502):
-        statistics.publish(numbered(number))  # which never waits
+        publish(statistics, number)  # which never waits
     assert statistics.reports(now + STALE_NS) == []
     (report,) = statistics.reports(now + STALE_NS + 1)
     assert report.begins and str(file) in report.text and "disk does not answer" in report.text
@@ -154,7 +159,7 @@ def test_the_end_removes_the_file_ends_the_thread_and_closes_what_was_opened(fil
         statistics.close()
         assert os.listdir(file.parent) == []
         statistics.close()
-        statistics.publish(numbered(2))  # too late, and nothing happens
+        publish(statistics, 2)  # too late, and nothing happens
     assert descriptors() == before
     assert threading.active_count() == threads
     assert os.listdir(file.parent) == []
@@ -187,9 +192,9 @@ def test_a_file_that_became_another_gateways_is_left_alone(
 def test_a_folder_that_is_missing_is_told_once_and_the_file_comes_with_it(tmp_path: Path) -> None:
     file = tmp_path / "run" / "status.json"
     statistics = Statistics(file)
-    statistics.publish(numbered(1))
+    publish(statistics, 1)
     (report,) = reports(statistics, 1)
-    statistics.publish(numbered(2))
+    publish(statistics, 2)
     assert report == Report(
         "statistics: file",
         True,
@@ -218,7 +223,7 @@ def test_a_full_disk_leaves_the_old_document_and_no_half_one(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
-        statistics.publish(numbered(2))
+        publish(statistics, 2)
         (report,) = reports(statistics, 1)
         assert report.begins and "No space left on device" in report.text
         assert number_in(file) == 1
@@ -230,7 +235,7 @@ def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
     target = tmp_path / "device"
     os.mkfifo(target)
     statistics = Statistics(target)
-    statistics.publish(numbered(1))
+    publish(statistics, 1)
     (report,) = reports(statistics, 1)
     assert report.begins and "no plain file" in report.text
     statistics.close()

@@ -27,15 +27,15 @@ from kontronik_can_gw.desk.monitor.status import (
 )
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime.process import pid_namespace
-from kontronik_can_gw.runtime.snapshot import (
-    STALE_NS,
+from kontronik_can_gw.runtime.facts import (
     CanFacts,
     PortFacts,
     ProgramFacts,
     StoreFacts,
     program_facts,
 )
+from kontronik_can_gw.runtime.process import pid_namespace
+from kontronik_can_gw.runtime.snapshot import STALE_NS
 
 Document = dict[str, Any]
 
@@ -102,7 +102,9 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     bench = heard()
     bench.silent.add(1)
     bench.run(2)
-    seen = judged(bench.document())
+    why = "no bytes: ESC off"  # which is shown only of the one that is not heard
+    ports = [PortFacts(name, "/dev/a", True, diagnosis=why) for name in ("esc1", "esc2")]
+    seen = judged(bench.document(ports=ports))
     assert (seen.code, seen.sentence) == (TROUBLE, "running, 1 fault")
     assert seen.troubles[0].startswith("esc2: no bytes: ESC off")
 

@@ -7,6 +7,7 @@ is counted and dropped. At most 43 bytes are held; work is linear in the bytes f
 """
 
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from zlib import crc32
 
 from kontronik_can_gw.esc.decoder import Reading
@@ -104,11 +105,11 @@ class Counters:
 
     def as_dict(self) -> dict[str, int]:
         """All counters and totals by name."""
-        own = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {"live": self.live, "info": self.info, "dropped_bytes": self.dropped_bytes} | own
+        sums = {"live": self.live, "info": self.info, "dropped_bytes": self.dropped_bytes}
+        return sums | dict(zip(_NAMES, _all_of(self), strict=True))
 
     def copy(self) -> "Counters":
-        return Counters(*(getattr(self, f.name) for f in fields(self)))
+        return Counters(*_all_of(self))
 
     def diagnosis(self, since: "Counters | None" = None) -> str | None:
         """What is wrong with a line from which no frame comes, in words; None while frames come."""
@@ -128,6 +129,10 @@ class Counters:
         if noise >= 64 and (self.long_run_bytes - old.long_run_bytes) * 10 >= noise * 9:
             return "bytes but never KOD, in long runs of equal bits: a slower line, as the 9600 baud of an old JIVE (not PRO)"
         return "bytes but never KOD: wrong parity (8E1 is needed), inverted signal, or the ESC is set to another protocol"
+
+
+_NAMES = tuple(f.name for f in fields(Counters))
+_all_of = attrgetter(*_NAMES)
 
 
 class Deframer:
