@@ -86,12 +86,16 @@ class NativeCore:
         self._handle.advance(now)
         self._slots.advance(now)
 
+    def advance_in_python(self, now: int) -> None:
+        """The same for what C does not know: the slots in Python."""
+        self._slots.advance(now)
+
     def next_deadline(self) -> int:
         return min(self._handle.next_deadline(), self._slots.next_deadline())
 
     def deadline_in_python(self) -> int:
-        """The same of what C does not know: the slots in Python."""
-        return self._slots.next_deadline()
+        """When ``advance_in_python`` has something to do; 0 while one of these slots is pending."""
+        return 0 if self._slots.is_pending else self._slots.next_deadline()
 
     def turns(self) -> Turns:
         """Whole turns of a loop with this core."""
