@@ -40,6 +40,12 @@ class Output:
         self.state_changes = 0
         """Grows with each change of a node's state or node-ID."""
 
+    @property
+    def marks(self) -> tuple[int, ...]:
+        """Others where something has changed that the runtime follows, but for ``frames``."""
+        ids, changes = id(self.receive_ids), self.state_changes
+        return ids, changes, len(self.saves), len(self.rejected_parameters)
+
     def own_ids(self) -> Mapping[int, Owner]:
         """The ids that only this output sends with, and what for."""
         return {}

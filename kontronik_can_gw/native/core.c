@@ -1246,11 +1246,6 @@ int64_t kcg_next_deadline(kcg *g)
     return g->heaped ? earlier(due, due_of(g, g->heap[0])) : due;
 }
 
-int kcg_expires(const kcg *g, int64_t now)
-{
-    return now >= g->next_expiry;
-}
-
 void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
 {
     kcg_esc *e = &g->esc[esc];

@@ -172,7 +172,6 @@ int kcg_advance(kcg *g, int64_t now);
 int kcg_port(kcg *g, int esc, int is_open, int64_t now);
 int kcg_next_event(kcg *g);
 int64_t kcg_next_deadline(kcg *g);
-int kcg_expires(const kcg *g, int64_t now); /* true where kcg_receive and kcg_advance would first let something expire */
 void kcg_apply(kcg *g, int esc, const kcg_settings *settings);
 void kcg_gateway_changed(kcg *g, int each_second, int64_t now);
 void kcg_repeat(kcg *g, int64_t now);

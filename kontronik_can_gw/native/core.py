@@ -84,20 +84,29 @@ class NativeCore:
         self._handle.advance(now)
         self._slots.advance(now)
 
+    def advance_in_python(self, now: int) -> None:
+        """The same for what C does not know: the slots in Python."""
+        self._slots.advance(now)
+
     def next_deadline(self) -> int:
         return min(self._handle.next_deadline(), self._slots.next_deadline())
 
     def deadline_in_python(self) -> int:
-        """The same of what C does not know: the slots in Python."""
-        return self._slots.next_deadline()
+        """When ``advance_in_python`` has something to do; 0 while one of these slots is pending."""
+        return 0 if self._slots.is_pending else self._slots.next_deadline()
 
     def turns(self) -> Turns:
         """Whole turns of a loop with this core."""
         return Turns(self._handle.library, self._handle.core, len(self.escs))
 
     def follow(self, found: int, now: int) -> None:
-        """Follow an event that a turn came back with, and what else there is."""
-        self._handle.follow(found, now)
+        """Follow an event that a turn came back with; if there are others it comes back with each."""
+        self._follow(found >> 8, found & 0xFF, now)
+
+    def follow_others(self, now: int) -> None:
+        """Follow these, where the rest of the turn is the loop's."""
+        handle = self._handle
+        handle.follow(handle.library.kcg_next_event(handle.core), now)
 
     @property
     def is_pending(self) -> bool:

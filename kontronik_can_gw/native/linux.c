@@ -42,18 +42,34 @@ static int has_room(const kcg_turns *t, size_t size)
     return !t->records || sizeof t->ring - t->recorded >= size + 2 * sizeof(kcg_entry);
 }
 
-/* Take what has come from an ESC; an event to be followed, -1: none, -2: it is the loop's. */
-static int serve(kcg_turns *t, int fd, kcg_input *in)
+/* Read what has come from an ESC; false where that is the loop's. */
+static int fetch(kcg_turns *t, int fd, kcg_input *in)
 {
     ssize_t size = has_room(t, KCG_READ) ? read(fd, t->data, KCG_READ) : 0;
     if (size <= 0)
-        return -2;
+        return 0;
     in->served = 1;
-    int64_t since = in->undrained != KCG_DRAINED ? in->undrained : in->asked;
-    int64_t passed = since + size * BYTE_NS;
+    t->size = (uint32_t)size;
+    t->since = in->undrained != KCG_DRAINED ? in->undrained : in->asked;
+    int64_t passed = t->since + size * BYTE_NS;
     in->undrained = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked at the turn's end */
-    note(t, KCG_NOTE_BYTES, in->esc, t->data, (uint32_t)size, since);
-    return kcg_receive(t->core, in->esc, t->data, (size_t)size, t->now, since);
+    note(t, KCG_NOTE_BYTES, in->esc, t->data, t->size, t->since);
+    return 1;
+}
+
+/* Take what has come from the next ESC, or, after an event, what the core has not taken yet; false where that is the loop's. */
+static int serve(kcg_turns *t)
+{
+    uint16_t place = t->place[t->at];
+    kcg_input *in = &t->inputs[t->input_of[place]];
+    if (!t->size && !fetch(t, t->fds[place].fd, in))
+        return 0;
+    t->found = kcg_receive(t->core, in->esc, t->data, t->size, t->now, t->since);
+    if (t->found >= KCG_AGAIN)
+        t->found &= ~KCG_AGAIN;
+    else
+        t->size = 0, t->at++;
+    return 1;
 }
 
 /* Hand the frames that wait to the bus, as far as it takes them: what sendmmsg answered last, below 0 with errno, or that they are old. */
@@ -83,6 +99,7 @@ static int hand_over(kcg_turns *t)
     }
     kcg_gateway(t->core)[KCG_SENT_FRAMES] += sent;
     t->unsent -= sent;
+    t->spoken -= sent < t->spoken ? sent : t->spoken;
     memmove(t->frames, t->frames + sent, t->unsent * sizeof *t->frames);
     return went;
 }
@@ -99,7 +116,7 @@ static void watch_room(kcg_turns *t, int is_full)
 /* Let a frame wait: in the place of an older one of its id and page. */
 static void put(kcg_turns *t, const kcg_frame *made)
 {
-    uint32_t i = 0;
+    uint32_t i = t->spoken;
     while (i < t->unsent && (t->frames[i].id != made->id || t->frames[i].page != made->page))
         i++;
     kcg_gateway(t->core)[KCG_REPLACED_FRAMES] += i < t->unsent;
@@ -125,7 +142,7 @@ static int transmit(kcg_turns *t)
         if (t->unsent && !t->is_full) {
             uint32_t waiting = t->unsent;
             int went = hand_over(t), is_full = went < 0 && errno == EAGAIN;
-            if (t->unsent && (!is_full || t->records))
+            if (t->unsent && (!is_full || t->records || t->spoken))
                 return 0;
             kcg_gateway(t->core)[KCG_SEND_FAILURES] += is_full;
             if (t->unsent < waiting || !before)
@@ -191,14 +208,15 @@ static int wait_for_turn(kcg_turns *t)
     int64_t due = kcg_next_deadline(t->core), wake = t->asked + t->period, begun = now_ns(), limit = MS * 3600000;
     if (t->due < due)
         due = t->due;
+    int64_t up = wake < due ? 0 : MS - 1; /* by which a wait is too long rather than too short: not where it is to ask all */
     if (wake < due)
         due = wake;
     int64_t last = t->now, pause = due > begun ? due - begun : 0;
-    int ready = epoll_wait(t->epoll, events, AT_ONCE, (int)(((pause < limit ? pause : limit) + MS - 1) / MS));
+    int ready = epoll_wait(t->epoll, events, AT_ONCE, (int)(((pause < limit ? pause : limit) + up) / MS));
     t->now = now_ns();
     t->late = t->now - last - pause;
-    t->ready = 0;
-    if (ready < 0 || t->late > t->max_late || t->now >= t->due || kcg_expires(t->core, t->now))
+    t->ready = t->at = t->size = t->advanced = 0;
+    if (ready < 0 || t->late > t->max_late || t->now >= t->due)
         return 0;
     for (int i = 0; i < ready; i++) {
         uint32_t place = events[i].data.u32;
@@ -213,26 +231,28 @@ static int wait_for_turn(kcg_turns *t)
     return 1;
 }
 
-/* One turn; false where something is left of it. */
+/* A turn, or the rest of one after an event: until there is one (`found`), or to its end; false where something is left of it. */
 static int turn(kcg_turns *t)
 {
-    for (uint32_t i = 0; i < t->ready; i++) {
-        uint16_t place = t->place[i];
-        t->found = serve(t, t->fds[place].fd, &t->inputs[t->input_of[place]]);
-        if (t->found != -1)
+    if (t->found >= 0)
+        t->found = kcg_next_event(t->core);
+    while (t->at < t->ready && t->found < 0)
+        if (!serve(t))
             return 0;
+    if (t->found < 0 && !t->advanced) {
+        if (!t->ready && t->now < kcg_next_deadline(t->core) && (!t->unsent || t->is_full))
+            return !t->unsent || t->now - t->full_since < MAX_FULL; /* nothing has come, nothing is due */
+        note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
+        t->found = kcg_advance(t->core, t->now);
+        t->advanced = 1;
     }
-    if (!t->ready && t->now < kcg_next_deadline(t->core) && (!t->unsent || t->is_full))
-        return !t->unsent || t->now - t->full_since < MAX_FULL; /* nothing has come, nothing is due */
-    note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
-    t->found = kcg_advance(t->core, t->now);
-    return t->found < 0 && transmit(t);
+    return t->found >= 0 || transmit(t);
 }
 
-void kcg_turn(kcg_turns *t)
+void kcg_begin(kcg_turns *t)
 {
     t->found = -1;
-    t->unsent = t->taken = t->recorded = t->turns = 0;
+    t->unsent = t->spoken = t->taken = t->recorded = t->turns = 0;
     for (uint32_t i = 0; i < t->count; i++)
         if (t->fds[i].fd == t->bus) {
             t->bus_place = i, t->fds[i].revents = 0;
@@ -240,19 +260,33 @@ void kcg_turn(kcg_turns *t)
             kcg_input *in = &t->inputs[t->input_of[i]];
             in->asked = in->empty > t->asked ? in->empty : t->asked;
         }
-    while (wait_for_turn(t)) {
-        int is_done = turn(t) && t->now < t->leave && has_room(t, KCG_RING / 2);
+}
+
+int kcg_turn(kcg_turns *t)
+{
+    while (t->found >= 0 || wait_for_turn(t)) {
+        int is_done = turn(t);
+        if (t->found >= 0)
+            return 1;
         t->turns++;
-        if (!is_done) {
+        if (!is_done || t->now >= t->leave || !has_room(t, KCG_RING / 2)) {
             t->late = 0;
             break;
         }
-        if (t->now - t->asked >= (t->period < ASK_ALL ? t->period : ASK_ALL))
+        if (t->now - t->asked >= (t->period - MS < ASK_ALL ? t->period - MS : ASK_ALL))
             ask_all(t);
         else
             ask_read(t);
     }
+    kcg_leave(t);
+    return 0;
+}
+
+void kcg_leave(kcg_turns *t)
+{
     watch_room(t, 0);
+    if (t->found >= 0)
+        t->turns++, t->late = 0;
     ask_all(t);
     t->late += t->asked - t->now;
 }

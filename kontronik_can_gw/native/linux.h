@@ -25,8 +25,11 @@ typedef struct {
     int64_t now, asked, before, late;    /* the last turn; when was asked what is ready, and the time before; how late that was */
     int64_t due, leave, period, max_late, max_turn; /* the loop's deadline; when to come back; how often all are to be asked; limits of lateness */
     int64_t full_since;                  /* the bus takes nothing */
+    int64_t since;                       /* nothing of `data` had come by then */
     int32_t epoll, bus, found;           /* descriptors; an event to be followed; below 0: none */
     uint32_t count, ready, unsent, taken, turns, records, recorded, bus_place, is_full;
+    uint32_t spoken;                     /* of `unsent`, the first: frames of outputs, in their order, never replaced */
+    uint32_t at, size, advanced;         /* of this turn: the next of `ready`; bytes in `data` that the core is to be given; time has passed */
     struct pollfd fds[KCG_FDS];
     int16_t input_of[KCG_FDS];            /* place in `inputs`, -1: none of an ESC */
     uint16_t place[KCG_AT_ONCE];         /* in `fds`, of the `ready` ports of this turn */
@@ -36,7 +39,10 @@ typedef struct {
 
 /* `fds` are others: wait for these. 0 where that cannot be. */
 int kcg_watch(kcg_turns *t);
-/* Turn until there is something for the loop; then `fds` says what is ready. */
-void kcg_turn(kcg_turns *t);
+void kcg_begin(kcg_turns *t);
+/* Turn until there is something for the loop: 0, and `fds` says what is ready; or until `found` is an event to be followed: 1. Then it is called
+   again (and asks kcg_next_event), with the frames that the outputs have made of it in `frames`, or kcg_leave: the rest of the turn is the loop's. */
+int kcg_turn(kcg_turns *t);
+void kcg_leave(kcg_turns *t);
 uint32_t kcg_turns_size(void);
 #endif

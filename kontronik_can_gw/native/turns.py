@@ -2,16 +2,23 @@
 
 import ctypes as c
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.output import NEVER
 
 _OUT, _MADE, _READ, _RING, _MAX_FDS, _AT_ONCE = 512, 256, 1 << 12, 1 << 18, 1024, 64
 _ENTRY = struct.Struct("=qqIBBxx")
+_CLASSIC = struct.Struct("=IB3x8s")
+_FRAME_SIZE = c.sizeof(Frame)
 _u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_int64
+
+
+def _is_plain(frame: CanFrame) -> bool:
+    return frame.queued and not (frame.fd or frame.remote)
 
 
 class Input(c.Structure):
@@ -35,13 +42,13 @@ class _Turns(c.Structure):
         *((name, c.c_void_p) for name in ("core", "inputs")),
         *((name, _i64) for name in ("now", "asked", "before", "late")),
         *((name, _i64) for name in ("due", "leave", "period", "max_late", "max_turn")),
-        ("full_since", _i64),
+        *((name, _i64) for name in ("full_since", "since")),
         *((name, _i32) for name in ("epoll", "bus", "found")),
         *(
             (name, _u32)
             for name in (
                 *("count", "ready", "unsent", "taken", "turns", "records", "recorded"),
-                *("bus_place", "is_full"),
+                *("bus_place", "is_full", "spoken", "at", "size", "advanced"),
             )
         ),
         ("fds", _PollFd * _MAX_FDS),
@@ -63,8 +70,14 @@ class Turns:
             one.esc, one.undrained_ns = esc, NEVER
         self.state = _Turns(core=core, inputs=c.addressof(self.inputs), epoll=-1)
         assert library.kcg_turns_size() == c.sizeof(self.state)
-        self._run, self._watch = library.kcg_turn, library.kcg_watch
-        self._address = c.byref(self.state)
+        self._address = address = c.byref(self.state)
+        self._watch = library.kcg_watch
+        self.begin = partial(library.kcg_begin, address)
+        """To be called before the first ``run``."""
+        self.run: Callable[[], int] = partial(library.kcg_turn, address)
+        """Turn until there is something for the loop: 0; or an event is to be followed: then it is to be called again, or ``leave``."""
+        self.leave = partial(library.kcg_leave, address)
+        """The rest of the turn is the loop's."""
         self._raw = memoryview(self.state).cast("B")
 
     def watch(self, descriptors: Sequence[tuple[int, int, int | None]]) -> bool:
@@ -82,9 +95,26 @@ class Turns:
         """Wait for nothing any more."""
         self.watch(())
 
-    def run(self) -> None:
-        """Turn until there is something for the loop."""
-        self._run(self._address)
+    def speak(self, frames: Sequence[CanFrame]) -> bool:
+        """Let what outputs have made of an event be sent before the core's frames. False where that is the loop's."""
+        state = self.state
+        count = state.unsent + len(frames)
+        if state.unsent != state.spoken or count > _MADE or not all(map(_is_plain, frames)):
+            return False
+        at = _Turns.frames.offset + state.unsent * _FRAME_SIZE
+        for can_id, data, extended, *_ in frames:
+            number = can_id | EXTENDED if extended else can_id
+            _CLASSIC.pack_into(self._raw, at, number, len(data), data)
+            at += _FRAME_SIZE
+        state.unsent = state.spoken = count
+        state.taken += len(frames)
+        return True
+
+    def read(self) -> tuple[int, bytes, int, int]:
+        """What the core has been given and not taken yet, as the arguments of Core.receive."""
+        state = self.state
+        esc = state.input_of[state.place[state.at]]
+        return esc, bytes(state.data[: state.size]), state.now, state.since
 
     def ready(self) -> list[tuple[int, int]]:
         """The descriptors that are ready, with what happened."""
@@ -93,7 +123,10 @@ class Turns:
 
     def unsent(self) -> list[CanFrame]:
         """The frames that the bus did not take, in their order."""
-        return frames_in(self._raw, _Turns.frames.offset, self.state.unsent)
+        state = self.state
+        frames = frames_in(self._raw, _Turns.frames.offset, state.unsent)
+        spoken = [frame._replace(queued=True) for frame in frames[: state.spoken]]
+        return spoken + frames[state.spoken :]
 
     def entries(self) -> Iterator[tuple[int, int, int, bytes, int | None]]:
         """What was recorded: (time, kind, ESC, data, since when it can have come), in its order."""

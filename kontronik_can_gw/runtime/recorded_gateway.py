@@ -89,10 +89,11 @@ class RecordedGateway(Gateway):
         self._note(now, Kind.CAN_STATE, flags=int(state))
         super().set_can_state(state, now)
 
-    def advance(self, now: int) -> None:
-        self._note_line_errors(now)
-        self._note(now, Kind.ADVANCE)
-        super().advance(now)
+    def advance(self, now: int, with_core: bool = True) -> None:
+        if with_core:  # otherwise the core's own was recorded
+            self._note_line_errors(now)
+            self._note(now, Kind.ADVANCE)
+        super().advance(now, with_core)
 
     def take_frames(self, now: int) -> list[CanFrame]:
         frames = super().take_frames(now)

@@ -7,15 +7,27 @@ import struct
 import threading
 import time
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import pytest
+import wire_world
+from dialogue import shipped_eds
 from equality import layout, settings, stream
+from sanitized import run_sanitized
 
+from kontronik_can_gw.canopen.cob_ids import EMERGENCY, HEARTBEAT
+from kontronik_can_gw.canopen.node_settings import NodeSettings
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
@@ -35,10 +47,24 @@ class LocalBus(socket.socket):
         pass
 
 
-class World:
-    """A loop with recorder, its ESCs' wires, and what comes out. ``is_slow``: the bus takes what is sent only now and then."""
+def _nodes(escs: Sequence[EscSettings], wanted: bool) -> CanopenSetup | None:
+    """Self-starting ones with default PDOs."""
+    if not wanted:
+        return None
+    count = len(escs)
+    settings = tuple(NodeSettings(1 + n, self_start=True) for n in range(count))
+    return CanopenSetup(shipped_eds(), settings, (Stored(),) * count, tuple(escs))
 
-    def __init__(self, seed: int, is_slow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+
+class World:
+    """A loop with recorder, its ESCs' wires, and what comes out.
+
+    ``is_slow``: the bus takes what is sent only now and then. ``has_nodes``: each ESC has a CANopen node.
+    """
+
+    def __init__(
+        self, seed: int, is_slow: bool, monkeypatch: pytest.MonkeyPatch, has_nodes: bool = False
+    ) -> None:
         self.chance = chance = random.Random(seed)
         self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
         self.layout = layout(chance, self.escs)
@@ -52,7 +78,10 @@ class World:
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 if is_slow else 1 << 20)
         port = LocalBus(fileno=ours.detach())
         monkeypatch.setattr(can_link, "open_can", lambda _: SocketCanPort(port, port.close))
-        self.gateway = RecordedGateway(self.put, self.escs, self.layout, time.monotonic_ns())
+        self.canopen = _nodes(self.escs, has_nodes)
+        begun = time.monotonic_ns()
+        arguments = (self.escs, self.layout, begun)
+        self.gateway = RecordedGateway(self.put, *arguments, canopen=self.canopen)
         self.begun = self.gateway.status.started_ns
         self.poller = NativePoller(self.gateway)
         ports = [os.ttyname(terminal) for _, terminal in pairs]
@@ -109,7 +138,7 @@ class World:
     def replayed(self, monkeypatch: pytest.MonkeyPatch) -> list[CanFrame]:
         monkeypatch.setenv(load.PURE, "1")
         load.library.cache_clear()
-        gateway = Gateway(self.escs, self.layout, self.begun)
+        gateway = Gateway(self.escs, self.layout, self.begun, canopen=self.canopen)
         assert gateway.core.language == "Python"
         replay = Replay(gateway)
         frames = [timed.frame for timed in replay.follow(self.entries)]
@@ -120,11 +149,12 @@ class World:
 @pytest.fixture(autouse=True)
 def _core_in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.delenv(load.PURE, raising=False)
-    load.library.cache_clear()
-    if load.library()[0] is None:
-        pytest.skip(f"the core in C: {load.library()[1]}")
+    library = load.library
+    library.cache_clear()
+    if library()[0] is None:
+        pytest.skip(f"the core in C: {library()[1]}")
     yield
-    load.library.cache_clear()
+    library.cache_clear()
 
 
 def on_the_wire(frames: Sequence[CanFrame]) -> list[tuple[int, bytes]]:
@@ -140,6 +170,69 @@ def test_what_is_sent_is_what_a_replay_in_python_sends(
     assert world.poller.count >= 200
     assert world.received == on_the_wire(world.replayed(monkeypatch))
     assert len(world.received) == world.gateway.status.sent_frames > 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_with_nodes_too_what_is_sent_is_what_a_replay_in_python_sends(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nearly each live frame has other error bits. Order within an id: queue and slots take turns in Python's transmit queue."""
+    world = World(seed, False, monkeypatch, has_nodes=True)
+    world.run(300)
+    replayed = on_the_wire(world.replayed(monkeypatch))
+    for can_id in {number for number, _ in replayed}:
+        received = [data for number, data in world.received if number == can_id]
+        assert received == [data for number, data in replayed if number == can_id]
+    assert len(world.received) == len(replayed) == world.gateway.status.sent_frames
+    assert sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed) > 500
+
+
+@pytest.mark.parametrize("has_nodes", [True, False])
+def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebody_wants_it(
+    has_nodes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop comes round for housekeeping, and heartbeats; an emergency goes in front of what the core sends in its turn."""
+    monkeypatch.setenv(load.PURE, "0")
+    world = wire_world.World()
+    escs = (EscSettings("esc1"),)
+    loop = wire_world.loop_in(world, monkeypatch, escs, canopen=_nodes(escs, has_nodes))
+    events: list[int] = []
+    turns: list[int] = []
+    _count(monkeypatch, loop._poller, "_follow", lambda: events.append(_found(loop)))
+    _count(monkeypatch, loop, "_serve", lambda: turns.append(world.now))
+    loop.open()
+    loop.begin()
+    wire, begun = world.wires[0], world.now
+    for n in range(400):
+        frame = encode(LiveData(operating_errors=n // 2 % 2 << 20), WireLayout.V4)
+        wire.put(frame, [begun + n * 10 * MS] * len(frame))
+    wire_world.run(loop, world, begun + 4 * SECOND)
+    assert len(turns) < 4 * 4
+    states = [found for found in events if found & Event.STATE]
+    emergencies = [(at, f) for at, f in world.bus.sent if f.can_id == EMERGENCY + 1]
+    assert len(emergencies) == (199 if has_nodes else 0)
+    assert (len(states) > 150) if has_nodes else not states
+    for at, _ in emergencies:
+        together = [frame.can_id for when, frame in world.bus.sent if when == at]
+        assert together[0] in (EMERGENCY + 1, HEARTBEAT + 1)
+        assert len(together) > 1
+    loop.close()
+
+
+def _found(loop: Loop) -> int:
+    found: int = loop._poller._turns.state.found  # type: ignore[attr-defined]
+    return found & 0xFF
+
+
+def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], None]) -> None:
+    """``note`` is called before each call of a method."""
+    method = getattr(of, name)
+
+    def noted(*arguments: Any) -> Any:
+        note()
+        return method(*arguments)
+
+    patch.setattr(of, name, noted)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -158,3 +251,34 @@ def test_where_the_bus_does_not_take_all_the_newest_values_are_sent(
         assert all(any(data == other for other in all_of_it) for data in got)
     waiting = len(world.loop.can.transmitter.queue)
     assert status.sent_frames + status.replaced_frames + waiting == len(replayed)
+
+
+@pytest.mark.extended
+def test_turns_and_hold_ups_touch_nothing_outside_their_memory_and_nothing_is_undefined(
+    tmp_path: Path,
+) -> None:
+    found = run_sanitized(tmp_path, "-c", _UNDER_SANITIZERS)
+    assert all(int(count) > 50 for count in found.split()), found
+
+
+_UNDER_SANITIZERS = """
+import os, pathlib, sys
+del os.environ["LD_PRELOAD"]  # the compiler needs none
+os.environ["KONTRONIK_PURE"] = "0"
+import pytest, native_world, sanitized, test_hold_ups, test_turns_in_c
+from kontronik_can_gw.native import binding, load
+
+patch = pytest.MonkeyPatch()
+plain = binding.load(pathlib.Path(sys.argv[1]))
+patch.setattr(load, "library", lambda: (plain, ""))
+for seed, is_slow, has_nodes in ((0, False, True), (1, True, False), (5, False, True)):
+    with pytest.MonkeyPatch.context() as each:
+        world = test_turns_in_c.World(seed, is_slow, each, has_nodes)
+        world.run(80)
+        print(len(world.received))
+faked = native_world.library(sanitized.SANITIZED)
+patch.setattr(native_world, "library", lambda: faked)
+hold_ups = test_hold_ups.test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true
+for seed in range(3):
+    hold_ups.hypothesis.inner_test(seed, 60, 10, 0.05, seed % 2, seed % 3)
+"""
