@@ -53,7 +53,9 @@ def until(condition: Callable[[], bool]) -> float:
     while time.monotonic() - start < LIMIT_S:
         if condition():
             return time.monotonic() - start
-        time.sleep(0.2)  # the machine has one processor: who asks all the time holds up what it waits for
+        time.sleep(
+            0.2
+        )  # the machine has one processor: who asks all the time holds up what it waits for
     return -1.0
 
 
