@@ -345,7 +345,7 @@ def broken(rng: random.Random, text: str) -> str:
 def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words() -> None:
     text = shipped("dbc/kontronik_esc.dbc").read_text()
     refusals = 0
-    for seed in range(100):
+    for seed in range(40):
         rng = random.Random(seed)
         mutated = broken(rng, text)
         names = rng.choice((("esc1",), ("left", "right")))
@@ -354,4 +354,4 @@ def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words() -> 
         except UserError:
             refusals += 1
             refused(mutated, names, node="KontronikGateway")
-    assert 20 < refusals < 90
+    assert 8 < refusals < 36
