@@ -30,7 +30,8 @@ def pytest_collection_finish() -> None:
 
 TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
-    *("gateway", "golden", "dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
+    *("gateway", "golden/test_golden.py::test_no_frame_has_changed"),
+    *("dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
     *(
         "capture/test_replay_is_identical.py",
         "canopen/test_outages_and_order.py",
@@ -40,13 +41,14 @@ ON_BOTH_CORES = (
     *("runtime/test_esc_input.py", "runtime/test_snapshot.py"),
     *("recordings/test_plain_bytes.py", "recordings/test_tables.py"),
 )
-"""Files and folders of tests of what the core does: they run on the core in C and on the one in Python."""
+"""Tests of what the core does, folders, files or single ones: they run on the core in C and on the one in Python."""
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run the tests of the core on both."""
-    path = Path(str(metafunc.module.__file__)).relative_to(TESTS)
-    if any(path.is_relative_to(each) for each in ON_BOTH_CORES):
+    file = Path(str(metafunc.module.__file__)).relative_to(TESTS)
+    places = (*map(str, (file, *file.parents)), f"{file}::{metafunc.function.__name__}")
+    if any(place in ON_BOTH_CORES for place in places):
         metafunc.parametrize("core_language", ["C", "Python"], indirect=True)
 
 

@@ -137,7 +137,7 @@ def test_an_eds_that_asks_for_too_much_is_refused_shortly(more: str, said: str) 
     assert all(len(line) < 900 for line in found)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject) -> None:
     lines = SHIPPED.split("\r\n")

@@ -148,7 +148,7 @@ node_ids = st.sampled_from((1, 127, 255, 255, 255))
 
 
 @given(traffic, node_ids, node_ids)
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_any_traffic_has_exactly_the_answers_and_the_state_that_looking_back_gives(
     frames: list[bytes], active: int, pending: int
 ) -> None:

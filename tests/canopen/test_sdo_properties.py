@@ -36,7 +36,7 @@ def requests(draw: st.DrawFn) -> bytes:
     return bytes((command,)) + index.to_bytes(2, "little") + bytes((sub,)) + tail
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(requests(), st.sampled_from([0, MS, 60 * MS, 2000 * MS])), max_size=40))
 def test_whatever_comes_nothing_raises_and_the_next_client_is_served(
     story: list[tuple[bytes, int]],
@@ -178,7 +178,7 @@ def losing(seed: int, percent: int) -> Callable[[], bool]:
     return lambda: chance.randrange(100) < percent
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(
     DATA,
     st.lists(st.integers(1, 127), min_size=1, max_size=4),
@@ -233,7 +233,7 @@ def test_a_download_to_the_largest_object_ends_at_64_kib(in_blocks: bool) -> Non
     assert caught.value.code == Abort.TOO_LONG
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     DATA,
     st.lists(st.integers(1, 127), min_size=1, max_size=5),

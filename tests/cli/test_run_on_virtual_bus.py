@@ -1,10 +1,8 @@
-"""The gateway at work on pseudo terminals and python-can's in-process bus; parts of the runtime on a fake socket."""
+"""The gateway at work on pseudo terminals and python-can's in-process bus."""
 
-import errno
 import os
 import re
 import select
-import struct
 import subprocess
 import sys
 import termios
@@ -21,14 +19,8 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.driver_port import DriverPort
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
-from kontronik_can_gw.transmit_queue import Sent
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIVE = LiveData(
@@ -165,122 +157,3 @@ def test_the_demonstration_in_a_pipe_prints_plain_lines() -> None:
     assert re.search(r"esc1 +ok 1\d\d Hz +motor off +0 2\d\.\d\d ", done.stdout)
     assert "\x1b" not in done.stdout
     assert "CAN frames decoded" in done.stderr
-
-
-# --- the CAN port on a fake socket
-
-
-class FakeSocket:
-    """A raw CAN socket: ``faults`` are the errors of the next sends, ``inbox`` is what comes."""
-
-    def __init__(self) -> None:
-        self.faults: list[int] = []
-        self.inbox: list[bytes] = []
-        self.sent: list[bytes] = []
-
-    def setsockopt(self, *option: object) -> None:
-        pass
-
-    def getsockopt(self, _level: int, _name: int, size: int) -> bytes:
-        return bytes(size)
-
-    def setblocking(self, blocking: bool) -> None:
-        assert not blocking
-
-    def fileno(self) -> int:
-        return 99
-
-    def send(self, data: bytes) -> None:
-        if self.faults:
-            number = self.faults.pop(0)
-            raise OSError(number, os.strerror(number))
-        self.sent.append(data)
-
-    def recvmsg(self, _size: int, _ancillary_size: int) -> tuple[bytes, list[Any], int, None]:
-        if not self.inbox:
-            raise BlockingIOError
-        return self.inbox.pop(0), [], 0, None
-
-
-@pytest.fixture
-def fake() -> FakeSocket:
-    return FakeSocket()
-
-
-@pytest.fixture
-def port(fake: FakeSocket) -> CanPort:
-    return SocketCanPort(fake, lambda: None)  # type: ignore[arg-type]
-
-
-def test_frames_go_out_as_the_kernel_wants_them(port: CanPort, fake: FakeSocket) -> None:
-    assert port.send(CanFrame(0x6D8, b"abc")) is Sent.OK
-    assert port.send(CanFrame(0x6D8, b"abcdefgh", extended=True)) is Sent.OK
-    assert port.send(CanFrame(0x1, bytes(64), fd=True)) is Sent.OK
-    assert struct.unpack("=IB3x8s", fake.sent[0]) == (0x6D8, 3, b"abc" + bytes(5))
-    assert struct.unpack("=IB3x8s", fake.sent[1]) == (0x8000_06D8, 8, b"abcdefgh")
-    assert struct.unpack("=IBB2x64s", fake.sent[2]) == (1, 64, 1, bytes(64))
-    assert port.state is CanState.ERROR_ACTIVE
-
-
-@pytest.mark.parametrize(
-    ("faults", "answer", "state"),
-    [
-        ([errno.ENOBUFS], Sent.BUSY, CanState.UNKNOWN),
-        ([errno.ENOMEM], Sent.BUSY, CanState.UNKNOWN),
-        ([errno.EAGAIN], Sent.FULL, CanState.UNKNOWN),
-        ([errno.ENETDOWN], Sent.OK, CanState.ERROR_ACTIVE),  # an old report: it is up again
-        ([errno.ENETDOWN] * 2, Sent.DOWN, CanState.DOWN),
-        ([errno.ENXIO], Sent.GONE, CanState.DOWN),
-        ([errno.ENODEV], Sent.GONE, CanState.DOWN),
-        ([errno.EBADF], Sent.GONE, CanState.DOWN),
-    ],
-)
-def test_a_refusal_of_the_kernel_shows_what_is_wrong(
-    port: CanPort, fake: FakeSocket, faults: list[int], answer: Sent, state: CanState
-) -> None:
-    fake.faults = list(faults)
-    frame = CanFrame(1, b"\1")
-    assert (port.send(frame), port.state) == (answer, state)
-    assert answer is Sent.GONE or port.send(frame) is Sent.OK, "it is tried again"
-
-
-def error_frame(kind: int, detail: int = 0) -> bytes:
-    return struct.pack("=IB3x8s", 0x2000_0000 | kind, 8, bytes((0, detail)))
-
-
-@pytest.mark.parametrize(
-    ("packet", "state"),
-    [
-        (error_frame(0x40), CanState.BUS_OFF),
-        (error_frame(0x100), CanState.ERROR_ACTIVE),
-        (error_frame(0x04, 0x04), CanState.ERROR_WARNING),
-        (error_frame(0x04, 0x08), CanState.ERROR_WARNING),
-        (error_frame(0x04, 0x10), CanState.ERROR_PASSIVE),
-        (error_frame(0x04, 0x20), CanState.ERROR_PASSIVE),
-        (error_frame(0x04, 0x30), CanState.ERROR_PASSIVE),
-        (error_frame(0x04, 0x40), CanState.ERROR_ACTIVE),
-        (error_frame(0x04, 0x00), CanState.UNKNOWN),
-        (error_frame(0x20, 0x40), CanState.UNKNOWN),  # no acknowledge: says nothing of the state
-        (struct.pack("=IB3x8s", 0x40, 8, b"\x40" * 8), CanState.UNKNOWN),  # data
-        (b"short", CanState.UNKNOWN),
-    ],
-)
-def test_error_frames_show_the_controllers_state_and_do_not_hold_the_loop(
-    port: CanPort, fake: FakeSocket, packet: bytes, state: CanState
-) -> None:
-    fake.inbox = [packet] * 1000
-    assert port.receive() == []
-    assert port.state is state
-    assert len(fake.inbox) >= 900
-    port.close()
-
-
-def test_another_interfaces_refusal_is_busy() -> None:
-    class Refusing:
-        def send(self, _message: can.Message, timeout: float) -> None:
-            assert timeout == 0
-            raise can.CanOperationError("full")
-
-    refusing = DriverPort(Refusing())  # type: ignore[arg-type]
-    assert refusing.fileno() is None
-    assert refusing.send(CanFrame(1, b"")) is Sent.BUSY

@@ -188,7 +188,7 @@ def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_the
     assert 'BA_ "SystemSignalLongSymbol"' not in text
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40))
 def test_any_comment_and_any_text_come_through(words: str) -> None:
     escaped = words.replace('"', '\\"')

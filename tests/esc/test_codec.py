@@ -25,7 +25,7 @@ from . import reference, sheet
 from .sheet import FORM_ROWS, Field, FormRow
 from .streams import decoded, form_of
 
-PROPERTY = settings(deadline=None, max_examples=150, database=None)
+PROPERTY = settings(deadline=None, max_examples=75, database=None)
 
 RECORDED_LIVE_VALUES = {
     "electrical_speed": 0,

@@ -25,7 +25,7 @@ from .reference import certain_at, counters_of, frames_of, random_frame, seal
 from .sheet import FORM_ROWS, FormRow
 from .streams import Uart, random_chunks, random_stream, seeds, streams
 
-PROPERTY = settings(deadline=None, max_examples=250, database=None)
+PROPERTY = settings(deadline=None, max_examples=100, database=None)
 LIVE_LEGACY, INFO_LEGACY, LIVE_V4, INFO_V4 = FORM_ROWS
 
 form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
@@ -101,7 +101,7 @@ def state_of(deframer: Deframer) -> tuple[dict[str, int], int]:
 # ---- against the brute force
 
 
-@settings(PROPERTY, max_examples=300)
+@settings(PROPERTY, max_examples=150)
 @given(stream=streams, seed=seeds)
 @example(b"", 0)
 @example(b"KOD", 0)

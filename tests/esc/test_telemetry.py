@@ -582,7 +582,7 @@ def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[LiveData]:
     return found
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(st.integers(0, 2**32), st.booleans())
 def test_what_is_shown_was_received_within_the_time_out_whatever_comes(
     seed: int, advance: bool
@@ -605,7 +605,7 @@ def test_what_is_shown_was_received_within_the_time_out_whatever_comes(
         assert telemetry.up is (telemetry.link in (LinkState.OK, LinkState.DEGRADED))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(st.integers(0, 2**32))
 def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_deadlines(
     seed: int,
@@ -631,7 +631,7 @@ def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_dead
             break  # from here on time would run backwards for one of them
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32))
 def test_a_clean_stream_loses_nothing_however_it_is_cut(seed: int) -> None:
     source = random.Random(seed)

@@ -9,6 +9,7 @@ from bus_watch import SECOND
 from harness import Bench, Injection, half, injected
 from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter
+from traffic_faults import still_answers
 
 LIMIT_S = 1.0
 ACTIVE, PASSIVE = 1, 3
@@ -28,11 +29,12 @@ def wait_can_state(bench: Bench, state: int) -> None:
 
 
 def back_up(injection: Injection) -> None:
-    """The interface is up again, and each node says that it has started anew."""
+    """The interface is up again, each node says that it has started anew, and hears."""
     injection.cleared()
     ip("link", "set", injection.bench.interface, "up")
     injection.wait_recovery()
     boot_ups(injection)
+    still_answers(injection)
 
 
 def boot_ups(injection: Injection) -> None:
@@ -42,7 +44,7 @@ def boot_ups(injection: Injection) -> None:
 
 @on_cable(
     "interface down and up",
-    rounds=lambda times: [0.05, 0.5, 1.2] * times + [24 if times > 10 else 4],
+    rounds=lambda times: [0.05, 0.5, 1.2] * max(1, times // 2) + [24 if times > 10 else 4],
 )
 def down(bench: Bench, injection: Injection, pause: float) -> None:
     ip("link", "set", bench.interface, "down")

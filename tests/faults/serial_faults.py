@@ -76,7 +76,7 @@ def permission(bench: Bench, injection: Injection, _n: int) -> None:
 @on_first(
     "port gone and back",
     LIMIT_S,
-    rounds=lambda times: [0.05, 0.3, 0.7] * times + [24 if times > 10 else 4],
+    rounds=lambda times: [0.05, 0.3, 0.7] * max(1, times // 2) + [24 if times > 10 else 4],
 )
 def gone(bench: Bench, injection: Injection, pause: float) -> None:
     port = port_of(bench)
@@ -268,7 +268,7 @@ def flood(bench: Bench, injection: Injection, _n: int) -> None:
 @fault("Serial", "ports gone and back again and again", LIMIT_S, bench="cycles")
 def cycles(bench: Bench, fault: Fault, times: int) -> None:
     """Nothing grows: memory, descriptors and threads after the cycles are what they were after the first few."""
-    rounds = 500 if times > 10 else 75
+    rounds = 500 if times > 10 else 25
     ports = [port for port in bench.ports if isinstance(port, PtyPort)]
     row = bench.report.row(fault)
     assert bench.gateway is not None

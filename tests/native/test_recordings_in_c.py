@@ -32,8 +32,8 @@ def test_rows_frames_damage_and_text_are_those_of_python(
 def test_the_same_over_many_more_recordings(
     native_library: Any, tmp_path: Path, group: int
 ) -> None:
-    seeds = range(1_000 + group, 1_100, 10)
-    assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 5_000
+    seeds = range(1_000 + group, 1_040, 10)
+    assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 2_000
 
 
 def test_what_it_does_not_play_python_plays(native_library: Any, tmp_path: Path) -> None:

@@ -404,5 +404,5 @@ def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> 
     bench.can.serve(bench.now)
     assert not bench.can.is_open
     bench.turn(600)
-    assert bench.port is not before
+    assert bench.port is not before and bench.port.ids == before.ids
     assert told(bench.take()) == ["boot-up"]

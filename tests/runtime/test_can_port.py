@@ -56,6 +56,8 @@ class FakeSocket:
         self.ancillary: list[tuple[int, int, bytes]] = []
         self.drops = 0
         self.fault = 0
+        self.refusals: list[int] = []
+        """Errors of the next sends."""
 
     def setsockopt(self, _level: int, name: int, value: bytes | int) -> None:
         if self.fault:
@@ -72,6 +74,9 @@ class FakeSocket:
         return 99
 
     def send(self, data: bytes) -> None:
+        if self.refusals:
+            number = self.refusals.pop(0)
+            raise OSError(number, os.strerror(number))
         if len(self.sent) == self.full:
             raise OSError(errno.ENOBUFS, "No buffer space available")
         self.sent.append(data)
@@ -236,6 +241,68 @@ def test_an_interface_that_goes_while_filters_are_set_is_gone(
     assert port.send(CanFrame(2, b"")) is Sent.GONE
 
 
+def test_frames_go_out_as_the_kernel_wants_them(port: CanPort, fake: FakeSocket) -> None:
+    assert port.send(CanFrame(0x6D8, b"abc")) is Sent.OK
+    assert port.send(CanFrame(0x6D8, b"abcdefgh", extended=True)) is Sent.OK
+    assert port.send(CanFrame(0x1, bytes(64), fd=True)) is Sent.OK
+    assert struct.unpack("=IB3x8s", fake.sent[0]) == (0x6D8, 3, b"abc" + bytes(5))
+    assert struct.unpack("=IB3x8s", fake.sent[1]) == (0x8000_06D8, 8, b"abcdefgh")
+    assert struct.unpack("=IBB2x64s", fake.sent[2]) == (1, 64, 1, bytes(64))
+    assert port.state is CanState.ERROR_ACTIVE
+
+
+@pytest.mark.parametrize(
+    ("faults", "answer", "state"),
+    [
+        ([errno.ENOBUFS], Sent.BUSY, CanState.UNKNOWN),
+        ([errno.ENOMEM], Sent.BUSY, CanState.UNKNOWN),
+        ([errno.EAGAIN], Sent.FULL, CanState.UNKNOWN),
+        ([errno.ENETDOWN], Sent.OK, CanState.ERROR_ACTIVE),  # an old report: it is up again
+        ([errno.ENETDOWN] * 2, Sent.DOWN, CanState.DOWN),
+        ([errno.ENXIO], Sent.GONE, CanState.DOWN),
+        ([errno.ENODEV], Sent.GONE, CanState.DOWN),
+        ([errno.EBADF], Sent.GONE, CanState.DOWN),
+    ],
+)
+def test_a_refusal_of_the_kernel_shows_what_is_wrong(
+    port: CanPort, fake: FakeSocket, faults: list[int], answer: Sent, state: CanState
+) -> None:
+    fake.refusals = list(faults)
+    frame = CanFrame(1, b"\1")
+    assert (port.send(frame), port.state) == (answer, state)
+    assert answer is Sent.GONE or port.send(frame) is Sent.OK, "it is tried again"
+
+
+@pytest.mark.parametrize(
+    ("received", "state"),
+    [
+        (packet(ERROR | 0x40, bytes(8)), CanState.BUS_OFF),
+        (packet(ERROR | 0x100, bytes(8)), CanState.ERROR_ACTIVE),
+        (packet(ERROR | 0x04, b"\0\x04" + bytes(6)), CanState.ERROR_WARNING),
+        (packet(ERROR | 0x04, b"\0\x08" + bytes(6)), CanState.ERROR_WARNING),
+        (packet(ERROR | 0x04, b"\0\x10" + bytes(6)), CanState.ERROR_PASSIVE),
+        (packet(ERROR | 0x04, b"\0\x20" + bytes(6)), CanState.ERROR_PASSIVE),
+        (packet(ERROR | 0x04, b"\0\x30" + bytes(6)), CanState.ERROR_PASSIVE),
+        (packet(ERROR | 0x04, b"\0\x40" + bytes(6)), CanState.ERROR_ACTIVE),
+        (packet(ERROR | 0x04, b"\0\x00" + bytes(6)), CanState.UNKNOWN),
+        (
+            packet(ERROR | 0x20, b"\0\x40" + bytes(6)),
+            CanState.UNKNOWN,
+        ),  # no acknowledge: says nothing of the state
+        (packet(0x40, b"\x40" * 8), CanState.UNKNOWN),  # data
+        (b"short", CanState.UNKNOWN),
+    ],
+)
+def test_error_frames_show_the_controllers_state_and_do_not_hold_the_loop(
+    port: CanPort, fake: FakeSocket, received: bytes, state: CanState
+) -> None:
+    fake.inbox = [received] * 1000
+    assert port.receive() == []
+    assert port.state is state
+    assert len(fake.inbox) >= 900
+    port.close()
+
+
 def test_a_remote_frame_is_sent_as_one(port: CanPort, fake: FakeSocket) -> None:
     port.send(CanFrame(0x701, b"", remote=True))
     assert fake.sent == [packet(0x701 | REMOTE)]
@@ -355,6 +422,17 @@ def message(can_id: int, data: bytes = b"", **flags: Any) -> can.Message:
     return can.Message(
         arbitration_id=can_id, data=data, is_extended_id=flags.pop("is_extended_id", False), **flags
     )
+
+
+def test_another_interfaces_refusal_is_busy() -> None:
+    class Refusing:
+        def send(self, _message: can.Message, timeout: float) -> None:
+            assert timeout == 0
+            raise can.CanOperationError("full")
+
+    refusing = DriverPort(Refusing())  # type: ignore[arg-type]
+    assert refusing.fileno() is None
+    assert refusing.send(CanFrame(1, b"")) is Sent.BUSY
 
 
 def test_without_ids_there_is_no_thread_and_nothing_to_wait_for() -> None:

@@ -25,7 +25,8 @@ for folder; do
     mkdir -p "$folder"
     mount --move "/run/kept/$number" "$folder"
 done
-for folder in /var/lib /var/log; do mount -t tmpfs tmpfs "$folder"; done
+# each "systemctl daemon-reload" would run the machine's generators anew, a dozen processes of which nothing is needed here
+for folder in /var/lib /var/log /usr/lib/systemd/system-generators; do mount -t tmpfs tmpfs "$folder"; done
 mount -t cgroup2 cgroup2 /sys/fs/cgroup
 echo 0123456789abcdef0123456789abcdef >/etc/machine-id
 

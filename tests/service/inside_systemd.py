@@ -53,7 +53,9 @@ def until(condition: Callable[[], bool]) -> float:
     while time.monotonic() - start < LIMIT_S:
         if condition():
             return time.monotonic() - start
-        time.sleep(0.05)
+        time.sleep(
+            0.2
+        )  # the machine has one processor: who asks all the time holds up what it waits for
     return -1.0
 
 
@@ -160,6 +162,7 @@ def trial(facts: Facts) -> None:
     write_configuration(CONFIGURATION.with_name("left.toml"), "vcan1", "/dev/ttyUSB7")
     facts["install left"] = service("install", "--instance", "left", "--now")
     facts["status of both"] = service("status", "-n", "1")
+    simulator.terminate()
     facts["uninstall left"] = service("uninstall", "--instance", "left")
     facts["left"] = shown("kontronik-can-gw@left.service")
 
@@ -182,7 +185,6 @@ def trial(facts: Facts) -> None:
     facts["purge"] = service("uninstall", "--purge")
     facts["after purge"] = [shown(), left_over(), run("id", "kontronik-can-gw")["code"]]
     facts["status in the end"] = service("status")
-    simulator.terminate()
 
 
 def left_over() -> list[str]:

@@ -100,7 +100,7 @@ def test_zencan_scans_reads_writes_and_stores(
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
         wait_for(lambda: len(dump.of(0x705)) >= 2 and len(dump.of(0x706)) >= 2, "heartbeats")
 
-        found = zencan("scan", slower=20)  # it waits for a dozen that are not there
+        found = zencan("scan", slower=10)  # it waits for a dozen that are not there
         assert re.findall(r"^Node (\d+):", found, re.MULTILINE) == ["5", "6"], found
         for serial in (SERIAL, SERIAL + 1):
             identity = (

@@ -6,17 +6,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from encoding import Identity
-from vcan_tools import Candump, GatewayProcess, canopen_table, chain, configuration, ip, wait_for
+from vcan_tools import Candump, GatewayProcess, canopen_table, configuration, ip, wait_for
 
 from kontronik_can_gw.desk.pty import PtyEsc
-
-ERROR_FRAMES = {  # as a controller's driver makes them; the state that follows
-    "20000004#0008000000000000": 2,  # transmit error counter at warning level
-    "20000004#0020000000000000": 3,  # error passive
-    "20000040#0000000000000000": 4,  # bus-off
-    "20000100#0000000000000000": 1,  # restarted
-}
 
 
 def test_a_missing_interface_and_one_without_can_fd_are_one_line_with_the_remedy(
@@ -58,14 +50,3 @@ def test_commands_to_a_stopped_process_are_obeyed_when_it_goes_on(
         assert order == [0x701, 0x581, 0x701, 0x581]
         gateway.wait_for_line("suspended")
         assert gateway.end() == 0
-
-
-def test_the_controllers_state_is_followed_from_error_frames(vcan: str, tmp_path: Path) -> None:
-    with chain(vcan, tmp_path, Identity(1)) as run, run.running():
-        wait_for(lambda: run.signal("GatewayStatus", "can_state") == 1, "ErrorActive")
-        for frame, state in ERROR_FRAMES.items():
-            subprocess.run(["cansend", vcan, frame], check=True)
-            wait_for(
-                lambda state=state: run.signal("GatewayStatus", "can_state") == state,  # type: ignore[misc]
-                f"CanState {state}",
-            )

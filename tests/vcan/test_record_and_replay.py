@@ -2,7 +2,6 @@
 
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,7 @@ from vcan_tools import (
     wait_for,
 )
 
-from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults
 
 Start = Callable[..., GatewayProcess]
@@ -149,34 +146,6 @@ def test_a_replay_keeps_away_from_a_bus_with_a_gateway(
         assert done.stderr.count("\n") == 1
         assert "another gateway on this machine sends the messages" in done.stderr
         assert gateway.end() == 0
-
-
-def test_what_a_killed_gateway_had_recorded_was_on_the_disk(
-    vcan: str, start_gateway: Start, tmp_path: Path
-) -> None:
-    folder = tmp_path / "captures"
-    with bench(EscOptions()) as run:
-        gateway = recorded_run(run, start_gateway, folder, 4, vcan)
-        sure = time.monotonic_ns()
-        wait_for(
-            lambda: (found := bytes_of(folder)) and found[-1] > sure,
-            "what came by now is on the disk",
-        )
-        gateway.end(signal.SIGKILL)
-    with open_input(folder) as found:
-        times = bytes_of(folder)
-        assert len(times) > 100
-        assert times[-1] > sure
-        assert isinstance(found, CaptureInput)
-        list(found.entries())
-        assert [line for line in found.damage if "was not closed" in line]
-
-
-def bytes_of(folder: Path) -> list[int]:
-    """When the bytes of a capture came."""
-    with open_input(folder) as found:
-        assert isinstance(found, CaptureInput)
-        return [entry.time_ns for entry in found.entries() if entry.kind == Kind.BYTES]
 
 
 def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
