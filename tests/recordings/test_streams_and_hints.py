@@ -112,7 +112,7 @@ def test_rubbish_with_the_name_of_a_log_is_one_line(
     assert said == f"{path}: is no {NAMES[format_]}, whatever its name says, and no other recording"
 
 
-@pytest.mark.parametrize("format_", ["candump", "asc", "blf"])
+@pytest.mark.parametrize("format_", ["candump", "asc"])
 def test_a_log_whose_beginning_is_damaged_is_read_from_where_it_is_whole(
     tmp_path: Path, format_: str
 ) -> None:

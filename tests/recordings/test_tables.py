@@ -27,7 +27,7 @@ from recordings import (
 )
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
+from kontronik_can_gw.desk.recordings.columns import fields_of_values
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table, distinct
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.samples import RowMaker
@@ -316,7 +316,7 @@ def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Pa
 def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(
     times: list[int], rate: float
 ) -> None:
-    rows = [Row(time_ns, None, ((index,),)) for index, time_ns in enumerate(sorted(times))]
+    rows = [Row(time_ns, None, (index,)) for index, time_ns in enumerate(sorted(times))]
     thin = list(thinned(iter(rows), rate))
     assert thin[-1:] == rows[-1:]
     assert all(row in rows for row in thin)
@@ -366,12 +366,12 @@ def test_any_values_read_back_equal(
 ) -> None:
     rows.sort(key=lambda row: row[0])
     path = tmp_path / f"any.{form}"
-    table = Table(FIELDS, has_utc, widths=(2, 2))
+    table = Table(FIELDS, has_utc)
     with path.open("wb") as file:
         by_path = form in ("parquet", "mf4")
         with open_table(path if by_path else file, form, table) as writer:
             for time_ns, wall_ns, values in rows:
-                writer.write(Row(time_ns, wall_ns, (values[:2], values[2:])))
+                writer.write(Row(time_ns, wall_ns, values))
     found = READ[form](path, {field.name: field for field in FIELDS})
     assert len(found) == len(rows)
     for cells, (time_ns, wall_ns, values) in zip(found, rows, strict=True):
@@ -406,9 +406,7 @@ def test_the_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None
     escs = [EscStream(EscSettings(name), 0) for name in ("a", "b")]
     fields = fields_of_values([esc.settings for esc in escs])
     ages = [index for index, one in enumerate(fields) if one.source == "data_age"]
-    maker = RowMaker(
-        sections(fields, ages, [esc.settings for esc in escs]), escs, GatewayStatus(), 0
-    )
+    maker = RowMaker([fields[index] for index in ages], escs, GatewayStatus(), 0)
     wire = encode(LiveData(), Layout.V4)
     for now in range(SECOND, 3 * SECOND, 100 * MS):
         for number, esc in enumerate(escs):

@@ -18,7 +18,6 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.blocks import NO_MESSAGES, RowBlock, player_of, timed
 from kontronik_can_gw.desk.recordings.capture_files import CaptureFiles
-from kontronik_can_gw.desk.recordings.columns import sections
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
 from kontronik_can_gw.errors import UserError
@@ -84,11 +83,11 @@ class CaptureInput(CaptureFiles):
         self._add_losses(replay)
 
     def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        columns = sections(self.fields, self._chosen(chosen), self.bus.escs)
+        fields = [self.fields[index] for index in self._chosen(chosen)]
         makers: list[RowMaker] = []
 
         def make(*of_gateway: Any) -> RowMaker:
-            makers.append(RowMaker(columns, *of_gateway))
+            makers.append(RowMaker(fields, *of_gateway))
             return makers[0]
 
         replay = Replay(self._silent_gateway((make,)), self.header.get("state"))

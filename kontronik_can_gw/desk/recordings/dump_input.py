@@ -12,7 +12,6 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.recordings.blocks import NO_MESSAGES, RowBlock, player_of
 from kontronik_can_gw.desk.recordings.can_logs import UART_MAGIC
-from kontronik_can_gw.desk.recordings.columns import sections
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
@@ -110,8 +109,8 @@ class DumpInput(Input):
         """A gateway runs from the first frame on; it knows no more than the telemetry."""
         esc = EscStream(self.setup.escs[0], 0)
         status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
-        columns = sections(self.fields, self._chosen(chosen), self.bus.escs)
-        maker = RowMaker(columns, [esc], status, 0)
+        fields = [self.fields[index] for index in self._chosen(chosen)]
+        maker = RowMaker(fields, [esc], status, 0)
         due = 0
         for now, _, reading in self._found(esc):
             if reading is None:

@@ -5,9 +5,8 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from itertools import accumulate
 
-from kontronik_can_gw.signals.unpacker import Column
+from kontronik_can_gw.signals.unpacker import Column, Value
 
 TIME = "Time"
 UTC = "Utc"
@@ -102,16 +101,16 @@ class Table:
     start_wall_ns: int | None = None
     """Unix time in ns of time 0."""
     provenance: Mapping[str, str] = field(default_factory=dict)
-    widths: Sequence[int] = ()
-    """How many neighbouring fields each part of a row has; none: all are one part."""
 
-    def parts(self) -> list[range]:
-        """The fields of each part of a row."""
-        widths = self.widths or (len(self.fields),)
-        return [
-            range(end - width, end) for width, end in zip(widths, accumulate(widths), strict=True)
-        ]
+    def by_message(self) -> dict[str, Sequence[int]]:
+        """The fields of each message of a table of CAN frames; else all of them under an empty name."""
+        if not self.by_frame:
+            return {"": range(len(self.fields))}
+        found: dict[str, list[int]] = {}
+        for index, one in enumerate(self.fields[2:], 2):
+            found.setdefault(one.message, []).append(index)
+        return dict(found)
 
-    def indices(self, message: str) -> list[int]:
-        """The fields of one message."""
-        return [index for index, one in enumerate(self.fields) if one.message == message]
+    def message_of(self, values: Sequence[Value]) -> str:
+        """The message of a row, as by_message has it."""
+        return str(values[1]) if self.by_frame else ""

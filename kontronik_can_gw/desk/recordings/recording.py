@@ -69,7 +69,7 @@ class Input(ABC):
             yield from self.samples_in_python(chosen)
         else:
             for block in blocks:
-                yield from (Sample(time_ns, (values,)) for time_ns, values in block.values())
+                yield from map(Sample._make, block.values())
 
     @abstractmethod
     def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:

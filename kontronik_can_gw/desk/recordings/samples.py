@@ -5,23 +5,22 @@ frame, and with its loss; from CAN frames with each group of messages that belon
 message, within 5 ms goes into the same row.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, groupby
 from typing import NamedTuple
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.recordings.columns import Read, Section, Values
+from kontronik_can_gw.desk.recordings.columns import Read, Values, reader_of, values_of_fields
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
-from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.esc.values import Kind as How
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals import units
-from kontronik_can_gw.signals.unpacker import Column, Part, SignalReader, Value
+from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
-Pick = Callable[[Sequence[Value]], Values]
 SAME_ROW_NS = 5 * MS
 GATEWAY_NS = 100 * MS
 """The gateway's own values are read so often."""
@@ -30,58 +29,45 @@ _DIGITS = 9
 
 
 class Sample(NamedTuple):
-    """A row. ``parts``: values of neighbouring columns; one that has not changed is the object that it was."""
+    """A row. ``values``: in the order of the columns."""
 
     time_ns: int
-    parts: tuple[Values, ...]
-
-    @property
-    def values(self) -> Values:
-        """In the order of the columns."""
-        return tuple(chain.from_iterable(self.parts))
+    values: Values
 
 
 # --- from bytes
 
 
 class RowMaker(Output):
-    """Makes rows of what ESCs say. They gather in ``rows``, which the owner empties; ``finish`` gives the last."""
+    """Makes rows of what ESCs say: the values of ``fields``. They gather until ``take_rows``; ``finish`` gives the last."""
 
     def __init__(
         self,
-        sections: Sequence[Section],
+        fields: Sequence[Field],
         escs: Sequence[EscTelemetry],
         status: GatewayStatus,
         now: int,
     ) -> None:
         super().__init__()
-        self.rows: list[Sample] = []
+        self._rows: list[Sample] = []
         self._escs = escs
         self._status = status
-        self._parts: list[Values] = [section.nothing for section in sections]
+        self._values: list[Value] = [None] * len(fields)
         self._row_ns: int | None = None
         self._last_ns = 0
         self._in_row: set[int] = set()
         self._gateway_ns = now - GATEWAY_NS
-
-        def readers(esc: int | None, *but: Group) -> list[tuple[int, Read]]:
-            every = enumerate(sections)
-            return [(i, s.read) for i, s in every if s.esc == esc and s.group not in but]
-
-        self._by_esc = [readers(esc) for esc in range(len(escs))]
-        self._with_live = [readers(esc, Group.INFO) for esc in range(len(escs))]
-        self._of_gateway = readers(None)
-        self._ages = [
-            (s.esc, index, s.read)
-            for index, s in enumerate(sections)
-            if s.ages and s.esc is not None
-        ]
+        self._readers: dict[int | None, list[tuple[int, Read]]] = {}
+        self._ages: list[tuple[int, int, Read]] = []
+        found = values_of_fields(fields, [esc.settings for esc in escs])
+        for index, (field, value) in enumerate(found):
+            self._readers.setdefault(field.esc, []).append((index, reader_of(value)))
+            if value.kind is How.AGE and field.esc is not None:
+                self._ages.append((field.esc, index, reader_of(value)))
 
     def take_rows(self) -> Sequence[Sample]:
         """The rows that are complete."""
-        if not self.rows:
-            return ()
-        rows, self.rows = self.rows, []
+        rows, self._rows = self._rows, []
         return rows
 
     def finish(self) -> Sequence[Sample]:
@@ -101,17 +87,15 @@ class RowMaker(Output):
             again = events & Event.LIVE and esc in self._in_row
             if again or when - row_ns > SAME_ROW_NS:
                 self._close_row()
-        parts = self._parts
-        changed = self._by_esc if events & (Event.LINK | Event.INFO) else self._with_live
-        for index, read in changed[esc]:
-            parts[index] = read(state, when)
+        values, status = self._values, self._status
+        for index, read in self._readers.get(esc, ()):
+            values[index] = read(state, status, when)
         for of, index, read in self._ages:
-            if of != esc:
-                parts[index] = read(self._escs[of], when)
+            values[index] = read(self._escs[of], status, when)
         if when - self._gateway_ns >= GATEWAY_NS or events & Event.LINK:
             self._gateway_ns = when
-            for index, read in self._of_gateway:
-                parts[index] = read(self._status, when)
+            for index, read in self._readers.get(None, ()):
+                values[index] = read(None, status, when)
         if events & Event.LIVE:
             self._in_row.add(esc)
             if self._row_ns is None:
@@ -119,7 +103,7 @@ class RowMaker(Output):
 
     def _close_row(self) -> None:
         if self._row_ns is not None:
-            self.rows.append(Sample(self._row_ns, tuple(self._parts)))
+            self._rows.append(Sample(self._row_ns, tuple(self._values)))
             self._last_ns = self._row_ns
             self._row_ns = None
             self._in_row.clear()
@@ -148,41 +132,22 @@ def _to_value(column: Column) -> tuple[str, float, float]:
     return (column.unit, 1, 0) if factors is None else (unit, float(factors[0]), float(factors[1]))
 
 
-def _picker(columns: Sequence[Column], first: int, chosen: Sequence[int]) -> Pick:
-    """What takes the chosen columns out of the values of their part of a message, which begins with the column ``first``."""
-    places = []
-    for index in chosen:
-        _, slope, shift = _to_value(columns[index])
-        places.append((index - first, slope, shift, (slope, shift) == (1, 0)))
-
-    def pick(values: Sequence[Value]) -> Values:
-        found = []
-        for place, slope, shift, is_same in places:
-            value = values[place]
-            if not is_same and isinstance(value, (int, float)):
-                value = round((value - shift) / slope, _DIGITS)
-            found.append(value)
-        return tuple(found)
-
-    return pick
-
-
 def samples_of_frames(
     frames: Iterable[TimedFrame], reader: SignalReader, chosen: Sequence[int]
 ) -> Iterator[Sample]:
     """Rows of CAN frames, as a listener has them: values hold while they are fresh."""
     view = View(reader)
-    part_of = [part for part in reader.parts for _ in range(part.count)]
-    runs: list[tuple[Part, Pick]] = []
-    by_first: dict[int, list[int]] = {}
-    for part, neighbours in groupby(chosen, lambda column: part_of[column]):
-        by_first.setdefault(part.first, []).append(len(runs))
-        runs.append((part, _picker(reader.columns, part.first, list(neighbours))))
+    scales = [(place, *_to_value(reader.columns[at])[1:]) for place, at in enumerate(chosen)]
+    others = [(place, slope, shift) for place, slope, shift in scales if (slope, shift) != (1, 0)]
 
-    def parts_now() -> list[Values]:
-        return [pick(view.values[part.first : part.first + part.count]) for part, pick in runs]
+    def row(time_ns: int) -> Sample:
+        values = [view.values[index] for index in chosen]
+        for place, slope, shift in others:
+            value = values[place]
+            if isinstance(value, (int, float)):
+                values[place] = round((value - shift) / slope, _DIGITS)
+        return Sample(time_ns, tuple(values))
 
-    parts = parts_now()
     row_ns: int | None = None
     in_row: set[int] = set()
     last = 0
@@ -192,23 +157,18 @@ def samples_of_frames(
         if key not in reader.keys:
             continue
         if row_ns is not None and (key in in_row or time_ns - row_ns > SAME_ROW_NS):
-            yield Sample(row_ns, tuple(parts))
+            yield row(row_ns)
             row_ns = None
             in_row.clear()
         while (due := view.next_expiry) is not None and due < time_ns:  # a loss is a row of its own
             if view.expire(due + 1):
                 row_ns = None
                 in_row.clear()
-                parts = parts_now()
-                yield Sample(due + 1, tuple(parts))
-        chunks = view.take(key, frame.data, time_ns)
-        if chunks is None:
+                yield row(due + 1)
+        if view.take(key, frame.data, time_ns) is None:
             continue
-        for first, new in chunks:
-            for at in by_first.get(first, ()):
-                parts[at] = runs[at][1](new)
         in_row.add(key)
         if row_ns is None:
             row_ns = time_ns
     if row_ns is not None:
-        yield Sample(row_ns, tuple(parts))
+        yield row(row_ns)

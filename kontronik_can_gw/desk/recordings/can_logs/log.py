@@ -2,27 +2,21 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Self
+from typing import Any, Self
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.can_logs.blf import BlfReader
-from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS, Damage, Reader
 from kontronik_can_gw.desk.recordings.can_logs.text import (
-    ASC_HEAD,
-    ASC_LINES,
-    CANDUMP_LINE,
-    CANDUMP_SCREEN_LINE,
     LONGEST_LINE,
+    SECOND_NS,
     TRC_HEAD,
     TRC_LINE,
     AscReader,
     CandumpReader,
-    TrcReader,
+    Damage,
+    asc_line,
+    candump_line,
 )
 from kontronik_can_gw.errors import RunError, UserError
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Reader
 
 SUFFIXES = {
     ".log": "candump",
@@ -46,43 +40,35 @@ _FAR = 1 << 20
 """So far into a file whose beginning is damaged something of its format must come."""
 UART_MAGIC = b"KOD"
 """What a telemetry frame begins with."""
-_LOOKS = {
-    "candump": (CANDUMP_LINE.fullmatch, CANDUMP_SCREEN_LINE.fullmatch),
-    "asc": (ASC_HEAD.match, *(pattern.match for pattern in ASC_LINES)),
-    "trc": (TRC_HEAD.match,),
+_LINES: dict[str, Callable[[bytes], object]] = {
+    "candump": candump_line,
+    "asc": asc_line,
+    "trc": TRC_HEAD.match,
 }
-"""What finds a line of each text format; one of TRC alone could be another's."""
-_READERS: dict[str, Callable[[BinaryIO, Damage], Reader]] = {
-    "candump": CandumpReader,
-    "asc": AscReader,
-    "trc": TrcReader,
-    "blf": BlfReader,
-}
-_SHORT = 64
+_BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
 _BACK_NS = 10 * SECOND_NS
 _AHEAD_NS = 86_400 * SECOND_NS
 """A step of time that is larger must be confirmed by the frame after it, or it is a damaged time."""
 
 
 def log_format(path: Path) -> str | None:
-    """The format of a log by its first 64 KiB; by its suffix where they are damaged but more of that comes. None: no log. RunError."""
+    """The format of a log by its content; by its suffix where its beginning is damaged but lines of that come. None: no log. RunError."""
     head = _beginning(path, _HEAD)
-    if head.startswith(b"LOGG"):
-        return "blf"
-    if head.startswith((b"MDF     ", b"UnFinMF ")):
-        return "mf4"
+    for magic, found in _BEGINNINGS.items():
+        if head.startswith(magic):
+            return found
     for line in head.removeprefix(b"\xef\xbb\xbf").split(b"\n", _HEAD_LINES)[:_HEAD_LINES]:
-        for format_, looks_like in _LOOKS.items():
-            if any(look(line) is not None for look in looks_like):
-                return format_
-    if b"LOBJ" in head:
-        return "blf"
-    if UART_MAGIC in head:  # bytes of an ESC, whatever they are called
-        return None
-    called = SUFFIXES.get(path.suffix.lower())
-    if called is None or _is_blank(head):
+        for found, is_line in _LINES.items():
+            if is_line(line):
+                return found
+    called = SUFFIXES.get(path.suffix.lower(), "")
+    if not head.strip():
         return called
-    return called if _has_any(called, _beginning(path, _FAR)) else None
+    if UART_MAGIC in head or called not in _LINES:  # bytes of an ESC, whatever they are called
+        return None
+    is_line = TRC_LINE.match if called == "trc" else _LINES[called]
+    lines = (line for line in _beginning(path, _FAR).split(b"\n") if len(line) <= LONGEST_LINE)
+    return called if any(map(is_line, lines)) else None
 
 
 def _beginning(path: Path, size: int) -> bytes:
@@ -93,22 +79,13 @@ def _beginning(path: Path, size: int) -> bytes:
         raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
 
 
-def _is_blank(head: bytes) -> bool:
-    """Nothing is in it, or a first line that was cut: the name is all there is to go by."""
-    return not head.strip() or (
-        len(head) < _SHORT and b"\n" not in head and head.rstrip().isascii() and b"\0" not in head
-    )
+def _reader_of(format_: str) -> Callable[..., Any]:
+    if format_ in ("candump", "asc"):
+        return CandumpReader if format_ == "candump" else AscReader
+    from kontronik_can_gw.desk.recordings.can_logs import library
 
-
-def _has_any(format_: str, content: bytes) -> bool:
-    """True where the beginning of a file holds anything of a format."""
-    if format_ == "mf4":
-        return False  # what has no beginning cannot be read
-    if format_ == "blf":
-        return b"LOBJ" in content
-    looks = (*_LOOKS[format_], *((TRC_LINE.match,) if format_ == "trc" else ()))
-    lines = [line for line in content.split(b"\n") if 0 < len(line) <= LONGEST_LINE]
-    return any(look(line) is not None for line in lines for look in looks)
+    readers = {"blf": library.BlfReader, "trc": library.TrcReader, "mf4": library.Mf4Reader}
+    return readers[format_]
 
 
 class CanLog:
@@ -116,8 +93,6 @@ class CanLog:
 
     UserError where it is no log that is known, or a table; RunError where it cannot be opened, or is MF4 and asammdf is missing.
     """
-
-    _mf4: "Mf4Reader | None" = None
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -130,26 +105,18 @@ class CanLog:
             self._file = path.open("rb")
         except OSError as error:
             raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
-        self._reader: Reader
-        if self.format == "mf4":
-            from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Reader
-
-            self._file.close()  # asammdf opens it itself
-            self._reader = self._mf4 = Mf4Reader(path, self._damage)
-        else:
-            self._reader = _READERS[self.format](self._file, self._damage)
+        self._reader = _reader_of(self.format)(self._file, self._damage)
 
     @property
     def wall_start_ns(self) -> int | None:
-        """Unix time in ns of the log's time 0; 0 where its times are Unix times, None where it does not say."""
-        return self._reader.wall_start_ns
+        """Unix time in ns of the log's time 0; 0 where its times are Unix times, None where it does not say. Known with the first frame."""
+        found: int | None = self._reader.wall_start_ns
+        return found
 
     @property
     def position(self) -> int:
         """Bytes read so far."""
-        if self._mf4 is not None:
-            return self._mf4.position
-        return self.size if self._file.closed else min(self._file.tell(), self.size)
+        return min(int(self._reader.position), self.size)
 
     @property
     def damage(self) -> list[str]:
@@ -187,9 +154,8 @@ class CanLog:
 
     def close(self) -> None:
         """Close the file."""
+        self._reader.close()
         self._file.close()
-        if self._mf4 is not None:
-            self._mf4.close()
 
     def __enter__(self) -> Self:
         return self

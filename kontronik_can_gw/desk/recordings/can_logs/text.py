@@ -1,176 +1,184 @@
-"""Readers of logs that are text: candump, Vector ASC, PEAK TRC. A line that cannot be read is counted, the next one is read again.
+"""Readers of candump logs and Vector ASC. A line that cannot be read is counted, the next one is read again.
 
-Each format is a regular expression; its groups have the same names in all of them. Times stay whole numbers of nanoseconds. The formats,
-where no specification is public, are read as python-can reads them. Error and remote frames and other events are left out.
+Times stay whole numbers of nanoseconds. ASC, which has no public specification, is read as python-can reads it. Error and remote frames
+and other events are left out.
 """
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from typing import BinaryIO
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.can_logs.record import (
-    FD_LENGTHS,
-    OLDEST_WALL_S,
-    SECOND_NS,
-    Damage,
-    is_possible,
-)
 from kontronik_can_gw.frames import CanFrame
 
+SECOND_NS = 1_000_000_000
+OLDEST_WALL_S = 631_152_000
+"""1990: what is earlier is no Unix time but seconds since a start."""
 LONGEST_LINE = 4096
 """Bytes; a line of any of these formats is far shorter."""
+TRC_HEAD = re.compile(
+    rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE
+)
+TRC_LINE = re.compile(rb"\s*\d{1,10}\)?\s+\d{1,12}(?:\.\d{1,6})?\s+\w+\s+\w+(?:\s|$)")
+"""How a line of any version of PEAK's TRC begins; it could be another format's."""
+FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _HEAD_LINES = 200
 """Lines in which a log's head is looked for."""
-_Found = dict[str, bytes | None]
-"""The groups of a line: time (s, f), id, data, and what else the format has."""
+_SHOWN = 8
 
 
-class TextReader(ABC):
+def is_possible(frame: CanFrame) -> bool:
+    """True where a frame with this id and number of bytes exists on a CAN bus."""
+    size = len(frame.data)
+    in_range = 0 <= frame.can_id <= (0x1FFFFFFF if frame.extended else 0x7FF)
+    return in_range and (size in FD_LENGTHS if frame.fd else size <= 8)
+
+
+class Damage:
+    """Counts what cannot be read. Memory stays small however much it is."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self._ranges: list[list[int]] = []
+        self._lines = self._last = 0
+
+    def line(self, number: int) -> None:
+        """A line (counted from 1) is no line of this format; a long one may come several times."""
+        if number == self._last:
+            return
+        if self._ranges and self._ranges[-1][1] == number - 1:
+            self._ranges[-1][1] = number
+        elif len(self._ranges) < _SHOWN:
+            self._ranges.append([number, number])
+        self._last = number
+        self._lines += 1
+
+    def texts(self) -> list[str]:
+        """One line for each kind of damage."""
+        if not self._lines:
+            return self.notes
+        shown = [f"{a}" if a == b else f"{a} to {b}" for a, b in self._ranges]
+        if rest := self._lines - sum(b - a + 1 for a, b in self._ranges):
+            shown.append(f"and {rest} more")
+        plural = "s" if self._lines > 1 else ""
+        return [f"{self._lines} damaged line{plural}: {', '.join(shown)}", *self.notes]
+
+
+class TextReader:
     """Reads an open log line by line."""
+
+    wall_start_ns: int | None = None
+    """Unix time of the log's time 0; None where it does not say."""
 
     def __init__(self, file: BinaryIO, damage: Damage) -> None:
         self._file = file
         self._damage = damage
-        self._number = 1
-        self.wall_start_ns: int | None = None
         self._read_head([file.readline(LONGEST_LINE) for _ in range(_HEAD_LINES)])
         file.seek(0)
 
+    @property
+    def position(self) -> int:
+        """Bytes read so far."""
+        return self._file.tell()
+
+    def close(self) -> None:
+        """Nothing is held."""
+
     def __iter__(self) -> Iterator[TimedFrame]:
-        self._number = 1
+        number = 1
         while line := self._file.readline(LONGEST_LINE):
             try:
-                item = self._frame(line)
-            except (ValueError, LookupError):  # of numbers, texts, kinds, lengths
-                self._damage.line(self._number)
+                item = self._frame(line) if line.strip() else None
+                if item is not None and not is_possible(item.frame):
+                    raise ValueError
+            except (ValueError, LookupError):  # of numbers, texts, lengths
+                self._damage.line(number)
             else:
                 if item is not None:
                     yield item
-            self._number += line.endswith(b"\n")
+            number += line.endswith(b"\n")
 
-    @abstractmethod
     def _read_head(self, lines: list[bytes]) -> None:
         """Find out what the log says of itself."""
+        raise NotImplementedError
 
-    @abstractmethod
     def _frame(self, line: bytes) -> TimedFrame | None:
         """The frame of a line; None for a line without one. ValueError, LookupError where it is damaged."""
+        raise NotImplementedError
 
 
-def _groups(pattern: "re.Pattern[bytes]", line: bytes) -> _Found:
-    """ValueError where the line is none of these."""
-    match = pattern.fullmatch(line)
-    if match is None:
+def _nanoseconds(text: bytes) -> int:
+    """Exact, of decimal seconds. ValueError."""
+    seconds, _, fraction = text.partition(b".")
+    if not (seconds.isdigit() and fraction.isdigit() and len(seconds) <= 12 and len(fraction) <= 9):
         raise ValueError
-    return match.groupdict()
-
-
-def _nanoseconds(found: _Found, digits: int = 9) -> int:
-    """The time, of a whole number and decimals of units of 10**digits ns."""
-    return int((found["s"] or b"0") + (found["f"] or b"").ljust(digits, b"0"))
-
-
-def _can_frame(
-    found: _Found, extended: bool, size: int | None = None, fd: bool = False, base: int = 16
-) -> CanFrame:
-    """ValueError where the numbers are no frame."""
-    words = (found["data"] or b"").split()[:size]
-    data = bytes.fromhex(b"".join(words).decode()) if base == 16 else bytes(map(int, words))
-    can_id = int(found["id"] or b"", base)
-    if size not in (None, len(data)) or not is_possible(can_id, extended, len(data), fd):
-        raise ValueError
-    return CanFrame(can_id, data, extended, fd)
+    return int(seconds + fraction.ljust(9, b"0"))
 
 
 # --- candump
 
-_CANDUMP = rb"\((?P<s>\d{1,12})\.(?P<f>\d{1,9})\)[ \t]+[\x21-\x7e]{1,64}[ \t]+"
-_ERROR_ID = rb"[2367ABEFabef][0-9A-Fa-f]{7}"
-CANDUMP_LINE = re.compile(
-    _CANDUMP + rb"(?:(?P<none>" + _ERROR_ID + rb")|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))#"
-    rb"(?:(?P<fd>#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2})*)(?:_[0-9A-Fa-f])?|(?P<remote>[Rr][0-9A-Fa-f]{0,2}))"
-    rb"(?:[ \t]+(?P<dir>[RTrt]))?[ \t\r\n]*"
+_ID = rb"(?:(?P<none>[2367ABEFabef][0-9A-Fa-f]{7})|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))"
+"""``none``: the id of an error frame."""
+_CANDUMP = rb"[ \t]*\((?P<time>\d+\.\d+)\)[ \t]+[\x21-\x7e]{1,64}[ \t]+"
+_LINE = re.compile(
+    _CANDUMP + _ID + rb"#(?:(?P<fd>#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2})*)(?:_[0-9A-Fa-f])?"
+    rb"|(?P<remote>[Rr][0-9A-Fa-f]{0,2}))(?:[ \t]+(?P<dir>[RTrt]))?\s*"
 )
-CANDUMP_SCREEN_LINE = re.compile(
-    rb"[ \t]*" + _CANDUMP + rb"(?:(?P<dir>RX|TX) [B-] [E-][ \t]+)?"
-    rb"(?:(?P<none>"
-    + _ERROR_ID
-    + rb")|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))[ \t]+\[(?P<size>\d{1,2})\]"
-    rb"(?:(?P<data>(?:[ \t]+[0-9A-Fa-f]{2})*)(?:[ \t]+'.*'|[ \t]+ERRORFRAME)?|[ \t]+(?P<remote>remote request))[ \t\r\n]*"
+_SCREEN_LINE = re.compile(
+    _CANDUMP + rb"(?:(?P<dir>RX|TX) [B-] [E-][ \t]+)?" + _ID + rb"[ \t]+\[(?P<size>\d{1,2})\]"
+    rb"(?:(?P<data>(?:[ \t]+[0-9A-Fa-f]{2})*)(?:[ \t]+'.*'|[ \t]+ERRORFRAME)?|[ \t]+(?P<remote>remote request))\s*"
 )
 """What ``candump -ta`` shows; a length of two digits is one of CAN FD."""
 
 
+def candump_line(line: bytes) -> "re.Match[bytes] | None":
+    """A line of ``candump -L`` (``(1700000000.123456) can0 681#0011223344556677 R``), or as ``candump -ta`` shows it."""
+    return _LINE.fullmatch(line) or _SCREEN_LINE.fullmatch(line)
+
+
 class CandumpReader(TextReader):
-    """``candump -L`` and ``-l``: ``(1700000000.123456) can0 681#0011223344556677 R``; also what ``candump -ta`` shows."""
+    """``candump -L`` and ``-l``, and ``candump -ta``."""
 
     def _read_head(self, lines: list[bytes]) -> None:
-        found = (CANDUMP_LINE.fullmatch(x) or CANDUMP_SCREEN_LINE.fullmatch(x) for x in lines)
-        first = next(filter(None, found), None)
-        if first is not None and int(first["s"]) >= OLDEST_WALL_S:
+        first = next(filter(None, map(candump_line, lines)), None)
+        if first is not None and float(first["time"]) >= OLDEST_WALL_S:
             self.wall_start_ns = 0
 
     def _frame(self, line: bytes) -> TimedFrame | None:
-        size = None
-        match = CANDUMP_LINE.fullmatch(line)
-        if match is None and (start := line.rfind(b"(")) > 0:
-            # rubbish in front of a whole line
-            match = CANDUMP_LINE.fullmatch(line, start)
-            if match is not None:
-                self._damage.line(self._number)
-        if match is not None:
-            found = match.groupdict()
-            fd = found["fd"] is not None
-        elif line.strip():
-            found = _groups(CANDUMP_SCREEN_LINE, line)
-            size = int(found["size"] or 0)
-            fd = len(found["size"] or b"") == 2
-        else:
-            return None
+        match = candump_line(line)
+        if match is None:
+            raise ValueError
+        found = match.groupdict()
         if found["none"] or found["remote"]:
             return None
-        frame = _can_frame(found, len(found["id"] or b"") == 8, size, fd)
+        data = bytes.fromhex((found["data"] or b"").decode())
+        size = found.get("size")
+        if size is not None and int(size) != len(data):
+            raise ValueError
+        is_fd = found["fd"] is not None if size is None else len(size) == 2
+        frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, is_fd)
         received = (found["dir"] or b"")[:1] in (b"R", b"r")
-        return TimedFrame(_nanoseconds(found), frame, received)
+        return TimedFrame(_nanoseconds(found["time"]), frame, received)
 
 
 # --- Vector ASC
 
-_ASC_TIME = rb"[ \t]*(?P<s>\d{1,10})\.(?P<f>\d{1,9})[ \t]+"
-_ASC_DATA = rb"(?P<data>(?:[ \t]+[0-9A-Fa-f]{1,3})*)"
-_ASC_CLASSIC = re.compile(
-    _ASC_TIME + rb"\d{1,3}[ \t]+(?P<id>[0-9A-Fa-f]{1,9})(?P<x>[xX]?)[ \t]+(?P<dir>Rx|Tx|TxRq)[ \t]+"
-    rb"(?:d[ \t]+(?P<size>[0-9A-Fa-f]{1,2})" + _ASC_DATA + rb"|(?P<remote>[rR]))",
-    re.IGNORECASE,
-)
-_ASC_FD = re.compile(
-    _ASC_TIME
-    + rb"CANFD[ \t]+\d{1,3}[ \t]+(?P<dir>Rx|Tx|TxRq)[ \t]+(?P<id>[0-9A-Fa-f]{1,9})(?P<x>[xX]?)[ \t]+"
-    rb"(?:[^\d\s]\S*[ \t]+)?[01][ \t]+[01][ \t]+(?P<dlc>[0-9A-Fa-f])[ \t]+(?P<size>\d{1,2})"
-    + _ASC_DATA,
-    re.IGNORECASE,
-)
-_ASC_ERROR = re.compile(
-    _ASC_TIME + rb"(?:CANFD[ \t]+)?\d{1,3}[ \t]+(?:(?:Rx|Tx)[ \t]+)?ErrorFrame", re.IGNORECASE
-)
-ASC_LINES = (_ASC_CLASSIC, _ASC_FD, _ASC_ERROR)
-ASC_HEAD = re.compile(
-    rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)", re.IGNORECASE
-)
-_ASC_OTHER = re.compile(
-    rb"\s*(?://.*|(?:date|base|begin|end|no|internal|previous)\b.*|\d+\.\d+\s+(?!\d+\s+\S+\s+(?:Rx|Tx)\b)(?!CANFD\b)[\x09\x20-\x7e\x80-\xff]+)?\s*",
-    re.IGNORECASE,
-)
-_ASC_EVENT = re.compile(_ASC_TIME)
-_ASC_BASE = re.compile(
-    rb"\s*base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE
-)
-_ASC_DATE = re.compile(r"\s*(?:date|begin\s+triggerblock)\s+\w+\s+(.+?)\s*$", re.IGNORECASE)
+_DIRECTIONS = (b"rx", b"tx", b"txrq")
+_HEADS = (b"date", b"base", b"begin", b"end", b"no", b"internal", b"previous")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
+_ASC_HEAD = re.compile(
+    rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)", re.IGNORECASE
+)
+_ASC_LINE = re.compile(
+    rb"\s*\d+\.\d+\s+(?:CANFD\s+\d+\s+(?:Rx|Tx)|\d+\s+\w+\s+(?:Rx|Tx))", re.IGNORECASE
+)
+
+
+def asc_line(line: bytes) -> "re.Match[bytes] | None":
+    """What a line of the head begins with, or one of a frame."""
+    return _ASC_HEAD.match(line) or _ASC_LINE.match(line)
 
 
 class AscReader(TextReader):
@@ -180,46 +188,53 @@ class AscReader(TextReader):
 
     def _read_head(self, lines: list[bytes]) -> None:
         for line in lines:
-            if (match := _ASC_BASE.match(line)) is not None:
-                self._base = 10 if match[1].lower() == b"dec" else 16
-                self._relative = (match[2] or b"").lower() == b"relative"
-            elif (date := _ASC_DATE.match(line.decode("utf-8", "replace"))) is not None:
-                started = asc_time(date[1])
+            head = line.decode("utf-8", "replace").lower().split()
+            if head[:1] == ["base"]:
+                self._base = 10 if head[1:2] == ["dec"] else 16
+                self._relative = head[-1] == "relative"
+            elif head[:1] == ["date"] or head[:2] == ["begin", "triggerblock"]:
+                started = asc_time(head[2 if head[0] == "date" else 3 :])
                 if started is not None and started >= OLDEST_WALL_S * SECOND_NS:
                     self.wall_start_ns = started
-            elif any(pattern.match(line) for pattern in ASC_LINES):
+            elif _ASC_LINE.match(line):
                 break
 
-    def __iter__(self) -> Iterator[TimedFrame]:
-        self._now = 0
-        return super().__iter__()
-
     def _frame(self, line: bytes) -> TimedFrame | None:
-        match = _ASC_CLASSIC.match(line) or _ASC_FD.match(line)
-        event = match or _ASC_ERROR.match(line)
-        if event is None and _ASC_OTHER.fullmatch(line) is None:
-            raise ValueError
-        if (event := event or _ASC_EVENT.match(line)) is None:
+        words = line.lower().split()
+        if words[0].startswith(b"//") or words[0] in _HEADS:
             return None
-        time_ns = _nanoseconds(event.groupdict())
+        time_ns = _nanoseconds(words[0])
         if self._relative:
             time_ns = self._now = self._now + time_ns
-        if match is None:
+        if fd := words[1:2] == [b"canfd"]:
+            if b"errorframe" in words:
+                return None
+            direction, can_id, *rest = words[3:]
+            rest = rest if rest[0] in (b"0", b"1") else rest[1:]  # its symbolic name
+            dlc, size, data = int(rest[2], 16), int(rest[3]), rest[4:]
+            if dlc and not size:  # a remote frame
+                return None
+        elif len(words) > 4 and words[3] in _DIRECTIONS:
+            can_id, direction, kind, *data = words[2:]
+            if kind == b"r":
+                return None
+            if kind != b"d":
+                raise ValueError
+            size, data = min(8, int(data[0], self._base)), data[1:]
+        else:  # an event of another kind
             return None
-        found = match.groupdict()
-        if (fd := "dlc" in found) and not int(found["size"]) and int(found["dlc"], 16):
-            return None
-        if found.get("remote"):
-            return None
-        size = int(found["size"]) if fd else min(8, int(found["size"], self._base))
-        frame = _can_frame(found, bool(found["x"]), size, fd, self._base)
-        return TimedFrame(time_ns, frame, found["dir"].lower() == b"rx")
+        if len(data) < size or direction not in _DIRECTIONS:
+            raise ValueError
+        extended = can_id.endswith(b"x")
+        number = int(can_id.removesuffix(b"x"), self._base)
+        content = bytes(int(byte, self._base) for byte in data[:size])
+        return TimedFrame(time_ns, CanFrame(number, content, extended, fd), direction == b"rx")
 
 
-def asc_time(text: str) -> int | None:
+def asc_time(words: list[str]) -> int | None:
     """Unix time in ns of ``Nov 14 10:13:20.123 pm 2023``, local time as ASC files have it; None where it is no date."""
     try:
-        month, day, clock, *half, year = text.lower().split()
+        month, day, clock, *half, year = words
         hour, minute, second = clock.split(":")
         second, _, fraction = second.partition(".")
         hours = int(hour) % 12 + 12 * (half == ["pm"]) if half else int(hour)
@@ -229,85 +244,3 @@ def asc_time(text: str) -> int | None:
         return int(moment.timestamp()) * SECOND_NS + int(fraction.ljust(9, "0")[:9])
     except (ValueError, LookupError, OverflowError, OSError):
         return None
-
-
-# --- PEAK TRC
-
-TRC_HEAD = re.compile(
-    rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE
-)
-TRC_LINE = re.compile(
-    rb"\s*\d{1,10}\)?[ \t]+\d{1,12}(?:\.\d{1,6})?[ \t]+"
-    rb"(?:(?:DT|FD|FB|FE|BI|RR|ST|EC|ER|EV|Rx|Tx|\d{1,2})[ \t]+)*(?:[0-9A-Fa-f]{8}|[0-9A-Fa-f]{4})[ \t]"
-)
-"""How a line of any version begins."""
-_TRC_EVENT = re.compile(
-    rb"\s*\d{1,10}\)?\s+[\d.]+\s+(?:\d+\s+)?(?:RR|ST|EC|ER|EV|Warng|Error|ErrCt|Event|FFFFFFFF)\s.*",
-    re.DOTALL,
-)
-_TRC_COLUMNS = {
-    "1.0": "N,O,I,l,D",
-    "1.1": "N,O,d,I,l,D",
-    "1.3": "N,O,B,d,I,R,l,D",
-    "2.0": "N,O,T,I,d,l,D",
-    "2.1": "N,O,T,B,I,d,R,L,D",
-}
-_TRC_PIECES = {
-    "O": rb"(?P<s>\d{1,12})(?:\.(?P<f>\d{1,6}))?",
-    "T": rb"(?P<kind>DT|FD|FB|FE|BI)",
-    "I": rb"(?P<id>[0-9A-Fa-f]{1,8})",
-    "B": rb"[\x21-\x7e]+",
-    "d": rb"(?P<dir>Rx|Tx)",
-    "l": rb"(?P<size>\d{1,2})",
-    "L": rb"(?P<dlc>\d{1,2})",
-}
-"""Columns that are read; the data stand in the last one, D."""
-_TRC_DAY0 = datetime(1899, 12, 30, tzinfo=UTC)
-
-
-class TrcReader(TextReader):
-    """PEAK TRC, file versions 1.0, 1.1, 1.3, 2.0 and 2.1."""
-
-    def _read_head(self, lines: list[bytes]) -> None:
-        version, columns = "", ""
-        for line in lines:
-            key, _, value = line.decode("latin-1").strip().partition("=")
-            if key and not key.startswith(";"):
-                break
-            if key == ";$FILEVERSION":
-                version = value.strip()
-            elif key == ";$COLUMNS":
-                columns = value.replace(" ", "")
-            elif key == ";$STARTTIME":
-                self.wall_start_ns = _trc_start(value)
-        if not columns.endswith(",D"):
-            newest = "2.1" if version.startswith("2") else "1.0"
-            columns = _TRC_COLUMNS.get(version, _TRC_COLUMNS[newest])
-        names = columns.removesuffix(",D").split(",")
-        pieces = (_TRC_PIECES.get(name, rb"\S+") for name in names)
-        data = rb"(?:\s+(?P<data>\S[^\r\n]*))?\s*"
-        self._line = re.compile(rb"\s*" + rb"\s+".join(pieces) + data)
-
-    def _frame(self, line: bytes) -> TimedFrame | None:
-        if not line.strip() or line.lstrip()[:1] == b";" or _TRC_EVENT.fullmatch(line):
-            return None
-        found = _groups(self._line, line)
-        if (found["data"] or b"").strip().upper() == b"RTR":
-            return None
-        fd = found.get("kind") not in (None, b"DT")
-        size = found.get("size")
-        length = FD_LENGTHS[int(found["dlc"] or 0)] if size is None else int(size)
-        frame = _can_frame(found, len(found["id"] or b"") > 4, length, fd)
-        if len((found["data"] or b"").split()) > length:
-            raise ValueError
-        return TimedFrame(_nanoseconds(found, 6), frame, found.get("dir") == b"Rx")
-
-
-def _trc_start(text: str) -> int | None:
-    """Unix time in ns of days since 1899-12-30; None where it is none, or before 1990."""
-    try:
-        moment = _TRC_DAY0 + timedelta(days=float(text))
-    except (ValueError, OverflowError):
-        return None
-    start = (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
-    return start if start >= OLDEST_WALL_S * SECOND_NS else None

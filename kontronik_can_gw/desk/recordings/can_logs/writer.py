@@ -1,4 +1,4 @@
-"""Writes CAN frames as candump log, ASC, BLF or TRC, as python-can's writers do, and as MF4 bus logging.
+"""Writes CAN frames as candump log, as ASC, BLF or TRC by python-can's writers, and as MF4 bus logging.
 
 The same frames give the same bytes: no file says when it was written.
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.recordings.blocks import timed
-from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS
+from kontronik_can_gw.desk.recordings.can_logs.text import FD_LENGTHS, SECOND_NS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
@@ -22,7 +22,20 @@ if TYPE_CHECKING:
 
 _MS = 1_000_000
 _LATEST_NS = 1 << 61
-Write = Callable[[int, CanFrame, bool], None]
+_MF4 = "CAN_DataFrame"
+_MF4_COLUMNS = {
+    "BusChannel": "<u1",
+    "ID": "<u4",
+    "IDE": "<u1",
+    "DLC": "<u1",
+    "DataLength": "<u1",
+    "DataBytes": "S64",
+    "Dir": "<u1",
+    "EDL": "<u1",
+    "BRS": "<u1",
+    "ESI": "<u1",
+}
+"""As python-can has them."""
 
 
 class CanLogWriter:
@@ -32,6 +45,9 @@ class CanLogWriter:
     ``first_ns``: time of the first frame, where an ASC, BLF, TRC or MF4 file with the Unix time begins.
     ``name``: what the file will be called (TRC says it).
     """
+
+    write: Callable[[int, CanFrame, bool], None]
+    """Add a frame: its time in ns, the frame, whether it was received."""
 
     def __init__(
         self,
@@ -45,49 +61,56 @@ class CanLogWriter:
     ) -> None:
         self.left_out: dict[str, int] = {}
         """Frames that the format does not know, by what they are."""
-        self.write: Write
-        """Add a frame: its time in ns, the frame, whether it was received."""
-        self._at_once: Callable[[Frames, int], memoryview] | None = None
-        self._file = file
+        self._at_once: Callable[[Frames, int], object] | None = None
         self.close: Callable[[], object] = lambda: None
         """Write what is held back, and the end. The file stays open."""
         self.discard: Callable[[], object] = lambda: None
         """Release what is held, where the log is not to be kept."""
-        base_ns = start_ns = 0
+        self._base_ns = start_ns = 0
         if wall_start_ns is not None:
             # Vector's and PEAK's headers count milliseconds, those of MF4 are read as microseconds
             unit = 1000 if format_ == "mf4" else _MS
             start_ns = (wall_start_ns + first_ns) // unit * unit
-            base_ns = start_ns - wall_start_ns
+            self._base_ns = start_ns - wall_start_ns
         if isinstance(file, Path):
-            from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Writer
-
-            mf4 = Mf4Writer(file, start_ns, provenance or {})
-            self.write = lambda at, frame, received: mf4.write(at - base_ns, frame, received)
-            self.close, self.discard = mf4.close, mf4.discard
+            self._mf4(file, start_ns, provenance or {})
         elif format_ == "candump":
-            self.write = _candump(file, wall_start_ns or 0, channel)
-            half = 500 + (wall_start_ns or 0)
-            if 0 <= half < _LATEST_NS:
-                self._at_once = lambda frames, origin_ns: frames.candump(half - origin_ns, channel)
+            self._candump(file, wall_start_ns or 0, channel)
         elif format_ == "asc":
-            self._asc(file, base_ns, None if wall_start_ns is None else start_ns)
+            self._asc(file, None if wall_start_ns is None else start_ns)
         elif format_ == "blf":
-            self._blf(file, base_ns, start_ns)
+            self._blf(file, start_ns)
         else:
-            self._trc(file, base_ns, start_ns, name)
+            self._trc(file, start_ns, name)
 
     def write_all(self, frames: "Frames | list[TimedFrame]", origin_ns: int) -> None:
         """Add frames, whose times are those of a recording that begins at ``origin_ns``."""
         if self._at_once is not None and not isinstance(frames, list):
-            assert not isinstance(self._file, Path)
-            self._file.write(self._at_once(frames, origin_ns))
+            self._at_once(frames, origin_ns)
             return
         write = self.write
         for time_ns, frame, received in timed(frames):
             write(time_ns - origin_ns, frame, received)
 
-    def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None) -> None:
+    def _candump(self, file: IO[bytes], wall_start_ns: int, channel: str) -> None:
+        half = 500 + wall_start_ns
+
+        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
+            us = (time_ns + half) // 1000
+            can_id, data, extended, fd = frame[:4]
+            flags = "#1" if fd else ""  # with a switched bit rate, as the gateway sends them
+            name = f"{can_id:08X}" if extended else f"{can_id:03X}"
+            end = "R" if received else "T"
+            line = f"({us // 1000000}.{us % 1000000:06d}) {channel} {name}#{flags}{data.hex().upper()} {end}\n"
+            file.write(line.encode("ascii"))
+
+        self.write = write
+        if 0 <= half < _LATEST_NS:
+            self._at_once = lambda frames, origin_ns: file.write(
+                frames.candump(half - origin_ns, channel)
+            )
+
+    def _asc(self, file: IO[bytes], start_ns: int | None) -> None:
         with without_asammdf():
             from can import ASCWriter
         # python-can's header has the time of writing, and cuts zeros of the milliseconds
@@ -102,17 +125,17 @@ class CanLogWriter:
         writer.header_written = True
         head = f"date {stamp}\nbase hex  timestamps absolute\ninternal events logged\nBegin Triggerblock {stamp}\n"
         text.write(head + f"{0.0: 9.6f} Start of measurement\n")
-        self.write = _through(writer.on_message_received, base_ns)
+        self._through(writer.on_message_received)
         self.close = lambda: (text.write("End TriggerBlock\n"), text.detach())
         self.discard = text.detach
 
-    def _blf(self, file: IO[bytes], base_ns: int, start_ns: int) -> None:
+    def _blf(self, file: IO[bytes], start_ns: int) -> None:
         with without_asammdf():
             from can import BLFWriter
         writer = BLFWriter(file)  # type: ignore[arg-type]
         writer.start_timestamp = 0.0
         # half a nanosecond more: the writer cuts where it should round
-        self.write = _through(writer.on_message_received, base_ns, 0.5)
+        self._through(writer.on_message_received, 0.5)
 
         def close() -> None:
             last = writer.stop_timestamp or 0.0
@@ -124,81 +147,81 @@ class CanLogWriter:
 
         self.close = close
 
-    def _trc(self, file: IO[bytes], base_ns: int, start_ns: int, name: str) -> None:
+    def _trc(self, file: IO[bytes], start_ns: int, name: str) -> None:
         with without_asammdf():
             from can import TRCWriter
         text = io.TextIOWrapper(file, encoding="utf-8", newline="\r\n", write_through=True)
-        writer = TRCWriter(_Named(text, name))  # type: ignore[arg-type]
+        writer = TRCWriter(_Unclosed(text, name=name))
         writer.filepath = name
         writer.first_timestamp = 0.0
         writer.header_written = True
-        writer.file = text
         writer.write_header(start_ns // _MS / 1000)
-        plain = _through(writer.on_message_received, base_ns)
 
-        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
-            if frame.fd:
+        def take(message: "Message") -> None:
+            if message.is_fd:
                 self.left_out["CAN FD frames"] = self.left_out.get("CAN FD frames", 0) + 1
             else:
-                plain(time_ns, frame, received)
+                writer.on_message_received(message)
 
-        self.write = write
+        self._through(take)
         self.close = self.discard = text.detach
 
+    def _mf4(self, path: Path, start_ns: int, provenance: Mapping[str, str]) -> None:
+        """By asammdf alone, many at once: python-can's writer takes thirty times as long."""
+        import numpy as np
 
-def _through(take: "Callable[[Message], None]", base_ns: int, more_ns: float = 0.0) -> Write:
-    """Writes by one of python-can's writers. Times go in seconds since ``base_ns``, for which a float is exact enough."""
-    from can import Message
+        from kontronik_can_gw.desk.recordings.mf4 import Mf4File
 
-    def write(time_ns: int, frame: CanFrame, received: bool) -> None:
-        take(
-            Message(
-                (max(time_ns - base_ns, 0) + more_ns) / SECOND_NS,
-                frame.can_id,
-                frame.extended,
-                data=frame.data,
-                is_fd=frame.fd,
-                bitrate_switch=frame.fd,
-                is_rx=received,
-            )
+        out = Mf4File(path, start_ns, provenance)
+        kind = np.dtype(
+            [
+                (f"{_MF4}.{name}", kind.replace("S64", "(64,)u1"))
+                for name, kind in _MF4_COLUMNS.items()
+            ]
         )
+        # a bus, CAN
+        source = out.module.blocks.v4_blocks.SourceInformation(source_type=2, bus_type=2)
+        nothing, no_times = np.array([], dtype=kind), np.array([], dtype="<f8")
+        signal = out.module.Signal(name=_MF4, samples=nothing, timestamps=no_times, source=source)
+        group = out.structure(signal, np.dtype(",".join(_MF4_COLUMNS.values())))
 
-    return write
+        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
+            size, fd = len(frame.data), int(frame.fd)
+            head = (1, frame.can_id, int(frame.extended), FD_LENGTHS.index(size), size)
+            row = (*head, frame.data, int(not received), fd, fd, 0)
+            group.write(max(0, time_ns - self._base_ns), (row,))
+
+        self.write, self.close, self.discard = write, out.save, out.discard
+
+    def _through(self, take: "Callable[[Message], None]", more_ns: float = 0.0) -> None:
+        """Write by one of python-can's writers. Times go in seconds since the start, for which a float is exact enough."""
+        from can import Message
+
+        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
+            take(
+                Message(
+                    (max(time_ns - self._base_ns, 0) + more_ns) / SECOND_NS,
+                    frame.can_id,
+                    frame.extended,
+                    data=frame.data,
+                    is_fd=frame.fd,
+                    bitrate_switch=frame.fd,
+                    is_rx=received,
+                )
+            )
+
+        self.write = write
 
 
 class _Unclosed:
     """A file that does not let its writer close it."""
 
-    def __init__(self, file: IO[bytes]) -> None:
+    def __init__(self, file: Any, **more: Any) -> None:
         self._file = file
+        self.__dict__ |= more
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
 
     def close(self) -> None:
         """The one who opened it closes it."""
-
-
-class _Named:
-    """What python-can's TRCWriter asks of its file while it is made."""
-
-    def __init__(self, file: io.TextIOWrapper, name: str) -> None:
-        self.name = name
-        self.reconfigure = file.reconfigure
-
-
-def _candump(file: IO[bytes], wall_start_ns: int, channel: str) -> Write:
-    """As python-can's CanutilsLogWriter writes it, at several times its speed."""
-    write = file.write
-    half = 500 + wall_start_ns
-
-    def one(time_ns: int, frame: CanFrame, received: bool) -> None:
-        us = (time_ns + half) // 1000
-        can_id, data, extended, fd = frame[:4]
-        flags = "#1" if fd else ""  # with a switched bit rate, as the gateway sends them
-        name = f"{can_id:08X}" if extended else f"{can_id:03X}"
-        end = "R" if received else "T"
-        line = f"({us // 1000000}.{us % 1000000:06d}) {channel} {name}#{flags}{data.hex().upper()} {end}\n"
-        write(line.encode("ascii"))
-
-    return one

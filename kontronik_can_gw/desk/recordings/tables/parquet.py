@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.desk.recordings.blocks import RowBlock
-from kontronik_can_gw.desk.recordings.columns import Values
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row, rows_of_block
 from kontronik_can_gw.errors import RunError
@@ -15,8 +14,6 @@ from kontronik_can_gw.signals.unpacker import Value
 
 ROWS = 4096
 """Rows that gather as such."""
-_FIRST = 64
-"""Rows that tell whether neighbours are one object."""
 _FAR = 1 << 63
 _EXACT = 1 << 53
 GROUP = 1 << 16
@@ -136,8 +133,8 @@ class ParquetTable:
             # one out of range comes from a damaged clock
             known = [wall if wall is not None and -_FAR <= wall < _FAR else None for wall in walls]
             arrays.append(pa.array(known, pa.int64()).cast(pa.timestamp("ns", tz="UTC")))
-        for part, values in zip(self._table.parts(), zip(*rows, strict=True), strict=True):
-            arrays += self._columns(part, values)
+        columns = enumerate(zip(*rows, strict=True))
+        arrays += [self._array(index, column) for index, column in columns]
         self._rows = []
         self._hold(arrays)
 
@@ -147,20 +144,6 @@ class ParquetTable:
         self._held += batch.num_rows
         if self._held >= GROUP:
             self._write_group()
-
-    def _columns(self, part: range, rows: Sequence[Values | None]) -> list[Any]:
-        """The columns of one part of all rows. Rows that have one object in common are made once and repeated."""
-        first = rows[:_FIRST]
-        few_alike = len({id(values) for values in first}) * 2 > len(first)
-        once = rows if few_alike else list({id(values): values for values in rows}.values())
-        nothing = (None,) * len(part)
-        columns = zip(*(nothing if values is None else values for values in once), strict=True)
-        arrays = [self._array(index, column) for index, column in zip(part, columns, strict=True)]
-        if few_alike:
-            return arrays
-        places = {id(values): place for place, values in enumerate(once)}
-        repeated = self._pa.array([places[id(values)] for values in rows], self._pa.int32())
-        return [array.take(repeated) for array in arrays]
 
     def _array(self, index: int, column: Sequence[Value]) -> Any:
         pa, one = self._pa, self._table.fields[index]

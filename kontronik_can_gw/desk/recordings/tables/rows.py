@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import chain, groupby
-from operator import itemgetter
 from typing import Any, NamedTuple, TypeVar
 
 from kontronik_can_gw.capture.replay import TimedFrame
@@ -28,14 +27,11 @@ T = TypeVar("T")
 
 
 class Row(NamedTuple):
-    """A row. ``time_ns``: since the recording's start. ``wall_ns``: Unix time, None where unknown.
-
-    ``parts``: values of neighbouring fields. A part that has not changed is the object that it was; None: it is of another frame.
-    """
+    """A row. ``time_ns``: since the recording's start. ``wall_ns``: Unix time, None where unknown. ``values``: of each field."""
 
     time_ns: int
     wall_ns: int | None
-    parts: tuple[Values | None, ...]
+    values: Values
 
 
 def fields_of_frames(recording: Input) -> list[Field]:
@@ -121,28 +117,24 @@ def rows_of(
             return None, iter(())
         origin_ns = first_frame.time_ns
         columns = recording.reader.columns
-        runs = groupby(choice.columns, lambda index: columns[index].key)
-        by_message = [(key, list(indices)) for key, indices in runs]
         names = {columns[at].key: _frame_name(columns[at]) for at in choice.columns}
-        items = _of_frames(recording, frames, origin_ns, names, by_message)
-        widths = [2, *(len(indices) for _, indices in by_message)]
+        items = _of_frames(recording, frames, origin_ns, names, choice.columns)
         fields = [*frame_fields(names.values()), *fields]
     else:
         first, samples = first_of(recording.samples(choice.columns))
         if first is None:
             return None, iter(())
         origin_ns = first.time_ns
-        items = (Row(at - origin_ns, wall_ns(at), parts) for at, parts in samples)
-        widths = list(map(len, first.parts))
+        items = (Row(at - origin_ns, wall_ns(at), values) for at, values in samples)
     if choice.start_ns is not None or choice.end_ns is not None:
         items = _cut(items, choice.start_ns, choice.end_ns)
     if choice.rate is not None:
-        items = thinned(items, choice.rate, (lambda row: row.parts[0]) if by_frame else None)
+        items = thinned(items, choice.rate, (lambda row: row.values[:2]) if by_frame else None)
     first_row, items = first_of(items)
     if first_row is None:
         return None, iter(())
     wall = wall_ns(origin_ns)
-    return Table(fields, wall is not None, by_frame, wall, recording.provenance, widths), items
+    return Table(fields, wall is not None, by_frame, wall, recording.provenance), items
 
 
 def _in_blocks(
@@ -157,8 +149,7 @@ def _in_blocks(
     if first is None:
         return None, blocks
     fields = [recording.fields[index] for index in choice.columns]
-    widths = [len(fields)]
-    return Table(fields, wall is not None, False, wall, recording.provenance, widths), blocks
+    return Table(fields, wall is not None, False, wall, recording.provenance), blocks
 
 
 def _cut_blocks(blocks: Iterator[RowBlock], choice: Choice, origin_ns: int) -> Iterator[RowBlock]:
@@ -175,7 +166,7 @@ def rows_of_block(block: RowBlock) -> Iterator[Row]:
     """The rows of a block one by one."""
     origin_ns, wall_ns = block.origin_ns, block.wall_ns
     for at, values in block.values():
-        yield Row(at - origin_ns, None if wall_ns is None else at + wall_ns, (values,))
+        yield Row(at - origin_ns, None if wall_ns is None else at + wall_ns, values)
 
 
 def _of_frames(
@@ -183,23 +174,22 @@ def _of_frames(
     frames: Iterator[TimedFrame],
     origin_ns: int,
     names: dict[int, tuple[str, str]],
-    runs: Sequence[tuple[int, Sequence[int]]],
+    chosen: Sequence[int],
 ) -> Iterator[Row]:
-    """A row for each frame of a message in ``names``; its columns, and None for those of the other ``runs``."""
+    """A row for each frame of a message in ``names``: its columns, and None for those of other messages."""
     reader, wall_ns = recording.reader, recording.wall_ns
-    picks = [(key, _picker(indices)) for key, indices in runs]
-    count = len(reader.columns)
+    nothing: list[Value] = [None] * len(reader.columns)
     for time_ns, frame, _ in frames:
         key = frame.key
         head = names.get(key)
         if head is None or (chunks := reader.read(key, frame.data)) is None:
             # shorter than its message
             continue
-        values: list[Value] = [None] * count
+        values = nothing.copy()
         for first, new in chunks:
             values[first : first + len(new)] = new
-        parts = [pick(values) if of == key else None for of, pick in picks]
-        yield Row(time_ns - origin_ns, wall_ns(time_ns), (head, *parts))
+        row = (*head, *(values[index] for index in chosen))
+        yield Row(time_ns - origin_ns, wall_ns(time_ns), row)
 
 
 def _frame_name(column: Column) -> tuple[str, str]:
@@ -226,10 +216,3 @@ def thinned(
     for _, in_slot in groupby(rows, lambda row: row.time_ns // period):
         newest = {None if by is None else by(row): row for row in in_slot}
         yield from sorted(newest.values(), key=lambda row: row.time_ns)
-
-
-def _picker(columns: Sequence[int]) -> Callable[[Sequence[Value]], Values]:
-    if len(columns) == 1:
-        only = columns[0]
-        return lambda values: (values[only],)
-    return itemgetter(*columns)
