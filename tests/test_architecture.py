@@ -68,7 +68,7 @@ ONLY_IN = {
     "asammdf": ("desk",),
     "paho": ("desk",),
     "shtab": ("cli",),
-    "canopen": (),
+    "canopen": ("desk/monitor/demo.py",),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
