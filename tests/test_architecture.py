@@ -197,8 +197,7 @@ def test_nothing_outside_its_folder_knows_the_wire() -> None:
     """Only protocols.py names a protocol. The simulated ESC speaks KONTRONIK's; what runs it imports it."""
     wire = f"{NAME}.esc.kontronik"
     runs_a_simulated_esc = {
-        *("cli/simulate.py", "cli/simulate_options.py"),
-        *("desk/monitor/demo.py", "desk/pty.py"),
+        *("cli/simulate.py", "desk/monitor/demo.py", "desk/pty.py"),
     }
     for path in MODULES:
         name = path.relative_to(PACKAGE).as_posix()

@@ -12,6 +12,15 @@ from kontronik_can_gw.errors import UserError
 REMOVED_OPTIONS: dict[tuple[str, str], str] = {
     ("describe", "--format html"): "Type kontronik-can-gw describe -o bus.md; pandoc -s bus.md -o bus.html makes a page of it.",
     ("describe", "--format man"): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
+    ("simulate", "--variant"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
+    ("simulate", "--firmware"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
+    ("simulate", "--cells"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
+    ("simulate", "--rate"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
+    ("simulate", "--info-every"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
+    ("simulate", "--info-replaces"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
+    ("simulate", "--noise"): "Type --flip-bits 0.0001: a bad line.",
+    ("simulate", "--lose-bytes"): "Type --flip-bits 0.0001: a bad line.",
+    ("simulate", "--swap-device"): "End it, and type simulate --device NAME with the same --link.",
     ("service", "--prometheus"):
         "Type kontronik-can-gw service install --metrics: a service of its own serves /metrics, and the gateway listens on nothing.",
     ("service", "--dry-run"):

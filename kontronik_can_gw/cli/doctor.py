@@ -11,7 +11,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.canopen.traffic import bits_per_second
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.cli.recording import record_folder
@@ -103,17 +102,9 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
 
 
 def _outputs(findings: Findings, loaded: Loaded) -> None:
-    """What will be sent, by which core, and warnings."""
+    """Which core would run, and warnings."""
     config = loaded.config
-    words = [f"{len(config.esc)} ESC{'s' * (len(config.esc) > 1)}"]
-    load = loaded.layout.bus_load(config.can.bitrate, config.can.data_bitrate)
-    if config.dbc.enabled:
-        words.append(f"{len(loaded.layout.messages)} messages of {config.dbc_path.name}")
-    if loaded.canopen is not None:
-        words.append(f"their CANopen nodes of {config.eds_path.name}")
-        load += bits_per_second(loaded.canopen.nodes(loaded.escs).nodes) / config.can.bitrate
-    about = {"file": config.file, "outputs": ", ".join(words), "load": load}
-    findings.say("config", "ok", **about, kilobits=config.can.bitrate // 1000)
+    findings.say("config", "ok", file=config.file)
     core, why = make_core(loaded.escs, loaded.layout, 0, silent=False)
     findings.say("config.core", "python" if why else "ok", core=in_words(core.language, why))
     damaged = {

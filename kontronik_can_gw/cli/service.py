@@ -119,7 +119,7 @@ def _install(args: argparse.Namespace) -> int:
             raise RunError(f"--{kind}: pip install 'kontronik-can-gw[{kind}]'")
     program = args.executable or _own_program()
     if args.root is None:
-        _check_program(program)
+        _check_program(program, is_own=args.executable is None)
     files = dict(planned(program, companions, args.channel, args.network))
     own = root / CONFIGURATIONS / f"{args.instance or 'gateway'}.toml"
     if not own.exists():
@@ -130,8 +130,8 @@ def _install(args: argparse.Namespace) -> int:
             raise RunError(f"{(root / place).parent}: leads out of {root}")
     for place, text in files.items():
         put(root / place, text)
-    for place in OBSOLETE:
-        remove(root / place)
+    for path in (path for place in OBSOLETE for path in root.glob(place)):
+        remove(path)
     if args.root is None:
         _reload(args.network)
     _enable(args, root, own, companions)
@@ -201,9 +201,12 @@ def _own_program() -> str:
     raise UserError(f"no installed {NAME} belongs to this Python. Name it with --executable.")
 
 
-def _check_program(program: str) -> None:
-    """UserError where the service's user could not run it, or import this package."""
-    for path in (Path(program), Path(program).resolve(), Path(__file__).resolve()):
+def _check_program(program: str, *, is_own: bool) -> None:
+    """UserError where the service's user could not run it. ``is_own``: it is run by this Python, with this package."""
+    paths = [Path(program), Path(program).resolve()]
+    if is_own:
+        paths += [Path(sys.executable).resolve(), Path(__file__).resolve()]
+    for path in paths:
         for part in (*reversed(path.parents), path):
             mode = part.stat().st_mode & (1 if part.is_dir() else 4) if part.exists() else 0
             if not mode or str(part) in ("/tmp", "/var/tmp"):  # noqa: S108  it has its own

@@ -15,7 +15,10 @@ COMPANIONS = {"mqtt": "paho", "metrics": "prometheus_client"}
 """Services that may stand by the gateway's, and the module that each needs."""
 _PROGRAM = f"/usr/bin/{NAME}"
 """The program in the files."""
-OBSOLETE = tuple(f"{UNITS}/{NAME}{end}.service.d/prometheus.conf" for end in ("", "@"))
+OBSOLETE = (
+    *(f"{UNITS}/{NAME}{end}.service.d/prometheus.conf" for end in ("", "@")),
+    f"etc/systemd/network/50-{NAME}-*.example",
+)
 """What 0.5.0 installed."""
 
 

@@ -1,6 +1,7 @@
 """``simulate``: simulates ESCs on pseudo terminals, with or without faults."""
 
 import argparse
+import re
 import sys
 from collections import Counter
 from contextlib import nullcontext
@@ -8,27 +9,95 @@ from pathlib import Path
 from threading import Event
 
 from kontronik_can_gw.cli import discard_output
+from kontronik_can_gw.cli.arguments import number_from, option
 from kontronik_can_gw.cli.common import stopping_on_signals
-from kontronik_can_gw.cli.simulate_options import OPTIONS as OPTIONS
-from kontronik_can_gw.cli.simulate_options import esc_options, mistakes
 from kontronik_can_gw.cli.terminals import terminals
 from kontronik_can_gw.desk.pty import run
-from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, Sent, SimulatedEsc
+from kontronik_can_gw.errors import RunError, UserError, did_you_mean
+from kontronik_can_gw.esc.kontronik.simulator import (
+    FLIGHT,
+    IDLE,
+    SECOND_NS,
+    Device,
+    Dropout,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    Layout,
+    OperatingError,
+    SelfTestError,
+    Sent,
+    SimulatedEsc,
+)
 
+_DEVICES = {device.text.lower(): device for device in Device}
+_BITS: dict[str, OperatingError | SelfTestError] = {
+    bit.text: bit for kind in (OperatingError, SelfTestError) for bit in kind
+}
+_UNITS = {"ms": 1e6, "s": 1e9, "": 1e9, "min": 60e9, "h": 3600e9}
+
+
+def _time_ns(text: str) -> int:
+    """A TIME in nanoseconds."""
+    match = re.fullmatch(r"([0-9]{1,6}(?:\.[0-9]*)?)\s*(ms|s|min|h|)", text.strip())
+    if not match:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a time. Give for example 5s, 200ms or 2min"
+        )
+    return round(float(match[1]) * _UNITS[match[2]])
+
+
+def _dropout(text: str) -> Dropout:
+    duration, _, interval = text.partition("/")
+    dropout = Dropout(_time_ns(duration), _time_ns(interval))
+    if dropout.duration_ns >= dropout.interval_ns:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: the silence must be shorter than the interval, as 2s/10s"
+        )
+    return dropout
+
+
+def _error(text: str) -> ErrorWindow:
+    name, _, when = text.partition("@")
+    start, plus, duration = when.partition("+")
+    key = name.lower().replace("-", "_")
+    if key not in _BITS:
+        near = did_you_mean(key, _BITS, or_known=True)
+        raise argparse.ArgumentTypeError(f"{name!r} is not an error bit.{near}")
+    return ErrorWindow(_BITS[key], _time_ns(start), _time_ns(duration) if plus else None)
+
+
+# fmt: off
+OPTIONS = (
+    "what ESC",
+    option("--esc N", "number of ESCs, 1..1000 (default 1)", type=number_from(1, 1000, "number of ESCs", kind=int), default=1),
+    option("--device", "default: kosmik, in the legacy layout jivepro", choices=tuple(_DEVICES)),
+    option("--layout", "mixed: odd ESCs v4, even ones legacy (default: legacy for jivepro, else v4)", choices=("v4", "legacy", "mixed")),
+    option("--idle", "the motor never runs (default: a repeating flight of 50 s)"),
+    option("--seed N", "seed of all that is random (default 0)", type=int, default=0),
+    "where to, and how long",
+    option("--link PATH", "symbolic link to the pseudo terminal; {n} is the ESC's number, from 1"),
+    option("--out FILE", "write the bytes to FILE (- for standard output) as fast as possible, no pseudo terminal; {n} as for --link"),
+    option("--seconds TIME", "stop after this time", type=_time_ns),
+    "misbehaviour",
+    option("--flip-bits SHARE", "share of bits that are flipped, as 0.0001", type=number_from(0, 1, "share, as 0.0001"), default=0.0),
+    option("--dropout TIME/TIME", "length and interval of silences: 2s/10s", type=_dropout),
+    option("--error NAME@TIME[+TIME]", "set an error bit at a time, for a time or for ever; may be repeated",
+           type=_error, action="append", default=[]),
+)
+# fmt: on
 EPILOG = """\
 Prints a line "esc1 /dev/pts/5" for each ESC on standard output, then sends until SIGINT, SIGTERM or --seconds.
 The same options and seed give the same bytes. Each ESC of several has a seed of its own (N, N+1, ...).
 Whatever a gateway sends to the ESC, an echo included, is reported as an error (exit code 1): a real ESC could take
 it for a command.
 
-TIME is 5s, 200ms, 2min or a number of seconds. SHARE is 0.001 or 0.1%.
+TIME is 5s, 200ms, 2min or a number of seconds.
 Error names are those that decode prints, such as undervoltage or test_short_to_ground.
 
 examples:
   kontronik-can-gw simulate --esc 2 --link /tmp/esc{n}
   kontronik-can-gw simulate --device jivepro --error undervoltage@5s+2s --dropout 2s/10s
-  kontronik-can-gw simulate --noise 3 --lose-bytes 0.1% --swap-device kolibri@20s --swap-device jivepro:legacy@40s
   kontronik-can-gw simulate --seconds 60 --out - | kontronik-can-gw decode - --csv > flight.csv
 
 exit codes: 0 done, 1 failed while running or a gateway transmitted, 2 wrong usage
@@ -36,23 +105,19 @@ exit codes: 0 done, 1 failed while running or a gateway transmitted, 2 wrong usa
 
 
 def main(args: argparse.Namespace) -> int:
-    """Simulate. UserError for each bad value, RunError if a gateway transmitted or a file failed."""
-    problems = mistakes(args)
-    has_several = isinstance(args.esc, int) and args.esc > 1
-    for option, path in (("--link", args.link), ("--out", args.out)):
-        if path is not None and has_several and "{n}" not in path:
-            problems.append(
-                f"{option} {path}: needs {{n}} in the path, for the number of each of the {args.esc} ESCs."
+    """Simulate. UserError for wrong usage, RunError if a gateway transmitted or a file failed."""
+    for name, path in (("--link", args.link), ("--out", args.out)):
+        if path is not None and args.esc > 1 and "{n}" not in path:
+            raise UserError(
+                f"{name} {path}: needs {{n}} in the path, for the number of each of the {args.esc} ESCs."
             )
     if args.out is not None and args.seconds is None:
-        problems.append(f"--out {args.out}: has no end. Give --seconds.")
+        raise UserError(f"--out {args.out}: has no end. Give --seconds.")
     if args.out is not None and args.link is not None:
-        problems.append("--link: there is no pseudo terminal with --out. Give one of the two.")
-    if problems:
-        raise UserError(*problems)
+        raise UserError("--link: there is no pseudo terminal with --out. Give one of the two.")
     escs = []
     for index in range(args.esc):
-        chosen = esc_options(args, index + 1)
+        chosen = _options(args, index + 1)
         # spread over the period, since real ESCs are not synchronized
         start_ns = chosen.period_ns * index // args.esc
         escs.append(SimulatedEsc(chosen, seed=args.seed + index, start_ns=start_ns))
@@ -61,6 +126,20 @@ def main(args: argparse.Namespace) -> int:
     else:
         _to_terminals(escs, args.link, args.seconds)
     return 0
+
+
+def _options(args: argparse.Namespace, number: int) -> EscOptions:
+    """Options of the ESC with this number, from 1."""
+    layout = args.layout
+    if layout == "mixed":
+        layout = "v4" if number % 2 else "legacy"
+    usual = "jivepro" if layout == "legacy" else "kosmik"
+    return EscOptions(
+        device=_DEVICES[args.device or usual],
+        layout=None if layout is None else Layout(layout),
+        profile=IDLE if args.idle else FLIGHT,
+        faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
+    )
 
 
 def _to_files(escs: list[SimulatedEsc], path: str, time_ns: int) -> None:

@@ -51,32 +51,34 @@ def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None
     assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
 
 
-def test_device_variant_firmware_and_cells_are_as_asked(tmp_path: Path) -> None:
-    words = "--device Kontrol_X --variant 7 --firmware 3.9 --cells 12"
-    frames = written(tmp_path, f"{words} --seconds 2 --rate 200 --info-every 50")
-    infos = [frame.data for frame in frames if isinstance(frame.data, InfoData)]
-    assert len(infos) == 8
-    assert len(frames) == 408
-    assert (infos[0].device, infos[0].variant, infos[0].firmware) == (Device.KONTROL_X, 7, "3.9")
-    assert infos[0].cell_count == 12
-
-
-def test_error_bits_and_device_swaps_come_when_asked(tmp_path: Path) -> None:
-    words = "--error undervoltage@1s+500ms --error BEC-overcurrent@2 --seconds 6"
-    frames = written(tmp_path, f"--swap-device uhv:legacy@4.5s --swap-device jivepro@3s {words}")
-    lives = [(f.layout, f.data) for f in frames if isinstance(f.data, LiveData)]
-    errors = [data.operating_errors for _, data in lives]
+def test_error_bits_and_the_device_are_as_asked(tmp_path: Path) -> None:
+    words = "--error undervoltage@1s+500ms --error BEC-overcurrent@2 --device kontrol-x"
+    frames = written(tmp_path, f"{words} --seconds 6")
+    errors = [f.data.operating_errors for f in frames if isinstance(f.data, LiveData)]
     assert [word & 1 for word in errors] == [int(100 <= n < 150) for n in range(600)]
     bec = 1 << OperatingError.BEC_OVERCURRENT
     assert [word & bec for word in errors] == [bec if n >= 200 else 0 for n in range(600)]
-    assert [layout is Layout.V4 for layout, _ in lives] == [n < 300 for n in range(600)]
-    devices = [frame.data.device for frame in frames if isinstance(frame.data, InfoData)]
-    assert devices == [Device.KOSMIK] * 3 + [Device.JIVEPRO] + [Device.UHV]
+    infos = [frame.data for frame in frames if isinstance(frame.data, InfoData)]
+    assert [info.device for info in infos] == [Device.KONTROL_X] * 6
+    assert (infos[0].variant, infos[0].firmware, infos[0].cell_count) == (120, "4.17", 6)
 
 
 def test_what_is_lost_and_disturbed_is_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:
-    words = "--seconds 3 --noise 2 --lose-bytes 0.1% --flip-bits 1e-4 --dropout 500ms/2s"
-    assert 150 < len(written(tmp_path, words)) < 253
+    assert 150 < len(written(tmp_path, "--seconds 3 --flip-bits 3e-4 --dropout 500ms/2s")) < 253
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--seconds soon", "'soon' is not a time. Give for example 5s, 200ms or 2min"),
+        ("--dropout 9s/2s", "'9s/2s': the silence must be shorter than the interval, as 2s/10s"),
+        ("--error undervoltag@5", "'undervoltag' is not an error bit. Did you mean undervoltage?"),
+        ("--esc 2 --link /tmp/x", "--link /tmp/x: needs {n} in the path"),
+        ("--out x", "--out x: has no end. Give --seconds."),
+    ],
+)
+def test_a_wrong_use_is_reported_in_one_line(words: str, said: str) -> None:
+    assert said in refused(2, "simulate", *words.split())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

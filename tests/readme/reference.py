@@ -1,5 +1,6 @@
 """The pages of docs/reference, made from their sources. ``make docs`` writes them."""
 
+import re
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
@@ -9,7 +10,7 @@ from kontronik_can_gw.cli.arguments import Option, Rows
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
-from kontronik_can_gw.desk.describe.markdown import Row, Table, markdown
+from kontronik_can_gw.desk.describe.markdown import Code, Row, Table, markdown
 from kontronik_can_gw.desk.describe.tables import configuration, dbc, values
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 
@@ -35,8 +36,10 @@ def pages() -> Iterator[tuple[str, str]]:
 def _commands() -> Iterator[Table]:
     for name, line in COMMANDS.items():
         module = import_module(f"kontronik_can_gw.cli.{name}")
-        text = [f"{line[:1].upper()}{line[1:]}."]
-        yield Table(name, text + module.EPILOG.split("\n\n"), list(_options(module.OPTIONS)))
+        parts = module.EPILOG.strip().split("\n\n")
+        text = [Code(part) if re.search(r"^  |   ", part, re.MULTILINE) else part for part in parts]
+        lead = f"{line[:1].upper()}{line[1:]}."
+        yield Table(name, [lead, *text], list(_options(module.OPTIONS)))
         for action, (about, options) in getattr(module, "ACTIONS", {}).items():
             yield Table(f"{name} {action}", [about], list(_options(options)))
 

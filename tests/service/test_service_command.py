@@ -122,8 +122,12 @@ def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
     old = root / UNITS / "kontronik-can-gw.service.d/prometheus.conf"
     old.parent.mkdir(parents=True)
     old.write_text("[Service]\nIPAddressAllow=localhost\n")
-    assert f"{old}: removed" in install(root).err
-    assert not old.exists()
+    example = root / "etc/systemd/network/50-kontronik-can-gw-can0.link.example"
+    example.parent.mkdir()
+    example.touch()
+    said = install(root).err
+    assert f"{old}: removed" in said and f"{example}: removed" in said
+    assert not old.exists() and not example.exists()
 
 
 @pytest.mark.parametrize("kind", ["metrics", "mqtt"])
@@ -276,7 +280,7 @@ def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path
     program = written(tmp_path / "closed" / "kontronik-can-gw")
     program.parent.chmod(0o700)
     with pytest.raises(UserError, match="the service's user cannot reach it: /"):
-        service._check_program(str(program))
+        service._check_program(str(program), is_own=False)
 
 
 # --- status, with a stand-in for systemctl

@@ -3,11 +3,18 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
+from textwrap import indent
 from typing import Any, NamedTuple
 
 Row = dict[str, Any]
 _HEX = {"id": 3, "cob_id": 3, "code": 4}
 """Columns of numbers that people write in hexadecimal, with digits."""
+
+
+class Code(str):
+    """Lines to type, which are shown as they are."""
+
+    __slots__ = ()
 
 
 class Table(NamedTuple):
@@ -23,7 +30,8 @@ def markdown(title: str, lead: Iterable[str], tables: Iterable[Table]) -> str:
     """The Markdown text, ending with a line end. Columns that are empty in all rows of a table are left out."""
     blocks = [f"# {text(title)}", *map(text, lead)]
     for table in tables:
-        blocks += [f"## {text(table.title)}", *map(text, table.text)]
+        blocks.append(f"## {text(table.title)}")
+        blocks += [indent(t, "    ") if isinstance(t, Code) else text(t) for t in table.text]
         if table.by:
             for head, rows in groupby(table.rows, key=lambda row: row[table.by]):
                 blocks += [f"### {text(str(head))}", _rows(list(rows), table.by)]

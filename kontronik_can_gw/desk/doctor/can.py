@@ -18,6 +18,7 @@ _CAN_TYPE = "280"
 _FD_MTU = 72
 _STATES = {"ERROR-ACTIVE": "active", "ERROR-WARNING": "warning", "ERROR-PASSIVE": "warning"}
 _MODES = {"LISTEN-ONLY": "listen_only", "LOOPBACK": "loopback"}
+_EVENTS = ("error_passive", "bus_error", "restarts")
 _LOSSES = ("rx_dropped", "rx_errors", "rx_over_errors", "tx_dropped", "tx_errors")
 
 
@@ -100,7 +101,7 @@ def _interface(machine: Machine, findings: Findings, can: CanConfig) -> None:
     events = link.get("info_xstats", {})
     if times := events.get("bus_off"):
         findings.say("can.bus_off", "some", times=times)
-    counts = {key: str(number) for key, number in events.items() if key != "bus_off"} | losses
+    counts = {key: str(events.get(key, 0)) for key in _EVENTS} | losses
     seen = [f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n not in ("", "0")]
     if seen:
         findings.say("can.statistics", "some", counts=", ".join(seen))

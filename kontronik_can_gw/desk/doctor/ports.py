@@ -29,7 +29,7 @@ def check_port(
     real, status = machine.real(port), machine.status(port)
     tty = real.rpartition("/")[2]
     findings = Findings(f"Serial port of {esc}", port=port, tty=tty, user=machine.user.name)
-    hardware = f"/sys/class/tty/{tty}/device"
+    hardware = f"/sys/class/tty/{tty}"
     is_pty = real.startswith("/dev/pts/")
     if (
         status is None
@@ -43,7 +43,7 @@ def check_port(
     holders, complete = machine.openers(status)
     if is_pty:  # the simulator has it open too
         holders = [process for process in holders if process.is_gateway]
-    usb = _adapter(machine, machine.real(hardware))
+    usb = _adapter(machine, machine.real(f"{hardware}/device"))
     product = machine.text(f"{usb}/product") if usb else ""
     case = "pty" if is_pty else "ok"
     findings.say("port.exists", case, what=", ".join(filter(None, [tty, product])))
@@ -112,11 +112,11 @@ def _permission(
     may = machine.may(str(findings.values["port"]), os.R_OK | os.W_OK)
     if who is not machine.user:
         may = who.may(status, 6)
-    elif any(process.is_gateway for process in holders):
-        may = True
     is_shared = status.st_mode & 0o060 == 0o060 and status.st_gid != 0
     group = machine.group_name(status.st_gid)
     case = "ok" if may else "join" if is_shared else "open"
+    if not may and who is machine.user and any(process.is_gateway for process in holders):
+        case = "gateway"
     findings.say("port.permission", case, user=who.name, group=group)
     # the names in /proc/devices are those of DeviceAllow
     characters = machine.text("/proc/devices").partition("Block")[0].splitlines()

@@ -13,6 +13,11 @@ from kontronik_can_gw.esc.kontronik.states import (
 
 _STANDING = frozenset(state for state in OperatingState if state <= OperatingState.StandBy)
 _INT16 = 32_767
+_AMBIENT = 22.0
+"""°C"""
+_VARIANT = 120
+_FIRMWARE = 4 << 8 | 17
+"""4.17"""
 _SPEED_PER_VOLT = 2500.0  # electrical 1/min for each V at the motor
 _SUPPLIES_NO_BEC_CURRENT = rows(LiveData)["bec_current"].not_on
 
@@ -37,8 +42,8 @@ class FlightModel:
         self._measures_battery_peak = peak_current_of(device) == "battery"
         self._supplies_bec_current = device not in _SUPPLIES_NO_BEC_CURRENT
         self._strength = options.max_current * (0.95 + 0.1 * self._random())
-        self._stage_temperature = options.ambient + 4 + 2 * self._random()
-        self._bec_temperature = options.ambient + 6 + 2 * self._random()
+        self._stage_temperature = _AMBIENT + 4 + 2 * self._random()
+        self._bec_temperature = _AMBIENT + 6 + 2 * self._random()
         self._power_up()
 
     def _power_up(self) -> None:
@@ -129,14 +134,12 @@ class FlightModel:
         """A first-order lag each. At full load the power stage settles about 60 K above ambient."""
         options, dt = self._options, self._dt
         stage = self._stage_temperature
-        stage += (
-            4 + 60 * abs(motor_current) / options.max_current + options.ambient - stage
-        ) * min(dt / 25, 1.0)
+        stage += (4 + 60 * abs(motor_current) / options.max_current + _AMBIENT - stage) * min(
+            dt / 25, 1.0
+        )
         self._stage_temperature = stage
         bec = self._bec_temperature
-        bec += (
-            5 + 4 * bec_current + 0.2 * (stage - options.ambient) + options.ambient - bec
-        ) * min(dt / 40, 1.0)
+        bec += (5 + 4 * bec_current + 0.2 * (stage - _AMBIENT) + _AMBIENT - bec) * min(dt / 40, 1.0)
         self._bec_temperature = bec
 
     def _in_steps(
@@ -194,11 +197,9 @@ class FlightModel:
     def info(self, selftest_errors: int) -> InfoData:
         """The info data now: extremes of all live data since power-up, sent or not."""
         options = self._options
-        main, sub = options.firmware
-        pair = device_and_variant(self._device, options.variant)
         return InfoData(
-            device_and_variant=pair,
-            firmware_word=main << 8 | sub,
+            device_and_variant=device_and_variant(self._device, _VARIANT),
+            firmware_word=_FIRMWARE,
             selftest_errors=selftest_errors,
             cell_count=options.cell_count,
             **self._log,

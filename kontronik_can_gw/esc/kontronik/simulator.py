@@ -13,43 +13,25 @@ from collections.abc import Iterator
 from random import Random
 from typing import NamedTuple
 
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import Layout as Layout
+from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import Data
 from kontronik_can_gw.esc.kontronik.flight_model import FlightModel
-from kontronik_can_gw.esc.kontronik.simulator_options import (
-    FLIGHT,
-    IDLE,
-    POWER_UP,
-    SECOND_NS,
-    Dropout,
-    ErrorWindow,
-    EscOptions,
-    Faults,
-    Phase,
-    Swap,
-    usual_layout,
-)
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
+from kontronik_can_gw.esc.kontronik.simulator_options import FLIGHT as FLIGHT
+from kontronik_can_gw.esc.kontronik.simulator_options import IDLE as IDLE
+from kontronik_can_gw.esc.kontronik.simulator_options import POWER_UP as POWER_UP
+from kontronik_can_gw.esc.kontronik.simulator_options import SECOND_NS as SECOND_NS
+from kontronik_can_gw.esc.kontronik.simulator_options import Dropout as Dropout
+from kontronik_can_gw.esc.kontronik.simulator_options import ErrorWindow as ErrorWindow
+from kontronik_can_gw.esc.kontronik.simulator_options import EscOptions as EscOptions
+from kontronik_can_gw.esc.kontronik.simulator_options import Faults as Faults
+from kontronik_can_gw.esc.kontronik.simulator_options import Phase as Phase
+from kontronik_can_gw.esc.kontronik.simulator_options import Swap as Swap
+from kontronik_can_gw.esc.kontronik.simulator_options import usual_layout as usual_layout
+from kontronik_can_gw.esc.kontronik.states import Device as Device
+from kontronik_can_gw.esc.kontronik.states import OperatingError as OperatingError
+from kontronik_can_gw.esc.kontronik.states import SelfTestError as SelfTestError
 
-__all__ = [
-    "FLIGHT",
-    "IDLE",
-    "POWER_UP",
-    "SECOND_NS",
-    "Device",
-    "Dropout",
-    "ErrorWindow",
-    "EscOptions",
-    "Faults",
-    "Layout",
-    "OperatingError",
-    "Phase",
-    "SelfTestError",
-    "Sent",
-    "SimulatedEsc",
-    "Swap",
-    "usual_layout",
-]
 BYTE_NS = 11 * SECOND_NS // 115_200
 """Wire time of a byte: start, 8 data, parity, stop."""
 
@@ -131,12 +113,9 @@ class SimulatedEsc:
             self._tick_ns = self.next_ns = now_ns + options.period_ns
             self._frame_number += 1
             if options.info_every and self._frame_number % options.info_every == 0:
-                if options.info_replaces:
-                    data = self._model.info(self._word(SelfTestError, since_start))
-                else:
-                    self._info_due = True
-                    length = 40 if self.layout is Layout.V4 else 38
-                    self.next_ns = now_ns + min(length * BYTE_NS, options.period_ns // 2)
+                self._info_due = True
+                length = 40 if self.layout is Layout.V4 else 38
+                self.next_ns = now_ns + min(length * BYTE_NS, options.period_ns // 2)
         if self._dropout is not None:
             duration, interval = self._dropout
             if since_start % interval >= interval - duration:
