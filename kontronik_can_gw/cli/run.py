@@ -5,6 +5,7 @@ import gc
 import logging
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,13 +102,14 @@ class _Run:
             self._loop.stop()
 
     def _opened(self) -> "Loop":
-        """The loop with everything open. The parsed DBC is freed at the end of this method."""
+        """The loop with everything open."""
         from kontronik_can_gw.native.load import in_words
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.native_poller import poller_for
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
-        loaded = load_all(self._path, _parameter_store)
+        # what cantools made of the DBC is not needed any more, and leaves its memory to the core
+        loaded = replace(load_all(self._path, _parameter_store), database=None)
         if loaded.canopen is not None:
             gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config

@@ -4,9 +4,9 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
+from functools import lru_cache
 
 from kontronik_can_gw.dbc import raw_values
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.raw_values import ValueTable
 from kontronik_can_gw.dbc.settings import UnfitSignal
 from kontronik_can_gw.esc.values import Divisor, Value
@@ -23,11 +23,7 @@ def bound_plan(
     """
     slope, intercept = _scale(plan, value)
     plan = replace(plan, role=Role.SOURCE, source=value, slope=slope, intercept=intercept)
-    numbers = {
-        number: table.codes[normalize(text)]
-        for number, text in value.names.items()
-        if normalize(text) in table.codes
-    }
+    numbers = table.numbers(value)
     notes = [*_notes_on_names(value, numbers)]
     if not numbers and not plan.is_float:
         notes += _notes_on_scale(plan, value, slope / divisor)
@@ -57,8 +53,16 @@ def _scale(plan: SignalPlan, value: Value) -> tuple[Fraction, Fraction]:
             f"{value.name} is in {value.unit or 'no unit'} and cannot be converted to "
             f"{plan.unit!r}. Possible: {can}; dbc.units says what other texts mean."
         )
+    return _slope_and_intercept(converted, value.per_unit, plan.factor, plan.offset)
+
+
+@lru_cache(maxsize=1024)
+def _slope_and_intercept(
+    converted: tuple[Fraction, Fraction], per_unit: int, factor: Fraction, offset: Fraction
+) -> tuple[Fraction, Fraction]:
+    """For signals alike one and the same object."""
     scale, shift = converted
-    return scale / value.per_unit / plan.factor, (shift - plan.offset) / plan.factor
+    return scale / per_unit / factor, (shift - offset) / factor
 
 
 def _notes_on_names(value: Value, numbers: Mapping[int, int]) -> Iterator[str]:

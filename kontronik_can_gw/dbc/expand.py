@@ -221,6 +221,7 @@ def _step(
 
 
 def _rename(message: "Message", prefix: str) -> None:
+    """Rename a message and its signals; the database that it gets into refreshes what cantools derives of them."""
     old_name = message.name
     stem = old_name.removeprefix("Esc")
     message.name = prefix + (stem if stem[:1].isupper() else old_name)
@@ -231,4 +232,3 @@ def _rename(message: "Message", prefix: str) -> None:
             signal.multiplexer_signal = names[signal.multiplexer_signal]
     for group in message.signal_groups or []:
         group.signal_names = [names.get(name, name) for name in group.signal_names]
-    message.refresh(strict=False)

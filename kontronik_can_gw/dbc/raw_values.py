@@ -3,9 +3,11 @@
 import math
 import struct
 from fractions import Fraction
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.esc.values import Value
 from kontronik_can_gw.signals.plan import Piece
 
 if TYPE_CHECKING:
@@ -32,6 +34,17 @@ class ValueTable:
             if normalize(text) not in _NOT_AVAILABLE | _ERROR
         }
         """Entries that are values."""
+        self._numbers: dict[Value, dict[int, int]] = {}
+
+    def numbers(self, value: Value) -> dict[int, int]:
+        """Numbers of an enumeration to the raw values of their texts."""
+        if value not in self._numbers:
+            self._numbers[value] = {
+                number: self.codes[normalize(text)]
+                for number, text in value.names.items()
+                if normalize(text) in self.codes
+            }
+        return self._numbers[value]
 
     def _first(self, texts: frozenset[str]) -> int | None:
         return next((raw for text, raw in self.codes.items() if text in texts), None)
@@ -50,9 +63,14 @@ def bits(signal: "Signal") -> list[int]:
 
 
 def pieces(signal: "Signal") -> tuple[Piece, ...]:
-    """The signal as runs of adjacent bits."""
+    """The signal as runs of adjacent bits; of signals at the same place one and the same object."""
+    return _runs(tuple(bits(signal)))
+
+
+@lru_cache(maxsize=1024)
+def _runs(places: tuple[int, ...]) -> tuple[Piece, ...]:
     found: list[Piece] = []
-    for shift, at in enumerate(bits(signal)):
+    for shift, at in enumerate(places):
         last = found[-1] if found else None
         if last and at == last.at + last.width:
             found[-1] = last._replace(width=last.width + 1)
@@ -77,6 +95,7 @@ def is_raw(value: Any, signal: "Signal") -> bool:
     return low <= value <= high
 
 
+@lru_cache(maxsize=1024)
 def exact(number: Any) -> Fraction:
     """The decimal number in the file, not the float nearest to it."""
     return Fraction(repr(number)) if isinstance(number, float) else Fraction(number)

@@ -45,7 +45,7 @@ class Piece(NamedTuple):
     at: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SignalPlan:
     """One signal with what fills it. Raw value of a source in steps x: ``x * slope + intercept``, rounded."""
 
@@ -89,7 +89,7 @@ def classic_bits(length: int, extended: bool = False) -> int:
     return head + 13 + 8 * length + (head + 8 * length - 1) // 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class MessagePlan:
     """One message of ours, as it is sent."""
 
