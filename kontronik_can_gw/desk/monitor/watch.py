@@ -1,7 +1,6 @@
 """Watching a source: a live screen with keys, lines without a terminal, or one document."""
 
 import contextlib
-import io
 import os
 import select
 import sys
@@ -82,13 +81,13 @@ def _keys() -> Iterator[int | None]:
     """Have single keys read without echo; Ctrl-C and Ctrl-Z are keys too. None where standard input is no terminal of ours."""
     try:
         fd = sys.stdin.fileno()
-        before = termios.tcgetattr(fd)
-        works = os.tcgetpgrp(fd) == os.getpgrp()
-    except (OSError, ValueError, AttributeError, io.UnsupportedOperation, termios.error):
-        works = False
-    if not works:
+        is_ours = os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
+    except OSError:
+        is_ours = False
+    if not is_ours:
         yield None
         return
+    before = termios.tcgetattr(fd)
     single = before[3] & ~(termios.ECHO | termios.ICANON | termios.ISIG)
     termios.tcsetattr(fd, termios.TCSADRAIN, [*before[:3], single, *before[4:]])
     try:
