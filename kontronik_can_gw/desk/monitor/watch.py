@@ -69,6 +69,8 @@ def obey(key: str, source: Source, monitor: Monitor, page: int) -> int:
             monitor.reset()
         case "n" | "p":
             return (page + (1 if key == "n" else -1)) % (count + 1)
+        case "a" | "\x1b":
+            return 0
         case " " if source.is_file:
             source.paused = not source.paused
         case digit if digit.isdecimal() and int(digit) <= count:
