@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from kontronik_can_gw.desk.monitor.lines import wrapped
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import alarms, notices, screen, table_of
 from kontronik_can_gw.desk.sources import Source
@@ -24,19 +25,16 @@ REFRESH_S = 0.15
 _QUIT = ("q", "\x03", "\x04")
 
 Stopped = Callable[[], bool]
-Say = Callable[[str], None]
 
 
-def watch(
-    source: Source, monitor: Monitor, interval: float | None, stopped: Stopped, say: Say
-) -> None:
-    """Show the source until a key, ``stopped``, or without a terminal the end of a file. ``say`` takes notices."""
+def watch(source: Source, monitor: Monitor, interval: float | None, stopped: Stopped) -> None:
+    """Show the source until a key, ``stopped``, or without a terminal the end of a file."""
     console = Console(highlight=False)
     monitor.advance(source.now())
     if console.is_terminal and not console.is_dumb_terminal:
         _live(console, source, monitor, interval or REFRESH_S, stopped)
     else:
-        _lines(source, monitor, interval or 1.0, stopped, say)
+        _lines(source, monitor, interval or 1.0, stopped)
 
 
 def _live(
@@ -99,22 +97,15 @@ def _keys() -> Iterator[int | None]:
             termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
-def _lines(source: Source, monitor: Monitor, interval: float, stopped: Stopped, say: Say) -> None:
-    """Print the table again and again, without terminal control."""
-    before: list[str] = []
+def _lines(source: Source, monitor: Monitor, interval: float, stopped: Stopped) -> None:
+    """Print notices and the table again and again, without terminal control."""
     while not stopped() and not source.ended:
         due = time.monotonic() + interval
         while time.monotonic() < due and not source.ended and not stopped():
             source.pump(monitor.take, due)
         monitor.advance(source.now())
-        news = [text for text, _ in notices(monitor, source)]
-        for text in news:
-            if text not in before:
-                say(text)
-        if before and not news:
-            say(f"{source.name}: frames come")
-        before = news
-        for line in (*table_of(monitor.escs, 80), *alarms(monitor.escs, 80)):
+        said = [line for text, _ in notices(monitor, source) for line in wrapped(text, "", 80)]
+        for line in (*said, *table_of(monitor.escs, 80), *alarms(monitor.escs, 80)):
             print(line.plain.rstrip(), flush=True)
 
 
