@@ -52,7 +52,9 @@ def _live(
             source.pump(monitor.take, min(due, now + 0.1))
             monitor.advance(source.now())
             if fd is not None and select.select([fd], [], [], 0)[0]:
-                typed = os.read(fd, 64)
+                typed = b""
+                with contextlib.suppress(OSError):
+                    typed = os.read(fd, 64)
                 key = typed.decode("ascii", "ignore").lower()
                 if not typed or key in _QUIT:  # nothing: the terminal is closed
                     return
