@@ -27,6 +27,6 @@ def main(args: argparse.Namespace) -> int:
     stop, end, bus = Event(), time.monotonic() + args.seconds, DemoBus(args.seed)
     monitor = Monitor(bus.bus)
     with stopping_on_signals(stop.set):
-        watch(bus, monitor, None, lambda: stop.is_set() or time.monotonic() >= end, say)
+        watch(bus, monitor, None, lambda: stop.is_set() or time.monotonic() >= end)
     say(f"{monitor.view.frames} CAN frames decoded")
     return 0

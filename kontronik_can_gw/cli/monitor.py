@@ -43,8 +43,8 @@ keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it,
 A value beyond a limit is marked with ! and !!: power stage and BEC from 80 and
 100 degC, a cell from 3.5 and 3.3 V down. The limits are the monitor's own.
 
-Where standard output is no terminal, or a dumb one, it writes a line for each
-ESC every second. --once waits until each cyclic message of the DBC has come, or
+Where standard output is no terminal, or a dumb one, it writes the table every
+second. --once waits until each cyclic message of the DBC has come, or
 for --timeout, and prints one line of JSON; of a FILE the values at its end, in
 the units of "units", null where not available.
 
@@ -66,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
     with _source_of(args) as source, stopping_on_signals(stop.set):
         monitor = Monitor(source.bus)
         if not args.once:
-            watch(source, monitor, args.interval, stop.is_set, say)
+            watch(source, monitor, args.interval, stop.is_set)
             count = monitor.view.frames
             say(f"{count} frames of {monitor.file} seen on {source.name}, none sent")
             return 0

@@ -47,7 +47,11 @@ def main(args: argparse.Namespace) -> int:
     if not seen and args.json:
         print(json.dumps({"gateways": []}))
     if not seen:
-        raise NotRunning(_no_file(config))
+        which = "" if config is None else " with this configuration"
+        raise NotRunning(
+            f"no gateway{which} runs as a service. Start it: sudo systemctl start {PROGRAM}; "
+            "or name the file of another one: --file, or statistics.file in its configuration."
+        )
     if args.json:
         print(printable_json({"gateways": [each.as_json() for each in seen]}))
         return max(each.code for each in seen)
@@ -72,15 +76,3 @@ def _look(given: Path | None, config: Config | None) -> list[Seen]:
         return seen
     wanted = printable(str(Path(config.file).absolute()))
     return [each for each in seen if each.document and each.document["configuration"] == wanted]
-
-
-def _no_file(config: Config | None) -> str:
-    if config is not None:
-        return (
-            f"{config.file}: no gateway with this configuration runs as a service, and statistics.file is not set. "
-            f"Start it: sudo systemctl start {PROGRAM}, or set statistics.file."
-        )
-    return (
-        f"no gateway runs as a service: there is no {RUN_FOLDER}/{PROGRAM}/status.json. "
-        f"Start it: sudo systemctl start {PROGRAM}; or name the file of another one: --file, or -c and its configuration."
-    )

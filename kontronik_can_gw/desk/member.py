@@ -65,6 +65,11 @@ class Member:
             for group in Group
         }
         """Those of each group."""
+        self._bits = {
+            word: {bit: self.columns.get(bit.text) for bit in self.protocol.errors.get(word, ())}
+            for word in _WORDS
+        }
+        """The bits of each error word, and the columns of those that are signals of their own."""
         self.factors: dict[str, tuple[float, float]] = {}
         """Factor and offset of the values whose signal has another unit than their source."""
         for name, at in self.columns.items():
@@ -152,16 +157,15 @@ class Member:
 
         Flags have no code for "not available": they count while another value of their group is known.
         """
-        group, bits = _WORDS[word], self.protocol.errors.get(word, ())
-        columns = {bit: self.columns.get(bit.text) for bit in bits}
-        values = {bit: None if at is None else self.view.values[at] for bit, at in columns.items()}
+        group, bits, values = _WORDS[word], self._bits[word], self.view.values
         has_others, whole = bool(self.of_group[group]), self.number(word)
-        if (has_others and not self.is_known(group)) or {whole, *values.values()} == {None}:
+        is_set = {bit: values[at] for bit, at in bits.items() if at is not None}
+        if (has_others and not self.is_known(group)) or {whole, *is_set.values()} == {None}:
             return None
         number = int(whole or 0)
-        found = [flag_of(bit) for bit in bits if number >> bit & 1 or values[bit] == 1]
-        for bit in range(32):
-            if number >> bit & 1 and bit not in columns:
+        found = [flag_of(bit) for bit in bits if number >> bit & 1 or is_set.get(bit) == 1]
+        for bit in range(32) if number else ():
+            if number >> bit & 1 and bit not in bits:
                 meaning = f"bit {bit} of {word}, which has no name"
                 found.append(Flag(f"bit{bit}", Severity.WARNING, meaning))
         return found if has_others else found or None

@@ -106,9 +106,7 @@ class Recording(Source):
 
     def __init__(self, opened: Input, speed: float, at_once: bool = False) -> None:
         super().__init__(Path(opened.name).name, opened.bus)
-        self._input = opened
-        self._speed = speed
-        self._at_once = at_once
+        self._input, self._speed, self._at_once = opened, speed, at_once
         self._frames = opened.frames()
         self._next = next(self._frames, None)
         self._clock = self._first_ns = 0 if self._next is None else self._next.time_ns
@@ -118,30 +116,24 @@ class Recording(Source):
     def pump(self, take: Take, until_s: float) -> None:
         begin = time.monotonic()
         # a delay is not made up for: a slow reader plays slower than asked for
-        passed = min(begin - self._last_pump, _MAX_LAG_S)
-        self._last_pump = begin
+        passed, self._last_pump = min(begin - self._last_pump, _MAX_LAG_S), begin
+        pause = _LONGEST_SLEEP_S
         if not self.paused and not self.ended:
-            self._clock += round(passed * self._speed * SECOND)
-            self._pass_on(take, until_s)
-        pause = until_s - time.monotonic()
-        if self._next is not None and not self.paused:
-            pause = min(pause, (self._next.time_ns - self._clock) / SECOND / self._speed)
+            clock = self._clock + round(passed * self._speed * SECOND)
+            while self._next is not None and (self._at_once or self._next.time_ns <= clock):
+                self._clock = self._next.time_ns
+                take(self._next.frame, self._clock)
+                self._next = next(self._frames, None)
+                if time.monotonic() >= until_s:
+                    break
+            else:
+                if self._next is not None:  # at the end the clock stays
+                    self._clock = clock
+                    pause = min(pause, (self._next.time_ns - clock) / SECOND / self._speed)
+            self.ended = self._next is None
+        pause = min(pause, until_s - time.monotonic())
         if pause > 0 and not self._at_once:
-            time.sleep(min(pause, _LONGEST_SLEEP_S))
-
-    def _pass_on(self, take: Take, until_s: float) -> None:
-        """Pass on what is due, at most until this time."""
-        last = self._clock
-        while self._next is not None and (self._at_once or self._next.time_ns <= self._clock):
-            last = self._next.time_ns
-            take(self._next.frame, last)
-            self._next = next(self._frames, None)
-            if time.monotonic() >= until_s:
-                self._clock = last
-                break
-        if self._next is None:
-            self.ended = True
-            self._clock = last
+            time.sleep(pause)
 
     def now(self) -> int:
         return self._clock

@@ -1,7 +1,6 @@
 """The connection alone: TLS, take-over, old brokers, brokers that speak rubbish, what waits and what is lasting."""
 
 import contextlib
-import logging
 import random
 import socket
 import subprocess
@@ -65,12 +64,6 @@ def turning(condition: Callable[[], object], *clients: MqttClient) -> None:
     wait_for(holds, lambda: [client.problem for client in clients])
 
 
-@pytest.fixture
-def said(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
-    with caplog.at_level(logging.INFO, "kontronik_can_gw"):
-        yield caplog
-
-
 # --- what waits, what is lasting
 
 
@@ -122,18 +115,6 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(own: Mosquitto) -> No
             offer()
         client.stop(0.3)  # it returns though nothing is taken
         own.freeze(False)
-
-
-def test_a_broker_that_stands_still_for_long_is_lost_and_found_again(
-    own: Mosquitto, monkeypatch: pytest.MonkeyPatch, said: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(mqtt_client, "KEEPALIVE_S", 1)
-    with connecting(to(own.port)) as client:
-        turning(lambda: client.problem == "", client)
-        own.freeze(True)
-        turning(lambda: "the connection was lost" in said.text, client)
-        own.freeze(False)
-        turning(lambda: "connected, after" in said.text, client)
 
 
 # --- brokers that end connections

@@ -305,19 +305,6 @@ def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_
             assert "options" not in component
 
 
-def test_names_are_written_as_people_write_them(of_two: Published) -> None:
-    shown = {
-        "bec_voltage": "BEC voltage",
-        "pwm_input": "PWM input",
-        "crc_errors": "CRC errors",
-        "min_bec_temperature": "Min BEC temperature",
-        "battery_voltage": "Battery voltage",
-    }
-    found = discovered(of_two)[TOPICS.discovery("homeassistant", "left")]["components"]
-    assert {source: found[source]["name"] for source in shown} == shown
-    assert found["battery_voltage"]["suggested_display_precision"] == 2
-
-
 def discoveries(published: Iterable[tuple[int, Message]]) -> list[tuple[int, dict[str, Any]]]:
     topic = TOPICS.discovery("ha", "esc1")
     return [(now, json.loads(m.payload)) for now, m in published if m.topic == topic]

@@ -98,8 +98,10 @@ class Esc(Member):
     def device_text(self) -> str:
         """Device, variant and firmware; empty where not available."""
         variant = self.number("variant")
-        text = (self.device or "") if variant is None else f"{self.device} {variant:.0f}"
-        return f"{text}, firmware {self.firmware}" if self.device and self.firmware else text
+        text = self.device or ""
+        if text and variant is not None:
+            text += f" {variant:.0f}"
+        return f"{text}, firmware {self.firmware}" if text and self.firmware else text
 
     @property
     def active(self) -> list[Flag]:

@@ -161,11 +161,10 @@ def sparkline(esc: Esc, quantity: Quantity, width: int) -> Text:
 def _trouble(esc: Esc) -> Flag | None:
     """What is wrong with the link of an ESC, with the remedy."""
     link, age = normalize(esc.link or ""), esc.number("data_age")
-    if link == "degraded":
-        remedy = "Look at cable and ground."
-        return Flag("link", Severity.WARNING, "frames are damaged", remedy)
     if esc.is_known(Group.LIVE) or link in ("", "ok"):
-        return None
+        remedy = "Look at cable and ground."
+        damaged = Flag("link", Severity.WARNING, "frames are damaged", remedy)
+        return damaged if link == "degraded" else None
     since = "" if age is None or link == "neverseen" else f" for {duration(round(age * MS))}"
     text = _TROUBLES.get(link, _NO_TELEMETRY)
     text = text.format(protocol=esc.protocol.name.upper(), since=since)

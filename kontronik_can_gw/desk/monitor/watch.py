@@ -1,7 +1,6 @@
 """Watching a source: a live screen with keys, lines without a terminal, or one document."""
 
 import contextlib
-import io
 import os
 import select
 import sys
@@ -15,6 +14,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from kontronik_can_gw.desk.monitor.lines import wrapped
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import alarms, notices, screen, table_of
 from kontronik_can_gw.desk.sources import Source
@@ -25,19 +25,16 @@ REFRESH_S = 0.15
 _QUIT = ("q", "\x03", "\x04")
 
 Stopped = Callable[[], bool]
-Say = Callable[[str], None]
 
 
-def watch(
-    source: Source, monitor: Monitor, interval: float | None, stopped: Stopped, say: Say
-) -> None:
-    """Show the source until a key, ``stopped``, or without a terminal the end of a file. ``say`` takes notices."""
+def watch(source: Source, monitor: Monitor, interval: float | None, stopped: Stopped) -> None:
+    """Show the source until a key, ``stopped``, or without a terminal the end of a file."""
     console = Console(highlight=False)
     monitor.advance(source.now())
     if console.is_terminal and not console.is_dumb_terminal:
         _live(console, source, monitor, interval or REFRESH_S, stopped)
     else:
-        _lines(source, monitor, interval or 1.0, stopped, say)
+        _lines(source, monitor, interval or 1.0, stopped)
 
 
 def _live(
@@ -55,7 +52,9 @@ def _live(
             source.pump(monitor.take, min(due, now + 0.1))
             monitor.advance(source.now())
             if fd is not None and select.select([fd], [], [], 0)[0]:
-                typed = os.read(fd, 64)
+                typed = b""
+                with contextlib.suppress(OSError):
+                    typed = os.read(fd, 64)
                 key = typed.decode("ascii", "ignore").lower()
                 if not typed or key in _QUIT:  # nothing: the terminal is closed
                     return
@@ -70,6 +69,8 @@ def obey(key: str, source: Source, monitor: Monitor, page: int) -> int:
             monitor.reset()
         case "n" | "p":
             return (page + (1 if key == "n" else -1)) % (count + 1)
+        case "a" | "\x1b":
+            return 0
         case " " if source.is_file:
             source.paused = not source.paused
         case digit if digit.isdecimal() and int(digit) <= count:
@@ -82,13 +83,13 @@ def _keys() -> Iterator[int | None]:
     """Have single keys read without echo; Ctrl-C and Ctrl-Z are keys too. None where standard input is no terminal of ours."""
     try:
         fd = sys.stdin.fileno()
-        before = termios.tcgetattr(fd)
-        works = os.tcgetpgrp(fd) == os.getpgrp()
-    except (OSError, ValueError, AttributeError, io.UnsupportedOperation, termios.error):
-        works = False
-    if not works:
+        is_ours = os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
+    except OSError:
+        is_ours = False
+    if not is_ours:
         yield None
         return
+    before = termios.tcgetattr(fd)
     single = before[3] & ~(termios.ECHO | termios.ICANON | termios.ISIG)
     termios.tcsetattr(fd, termios.TCSADRAIN, [*before[:3], single, *before[4:]])
     try:
@@ -98,22 +99,15 @@ def _keys() -> Iterator[int | None]:
             termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
-def _lines(source: Source, monitor: Monitor, interval: float, stopped: Stopped, say: Say) -> None:
-    """Print the table again and again, without terminal control."""
-    before: list[str] = []
+def _lines(source: Source, monitor: Monitor, interval: float, stopped: Stopped) -> None:
+    """Print notices and the table again and again, without terminal control."""
     while not stopped() and not source.ended:
         due = time.monotonic() + interval
         while time.monotonic() < due and not source.ended and not stopped():
             source.pump(monitor.take, due)
         monitor.advance(source.now())
-        news = [text for text, _ in notices(monitor, source)]
-        for text in news:
-            if text not in before:
-                say(text)
-        if before and not news:
-            say(f"{source.name}: frames come")
-        before = news
-        for line in (*table_of(monitor.escs, 80), *alarms(monitor.escs, 80)):
+        said = [line for text, _ in notices(monitor, source) for line in wrapped(text, "", 80)]
+        for line in (*said, *table_of(monitor.escs, 80), *alarms(monitor.escs, 80)):
             print(line.plain.rstrip(), flush=True)
 
 
