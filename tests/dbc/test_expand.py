@@ -14,9 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
-from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.dbc import expand, writer
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.prepare import compile_layout, prepare
@@ -93,13 +91,6 @@ def relations(text: str) -> list[str]:
 
 def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
     assert writer.dbc_text(parse_database(SHIPPED.encode(), "x")) == SHIPPED
-
-
-def test_the_shipped_file_of_the_canopen_nodes_is_written_from_rows() -> None:
-    setup = shipped_canopen([1])
-    settings = setup.esc_settings(ONE)
-    text = writer.dbc_text(canopen_dbc.database(setup.nodes(settings), settings))
-    assert text == shipped("dbc/kontronik_canopen.dbc").read_text()
 
 
 def test_the_file_for_eight_escs_keeps_the_rules() -> None:

@@ -5,7 +5,7 @@
 #   tshark      Wireshark's decoder, from Debian       about 25 s, needs root or a sudo that asks nothing
 # They go to tests/foreign/.cache, tshark to the system. What is there already is left alone. What cannot be had is
 # named, and the others are installed all the same; the exit code then is 1.
-# VM_APT_UPDATED=1: the package lists are fresh.
+# VM_APT_UPDATED=1: the package lists are fresh. "install.sh masters": not tshark, so without apt.
 set -u
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -71,7 +71,7 @@ install_tshark() {
     quietly $apt install -y --no-install-recommends tshark || lacks "tshark: apt-get install failed"
 }
 
-install_tshark
+[ "${1:-}" = masters ] || install_tshark
 install_node_canopen
 install_zencan
 exit $missing

@@ -3,11 +3,9 @@
 import json
 import re
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-import can
 from vcan_tools import (
     LIMIT_S,
     Candump,
@@ -19,11 +17,8 @@ from vcan_tools import (
     wait_for,
 )
 
-from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime.bus_listener import BusListener
 
 Start = Callable[..., GatewayProcess]
 FAULTY = EscOptions(faults=Faults(errors=(ErrorWindow(OperatingError.BEC_OVERCURRENT, 0),)))
@@ -111,30 +106,3 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
             assert "Traceback" not in shown.log
         finally:
             shown.kill()
-
-
-def test_the_listener_takes_only_what_was_asked_for_and_sends_nothing(vcan: str) -> None:
-    listener = BusListener(CanConfig(channel=vcan), frozenset({0x123, 0x1ABCDE | 0x80000000}))
-    assert sent_on(vcan) == 0
-    with can.Bus(interface="socketcan", channel=vcan) as bus:
-        for number in range(50):
-            for can_id, extended in (
-                (0x123, False),
-                (0x124, False),
-                (0x123, True),
-                (0x1ABCDE, True),
-            ):
-                bus.send(can.Message(arbitration_id=can_id, data=[number], is_extended_id=extended))
-            bus.send(
-                can.Message(arbitration_id=0x123, is_remote_frame=True, dlc=1, is_extended_id=False)
-            )
-            time.sleep(0.001)
-        frames: list[CanFrame] = []
-        while len(frames) < 100 and (more := listener.receive(LIMIT_S)):
-            frames += more
-    expected = [
-        CanFrame(each, bytes([n]), each != 0x123) for n in range(50) for each in (0x123, 0x1ABCDE)
-    ]
-    assert frames == expected
-    assert sent_on(vcan) == 250
-    listener.close()
