@@ -306,6 +306,22 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
 
 static const char hex[] = "0123456789ABCDEF";
 
+/* Four bytes at once, each nibble in a byte of its own; up to six characters more are written. */
+static char *hex_text(char *p, const uint8_t *data, int count)
+{
+    for (int at = 0; at < count; at += 4) {
+        uint64_t x = u32(data + at);
+        x = (x | x << 16) & UINT64_C(0x0000FFFF0000FFFF);
+        x = (x | x << 8) & UINT64_C(0x00FF00FF00FF00FF);
+        x = (x >> 4 & UINT64_C(0x000F000F000F000F)) | (x & UINT64_C(0x000F000F000F000F)) << 8;
+        x += UINT64_C(0x3030303030303030) + ((x + UINT64_C(0x0606060606060606)) >> 4 & UINT64_C(0x0101010101010101)) * 7;
+        char *q = p + 2 * at;
+        q[0] = (char)x, q[1] = (char)(x >> 8), q[2] = (char)(x >> 16), q[3] = (char)(x >> 24);
+        q[4] = (char)(x >> 32), q[5] = (char)(x >> 40), q[6] = (char)(x >> 48), q[7] = (char)(x >> 56);
+    }
+    return p + 2 * count;
+}
+
 static char *digits(char *p, uint64_t n, int count)
 {
     for (int k = count; k--; n /= 10)
@@ -331,15 +347,23 @@ static char *put(char *p, const char *text)
 size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int64_t shift, const char *channel, char *out)
 {
     char *p = out, *head = out;
-    size_t head_size = 0;
+    size_t head_size = 0, second_size = 0;
+    uint64_t second = 0;
     for (uint32_t k = 0; k < count; k++, f++) {
         if (k && time[k] == time[k - 1]) {
-            memcpy(p, head, head_size);
+            for (size_t at = 0; at < head_size; at += 16) /* in pieces of which the compiler knows the size; a line is longer */
+                memcpy(p + at, head + at, 16);
             p += head_size;
         } else {
             uint64_t us = (uint64_t)(time[k] + shift) / 1000;
+            const char *before = head + 1;
             head = p;
-            *p++ = '(', p = decimal(p, us / 1000000);
+            *p++ = '(';
+            if (second_size && us / 1000000 == second)
+                memcpy(p, before, 16);
+            else
+                second = us / 1000000, second_size = (size_t)(decimal(p, second) - p);
+            p += second_size;
             *p++ = '.', p = digits(p, us % 1000000, 6);
             *p++ = ')', *p++ = ' ';
             p = put(p, channel);
@@ -351,8 +375,7 @@ size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int6
         *p++ = '#';
         if (f->flags)
             *p++ = '#', *p++ = '1'; /* CAN FD with a switched bit rate */
-        for (int i = 0; i < f->length; i++)
-            *p++ = hex[f->data[i] >> 4], *p++ = hex[f->data[i] & 15];
+        p = hex_text(p, f->data, f->length);
         *p++ = ' ', *p++ = 'T', *p++ = '\n';
     }
     return (size_t)(p - out);
