@@ -8,7 +8,7 @@
 #define SAME_ROW (5 * MS)
 #define GATEWAY_EACH (100 * MS)
 enum { BYTES = 1, FRAME = 2, ADVANCE = 3, COUNTERS = 14, NOT_SENT = 18 }; /* capture/format.py, Kind */
-enum { COUNT = 4, ENTRY = 16, TIME = 8, SENT_FRAMES = 4, COUNTERS_COUNT = 8, MAGIC = 3, LONGEST_FRAME = 64 };
+enum { COUNT = 4, ENTRY = 16, TIME = 8, SENT_FRAMES = 4, COUNTERS_COUNT = 8, MAGIC = 3 };
 
 static uint32_t u32(const uint8_t *p)
 {
@@ -206,21 +206,8 @@ static int catch_up(kcg_offline *o, int64_t now)
     }
 }
 
-/* The bytes up to a position, at a time: to the core. */
-static int give(kcg_offline *o, const uint8_t *data, uint64_t end, int64_t now)
-{
-    if (!o->column && end > o->at) {
-        if (!catch_up(o, now))
-            return 0;
-        receive(o, 0, data + (o->at - o->base), (size_t)(end - o->at), now, now);
-        advance(o, now);
-    }
-    o->at = end;
-    return 1;
-}
-
-/* The next frame that was found, at its time: to the core as bytes, or as it is where rows are wanted. */
-static int give_frame(kcg_offline *o, const uint8_t *data)
+/* The next frame that was found, at its time: to the core as it is, with the counters of what found it. */
+static int give_frame(kcg_offline *o)
 {
     static const uint8_t first_after = KCG_N_LONG_RUN + 1;
     const kcg_found *f = &o->found[o->found_at];
@@ -230,19 +217,15 @@ static int give_frame(kcg_offline *o, const uint8_t *data)
         o->now = !f->is_info ? o->lives++ * o->period : half > o->now ? half : o->now;
         o->is_timed = 1;
     }
-    if (o->column) {
-        memcpy(g->esc[0].count, o->finder->esc[0].count, first_after * sizeof *g->esc[0].count);
-        if (!catch_up(o, o->now))
-            return 0;
-        g->found[0] = *f;
-        g->found_at = 0, g->found_count = 1;
-        g->read_esc = 0, g->read_end = f->end;
-        g->read_now = g->read_shown = g->read_bound = o->now;
-        follow(o, kcg_next_event(g), o->now);
-    }
-    uint64_t end = o->fed - (uint32_t)((uint32_t)o->fed - f->end); /* the core counts in 32 bits */
-    if (!give(o, data, end, o->now))
+    memcpy(g->esc[0].count, o->finder->esc[0].count, first_after * sizeof *g->esc[0].count);
+    if (!catch_up(o, o->now))
         return 0;
+    g->found[0] = *f;
+    g->found_at = 0, g->found_count = 1;
+    g->read_esc = 0, g->read_end = f->end;
+    g->read_now = g->read_shown = g->read_bound = o->now;
+    follow(o, kcg_next_event(g), o->now);
+    advance(o, o->now);
     o->is_timed = 0;
     o->found_at++;
     return 1;
@@ -282,11 +265,9 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
 {
     for (;;) {
         while (o->found_at < o->found_count)
-            if (!give_frame(o, data))
+            if (!give_frame(o))
                 return KCG_IS_FULL;
         o->found_at = o->found_count = 0;
-        if (o->fed - o->at > o->max_waiting && !give(o, data, o->fed - LONGEST_FRAME, o->now))
-            return KCG_IS_FULL;
         size_t from = (size_t)(o->fed - o->base), to = piece_end(data, from, size, ended);
         if (to > from) {
             find(o, data + from, to - from);
@@ -297,7 +278,10 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
             kcg_end(o->finder, 0);
             collect(o);
         } else {
-            return give(o, data, o->fed, o->now) ? KCG_ALL_DONE : KCG_IS_FULL;
+            if (!catch_up(o, o->now))
+                return KCG_IS_FULL;
+            advance(o, o->now);
+            return KCG_ALL_DONE;
         }
     }
 }

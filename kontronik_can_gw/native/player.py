@@ -45,7 +45,7 @@ class _Offline(c.Structure):
         ("reserved", _u8 * 3),
         *((name, _i64) for name in ("last", "row_ns", "last_row_ns", "gateway_ns", "now")),
         *((name, _i64) for name in ("lives", "period")),
-        *((name, _u64) for name in ("at", "base", "fed", "max_waiting", "data_at")),
+        *((name, _u64) for name in ("base", "fed", "data_at")),
         ("in_row", _u8 * 256),
         ("found", _Found * 16),
     )
@@ -154,18 +154,18 @@ class Player(Output):
 
     # --- plain bytes of one ESC
 
-    def set_bytes(self, period_ns: int, max_waiting: int) -> None:
-        """Times: a live frame each ``period_ns``. ``max_waiting``: bytes without a frame that are held."""
+    def set_bytes(self, period_ns: int) -> None:
+        """Times: a live frame each ``period_ns``."""
         tables = Tables(Layout("", "", ()), [self._settings])
         self._finder = Handle(self._library, tables, 0, lambda *_: None)
         self._finder.report_only(0)
         self._state.finder = self._finder.core
-        self._state.period, self._state.max_waiting = period_ns, max_waiting
+        self._state.period = period_ns
 
     def play_bytes(self, data: bytes, ended: bool) -> bool:
         """The stream from ``position`` on; what is left of it is to be given again. True where there was no room for all of it."""
         state = self._state
-        state.base = state.at
+        state.base = state.fed
         why = self._library.kcg_play_bytes(c.byref(state), data, len(data), ended)
         state.sure = state.count
         return bool(why == _FULL)
@@ -173,7 +173,7 @@ class Player(Output):
     @property
     def position(self) -> int:
         """Bytes that were played."""
-        return int(self._state.at)
+        return int(self._state.fed)
 
     @property
     def counters(self) -> Counters:
