@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from kontronik_can_gw.dbc.messages import Messages, own_ids
+from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
@@ -129,13 +130,22 @@ class PythonCore:
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
-        state = self.escs[esc]
+        self._expire_before(esc, now)
+        for events in self.escs[esc].receive_each(data, now, since):
+            self._report(esc, events, now)
+
+    def accept(self, esc: int, reading: Reading, now: int) -> None:
+        """A reading that came at ``now``; its ESC's decoder has counted it."""
+        self._expire_before(esc, now)
+        if events := self.escs[esc].accept(reading, now, now):
+            self._report(esc, events, now)
+
+    def _expire_before(self, esc: int, now: int) -> None:
+        """What is too old by now goes, before an ESC brings something."""
         if now >= self._next_expiry:
             self.expire(now, but=esc)  # a message may hold values of several ESCs
-            if events := state.expire(now):
+            if events := self.escs[esc].expire(now):
                 self._report(esc, events, now)
-        for events in state.receive_each(data, now, since):
-            self._report(esc, events, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         state = self.escs[esc]

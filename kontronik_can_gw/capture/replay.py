@@ -174,23 +174,3 @@ def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
     """The frames of one turn in the order in which the interface gets them. ``waiting``: the queue, the same for each turn."""
     waiting.put_all(frames)
     return waiting.take_all()
-
-
-def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Iterator[TimedFrame]:
-    """The frames of a gateway that starts with the first of these (time, bytes) of its first ESC and is never late."""
-    waiting = TransmitQueue()
-    started = False
-    for now, data in chunks:
-        if not started:
-            started = True
-            gateway.port(0, True, now)
-            gateway.start(now)
-        while (due := gateway.next_deadline()) < now:
-            gateway.advance(due)
-            for frame in in_order(gateway.take_frames(due), waiting):
-                yield TimedFrame(due, frame)
-        gateway.receive_bytes(0, data, now, now)
-        gateway.advance(now)
-        for frame in in_order(gateway.take_frames(now), waiting):
-            yield TimedFrame(now, frame)
-        gateway.take_link_changes()

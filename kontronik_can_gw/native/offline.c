@@ -8,7 +8,7 @@
 #define SAME_ROW (5 * MS)
 #define GATEWAY_EACH (100 * MS)
 enum { BYTES = 1, FRAME = 2, ADVANCE = 3, COUNTERS = 14, NOT_SENT = 18 }; /* capture/format.py, Kind */
-enum { COUNT = 4, ENTRY = 16, TIME = 8, SENT_FRAMES = 4, COUNTERS_COUNT = 8, MAGIC = 3, LONGEST_FRAME = 64 };
+enum { COUNT = 4, ENTRY = 16, TIME = 8, SENT_FRAMES = 4, COUNTERS_COUNT = 8, MAGIC = 3 };
 
 static uint32_t u32(const uint8_t *p)
 {
@@ -206,21 +206,8 @@ static int catch_up(kcg_offline *o, int64_t now)
     }
 }
 
-/* The bytes up to a position, at a time: to the core. */
-static int give(kcg_offline *o, const uint8_t *data, uint64_t end, int64_t now)
-{
-    if (!o->column && end > o->at) {
-        if (!catch_up(o, now))
-            return 0;
-        receive(o, 0, data + (o->at - o->base), (size_t)(end - o->at), now, now);
-        advance(o, now);
-    }
-    o->at = end;
-    return 1;
-}
-
-/* The next frame that was found, at its time: to the core as bytes, or as it is where rows are wanted. */
-static int give_frame(kcg_offline *o, const uint8_t *data)
+/* The next frame that was found, at its time: to the core as it is, with the counters of what found it. */
+static int give_frame(kcg_offline *o)
 {
     static const uint8_t first_after = KCG_N_LONG_RUN + 1;
     const kcg_found *f = &o->found[o->found_at];
@@ -230,19 +217,15 @@ static int give_frame(kcg_offline *o, const uint8_t *data)
         o->now = !f->is_info ? o->lives++ * o->period : half > o->now ? half : o->now;
         o->is_timed = 1;
     }
-    if (o->column) {
-        memcpy(g->esc[0].count, o->finder->esc[0].count, first_after * sizeof *g->esc[0].count);
-        if (!catch_up(o, o->now))
-            return 0;
-        g->found[0] = *f;
-        g->found_at = 0, g->found_count = 1;
-        g->read_esc = 0, g->read_end = f->end;
-        g->read_now = g->read_shown = g->read_bound = o->now;
-        follow(o, kcg_next_event(g), o->now);
-    }
-    uint64_t end = o->fed - (uint32_t)((uint32_t)o->fed - f->end); /* the core counts in 32 bits */
-    if (!give(o, data, end, o->now))
+    memcpy(g->esc[0].count, o->finder->esc[0].count, first_after * sizeof *g->esc[0].count);
+    if (!catch_up(o, o->now))
         return 0;
+    g->found[0] = *f;
+    g->found_at = 0, g->found_count = 1;
+    g->read_esc = 0, g->read_end = f->end;
+    g->read_now = g->read_shown = g->read_bound = o->now;
+    follow(o, kcg_next_event(g), o->now);
+    advance(o, o->now);
     o->is_timed = 0;
     o->found_at++;
     return 1;
@@ -282,11 +265,9 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
 {
     for (;;) {
         while (o->found_at < o->found_count)
-            if (!give_frame(o, data))
+            if (!give_frame(o))
                 return KCG_IS_FULL;
         o->found_at = o->found_count = 0;
-        if (o->fed - o->at > o->max_waiting && !give(o, data, o->fed - LONGEST_FRAME, o->now))
-            return KCG_IS_FULL;
         size_t from = (size_t)(o->fed - o->base), to = piece_end(data, from, size, ended);
         if (to > from) {
             find(o, data + from, to - from);
@@ -297,7 +278,10 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
             kcg_end(o->finder, 0);
             collect(o);
         } else {
-            return give(o, data, o->fed, o->now) ? KCG_ALL_DONE : KCG_IS_FULL;
+            if (!catch_up(o, o->now))
+                return KCG_IS_FULL;
+            advance(o, o->now);
+            return KCG_ALL_DONE;
         }
     }
 }
@@ -305,6 +289,22 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
 /* --- text (twins: can_logs/writer.py, tables/text.py) ---------------------------------------------------------------- */
 
 static const char hex[] = "0123456789ABCDEF";
+
+/* Four bytes at once, each nibble in a byte of its own; up to six characters more are written. */
+static char *hex_text(char *p, const uint8_t *data, int count)
+{
+    for (int at = 0; at < count; at += 4) {
+        uint64_t x = u32(data + at);
+        x = (x | x << 16) & UINT64_C(0x0000FFFF0000FFFF);
+        x = (x | x << 8) & UINT64_C(0x00FF00FF00FF00FF);
+        x = (x >> 4 & UINT64_C(0x000F000F000F000F)) | (x & UINT64_C(0x000F000F000F000F)) << 8;
+        x += UINT64_C(0x3030303030303030) + ((x + UINT64_C(0x0606060606060606)) >> 4 & UINT64_C(0x0101010101010101)) * 7;
+        char *q = p + 2 * at;
+        q[0] = (char)x, q[1] = (char)(x >> 8), q[2] = (char)(x >> 16), q[3] = (char)(x >> 24);
+        q[4] = (char)(x >> 32), q[5] = (char)(x >> 40), q[6] = (char)(x >> 48), q[7] = (char)(x >> 56);
+    }
+    return p + 2 * count;
+}
 
 static char *digits(char *p, uint64_t n, int count)
 {
@@ -331,15 +331,23 @@ static char *put(char *p, const char *text)
 size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int64_t shift, const char *channel, char *out)
 {
     char *p = out, *head = out;
-    size_t head_size = 0;
+    size_t head_size = 0, second_size = 0;
+    uint64_t second = 0;
     for (uint32_t k = 0; k < count; k++, f++) {
         if (k && time[k] == time[k - 1]) {
-            memcpy(p, head, head_size);
+            for (size_t at = 0; at < head_size; at += 16) /* in pieces of which the compiler knows the size; a line is longer */
+                memcpy(p + at, head + at, 16);
             p += head_size;
         } else {
             uint64_t us = (uint64_t)(time[k] + shift) / 1000;
+            const char *before = head + 1;
             head = p;
-            *p++ = '(', p = decimal(p, us / 1000000);
+            *p++ = '(';
+            if (second_size && us / 1000000 == second)
+                memcpy(p, before, 16);
+            else
+                second = us / 1000000, second_size = (size_t)(decimal(p, second) - p);
+            p += second_size;
             *p++ = '.', p = digits(p, us % 1000000, 6);
             *p++ = ')', *p++ = ' ';
             p = put(p, channel);
@@ -351,8 +359,7 @@ size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int6
         *p++ = '#';
         if (f->flags)
             *p++ = '#', *p++ = '1'; /* CAN FD with a switched bit rate */
-        for (int i = 0; i < f->length; i++)
-            *p++ = hex[f->data[i] >> 4], *p++ = hex[f->data[i] & 15];
+        p = hex_text(p, f->data, f->length);
         *p++ = ' ', *p++ = 'T', *p++ = '\n';
     }
     return (size_t)(p - out);

@@ -32,7 +32,7 @@ typedef struct {
     uint32_t room, count, sure, ages, rows, index;
     uint8_t is_open, is_timed, has_ended, found_count, found_at, reserved[3];
     int64_t last, row_ns, last_row_ns, gateway_ns, now, lives, period;
-    uint64_t at, base, fed, max_waiting, data_at; /* positions in the stream; data_at: of the entry's data in its block */
+    uint64_t base, fed, data_at; /* positions in the stream; data_at: of the entry's data in its block */
     uint8_t in_row[256];
     kcg_found found[16];
 } kcg_offline;
@@ -41,7 +41,7 @@ typedef struct {
 int kcg_is_intact(const uint8_t *payload, size_t size);
 /* Play the entries of an intact block from o->index, o->data_at on. */
 int kcg_play(kcg_offline *o, const uint8_t *payload, size_t size);
-/* The stream's bytes from position o->base on; those up to o->at need not be given again. */
+/* The stream's bytes from position o->base on; those up to o->fed need not be given again. */
 int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended);
 /* An event of an ESC in a call that the owner made: to the rows. */
 void kcg_row_event(kcg_offline *o, int esc, int events, int64_t now);

@@ -64,39 +64,58 @@ def _address(memory: bytearray) -> int:
     return c.addressof(c.c_char.from_buffer(memory))
 
 
-class Frames:
-    """Frames that were sent: ``times`` in ns, which do not decrease."""
+class FrameRoom:
+    """Room for frames, their times and the text of both, used again and again."""
 
-    def __init__(
-        self, library: Any, memory: bytearray, times: bytearray, begin: int, end: int
-    ) -> None:
-        self._library, self._memory, self._times = library, memory, times
-        self._begin, self._end = begin, end
-        self.times = memoryview(times).cast("q")[begin:end]
+    def __init__(self, library: Any, size: int) -> None:
+        self.library, self.size = library, size
+        self.frames, self.times = (Frame * size)(), (_i64 * size)()
+        self._text: Any = None
+
+    def move_to(self, other: "FrameRoom", begin: int, count: int) -> None:
+        """Copy some to the beginning of another one."""
+        for mine, its, size in (
+            (self.frames, other.frames, c.sizeof(Frame)),
+            (self.times, other.times, 8),
+        ):
+            c.memmove(its, c.addressof(mine) + size * begin, size * count)
+
+    def candump(self, begin: int, end: int, shift_ns: int, channel: str) -> memoryview:
+        """As Frames.candump."""
+        name, count = channel.encode(), end - begin
+        room = count * (len(name) + 190)
+        if self._text is None or len(self._text) < room:
+            self._text = c.create_string_buffer(self.size * (len(name) + 190))
+        length = self.library.kcg_candump(
+            c.byref(self.frames, begin * c.sizeof(Frame)),
+            c.byref(self.times, begin * 8),
+            *(count, shift_ns, name, self._text),
+        )
+        return memoryview(self._text).cast("B")[:length]
+
+
+class Frames:
+    """Frames that were sent: ``times`` in ns, which do not decrease. They are there until the one after the next is taken."""
+
+    def __init__(self, room: FrameRoom, begin: int, end: int) -> None:
+        self._room, self._begin, self._end = room, begin, end
+        self.times = memoryview(room.times).cast("B").cast("q")[begin:end]
 
     def __len__(self) -> int:
         return self._end - self._begin
 
     def part(self, begin: int, end: int) -> "Frames":
         """Some of them."""
-        return Frames(
-            *(self._library, self._memory, self._times, self._begin + begin, self._begin + end)
-        )
+        return Frames(self._room, self._begin + begin, self._begin + end)
 
     def __iter__(self) -> Iterator[tuple[int, CanFrame]]:
-        frames = frames_in(memoryview(self._memory), self._begin * c.sizeof(Frame), len(self))
+        memory = memoryview(self._room.frames).cast("B")
+        frames = frames_in(memory, self._begin * c.sizeof(Frame), len(self))
         return zip(self.times, frames, strict=True)
 
     def candump(self, shift_ns: int, channel: str) -> memoryview:
-        """Lines of a candump log, with microseconds of the time and ``shift_ns``."""
-        if not len(self):
-            return memoryview(b"")
-        name = channel.encode()
-        out = bytearray(len(self) * (len(name) + 190))
-        frames = _address(self._memory) + self._begin * c.sizeof(Frame)
-        times = _address(self._times) + self._begin * 8
-        write = self._library.kcg_candump
-        return memoryview(out)[: write(frames, times, len(self), shift_ns, name, _address(out))]
+        """Lines of a candump log, with microseconds of the time and ``shift_ns``; to be written before others are asked for."""
+        return self._room.candump(self._begin, self._end, shift_ns, channel)
 
 
 class ColumnOf(NamedTuple):

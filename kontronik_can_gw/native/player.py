@@ -9,9 +9,9 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 from kontronik_can_gw.esc.decoder import Counters
-from kontronik_can_gw.native.binding import Frame, Handle
+from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.core import NativeCore
-from kontronik_can_gw.native.offline import ROWS, ColumnOf, Frames, Rows, declare
+from kontronik_can_gw.native.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows, declare
 from kontronik_can_gw.native.rows import Signal
 from kontronik_can_gw.native.state import NativeEsc
 from kontronik_can_gw.native.tables import OF_AGE, Tables, bind, places_of
@@ -21,7 +21,7 @@ from kontronik_can_gw.signals.plan import Layout
 _DONE, _FULL, _OTHER_ENTRY = range(3)
 _MAX_ROWS = 1024
 """That one call of the core can make."""
-_FRAMES = 1 << 13
+_FRAMES = 1 << 12
 _u8, _u32, _u64, _i64, _p = c.c_uint8, c.c_uint32, c.c_uint64, c.c_int64, c.c_void_p
 
 
@@ -45,7 +45,7 @@ class _Offline(c.Structure):
         ("reserved", _u8 * 3),
         *((name, _i64) for name in ("last", "row_ns", "last_row_ns", "gateway_ns", "now")),
         *((name, _i64) for name in ("lives", "period")),
-        *((name, _u64) for name in ("at", "base", "fed", "max_waiting", "data_at")),
+        *((name, _u64) for name in ("base", "fed", "data_at")),
         ("in_row", _u8 * 256),
         ("found", _Found * 16),
     )
@@ -69,15 +69,19 @@ class Player(Output):
         self._settings = core.escs[0].settings
         self._state.core = handle.core
         if self._columns is None:
-            self._state.room = room = max(_FRAMES, 2 * handle.pages)
-            self._frames, self._times = (Frame * room)(), (_i64 * room)()
-            self._state.frame = c.addressof(self._frames)
-            self._state.frame_time = c.addressof(self._times)
+            self._state.room = size = max(_FRAMES, 2 * handle.pages)
+            self._rooms = [FrameRoom(library, size) for _ in range(2)]
+            self._set_room()
             return
         self._state.room = ROWS
         self._state.gateway_ns = now - 100_000_000
         self._set_columns(core, self._columns)
         self._new_rows()
+
+    def _set_room(self) -> None:
+        room = self._rooms[0]
+        self._state.frame = c.addressof(room.frames)
+        self._state.frame_time = c.addressof(room.times)
 
     def _set_columns(self, core: NativeCore, columns: Sequence[ColumnOf]) -> None:
         count = len(core.escs)
@@ -150,18 +154,18 @@ class Player(Output):
 
     # --- plain bytes of one ESC
 
-    def set_bytes(self, period_ns: int, max_waiting: int) -> None:
-        """Times: a live frame each ``period_ns``. ``max_waiting``: bytes without a frame that are held."""
+    def set_bytes(self, period_ns: int) -> None:
+        """Times: a live frame each ``period_ns``."""
         tables = Tables(Layout("", "", ()), [self._settings])
         self._finder = Handle(self._library, tables, 0, lambda *_: None)
         self._finder.report_only(0)
         self._state.finder = self._finder.core
-        self._state.period, self._state.max_waiting = period_ns, max_waiting
+        self._state.period = period_ns
 
     def play_bytes(self, data: bytes, ended: bool) -> bool:
         """The stream from ``position`` on; what is left of it is to be given again. True where there was no room for all of it."""
         state = self._state
-        state.base = state.at
+        state.base = state.fed
         why = self._library.kcg_play_bytes(c.byref(state), data, len(data), ended)
         state.sure = state.count
         return bool(why == _FULL)
@@ -169,7 +173,7 @@ class Player(Output):
     @property
     def position(self) -> int:
         """Bytes that were played."""
-        return int(self._state.at)
+        return int(self._state.fed)
 
     @property
     def counters(self) -> Counters:
@@ -184,16 +188,15 @@ class Player(Output):
     def take_frames(self, final: bool = False) -> Frames:
         """The frames that are sure: those of the last turn are only by the next entry, or because there is none (``final``)."""
         state = self._state
-        if self._columns is not None:
-            return Frames(self._library, bytearray(), bytearray(), 0, 0)
         sure = state.count if final else state.sure
+        if self._columns is not None or not sure:
+            return Frames(FrameRoom(self._library, 0), 0, 0)
+        taken, other = self._rooms
+        taken.move_to(other, sure, state.count - sure)
         state.count, state.sure = state.count - sure, 0
-        taken = []
-        for held in (self._frames, self._times):
-            size, begin = c.sizeof(held) // state.room, c.addressof(held)
-            taken.append(bytearray(c.string_at(begin, size * sure)))
-            c.memmove(begin, begin + size * sure, size * state.count)
-        return Frames(self._library, taken[0], taken[1], 0, sure)
+        self._rooms.reverse()
+        self._set_room()
+        return Frames(taken, 0, sure)
 
     @property
     def has_rows(self) -> bool:

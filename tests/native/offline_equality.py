@@ -122,7 +122,6 @@ def run(library: Any, seed: int, folder: Path) -> int:
     path = write(chance, folder / f"{seed}.kcap")
     path = path if write is write_capture else path.rename(path.with_suffix(".bin"))
     setattr(dump_input, "CHUNK", chance.choice((7, 100, 5000, 1 << 18)))  # noqa: B010
-    setattr(dump_input, "MAX_WAITING", chance.choice((64, 300, 1 << 16)))  # noqa: B010
     found = []
     part = {"start_ns": chance.choice((None, SECOND)), "end_ns": chance.choice((None, 3 * SECOND))}
     fields = range(len(open_input(path).fields))

@@ -55,7 +55,6 @@ def test_rows_are_the_frames_that_brute_force_finds(
     """However the file is read: small reads put every limit of a read anywhere in a frame and in rubbish."""
     source = random.Random(f"{kind} {seed}")
     monkeypatch.setattr(dump_input, "CHUNK", source.choice([1, 7, 44, 100, 5000, 1 << 18]))
-    monkeypatch.setattr(dump_input, "MAX_WAITING", source.choice([64, 300, 1 << 16]))
     stream = STREAMS[kind](source)
     dump = recording(tmp_path, stream, live_rate=1e9 / PERIOD_NS)
     found = frames_of(stream)

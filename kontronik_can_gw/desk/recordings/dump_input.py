@@ -2,13 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
-from kontronik_can_gw.capture.replay import TimedFrame, follow_bytes
+from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core import PythonCore
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.recordings.blocks import NO_MESSAGES, RowBlock, player_of
 from kontronik_can_gw.desk.recordings.can_logs import UART_MAGIC
@@ -17,10 +19,11 @@ from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
-from kontronik_can_gw.esc.stream import EscStream
-from kontronik_can_gw.esc.telemetry import SECOND, Event
+from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway, MakeOutput
-from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
+from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.transmit_queue import TransmitQueue
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames
@@ -28,9 +31,6 @@ if TYPE_CHECKING:
 
 LIVE_RATE = 100.0
 """Live frames a second that plain bytes are taken to have come at."""
-MAX_WAITING = 1 << 16
-"""Bytes without a frame that are held."""
-_LONGEST_FRAME = 64
 _UNDECIDED = len(UART_MAGIC) - 1
 """Bytes at the end of a read that may begin a header."""
 
@@ -61,39 +61,64 @@ class DumpInput(Input):
             )
 
     def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
-        found = player_of(lambda _: self.setup.gateway(self.bus.layout, 0), None, (), 0)
-        if found is None:
-            gateway = self.setup.gateway(self.bus.layout, 0)
-            yield from ([frame] for frame in follow_bytes(gateway, self.chunks()))
+        found = player_of(self._gateway, None, (), 0)
+        if found is not None:
+            for _ in self._steps(*found):
+                yield found[0].take_frames()
             return
-        player, gateway = found
-        gateway.port(0, True, 0)
-        gateway.start(0)
-        for _ in self._steps(player):
-            yield player.take_frames()
+        gateway, waiting = self._gateway(), TransmitQueue()
+        for now in self._play(gateway):
+            yield [TimedFrame(now, one) for one in in_order(gateway.take_frames(now), waiting)]
+
+    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        fields = [self.fields[index] for index in self._chosen(chosen)]
+        makers: list[RowMaker] = []
+
+        def make(*of_gateway: Any) -> RowMaker:
+            makers.append(RowMaker(fields, *of_gateway))
+            return makers[0]
+
+        for _ in self._play(self._gateway((make,), NO_MESSAGES)):
+            yield from makers[0].take_rows()
+        yield from makers[0].finish()
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:
         fields = [self.fields[index] for index in self._chosen(chosen)]
-
-        def make(further: Sequence[MakeOutput]) -> Gateway:
-            return Gateway(self.setup.escs, NO_MESSAGES, 0, further=further)
-
+        make = partial(self._gateway, layout=NO_MESSAGES)
         found = player_of(make, fields, self.bus.escs, 0)
         return None if found is None else self._blocks_of(*found)
 
+    def _gateway(self, further: Sequence[MakeOutput] = (), layout: Layout | None = None) -> Gateway:
+        return Gateway(self.setup.escs, layout or self.bus.layout, 0, further=further)
+
+    def _play(self, gateway: Gateway) -> Iterator[int]:
+        """Give all frames to a gateway with the core in Python; the times at which it may have something to send."""
+        core, now = cast(PythonCore, gateway.core), 0
+        _start(gateway)
+        for now, reading in self._found(core.escs[0].decoder):
+            while (due := gateway.next_deadline()) < now:
+                gateway.advance(due)
+                yield due
+            core.accept(0, reading, now)
+            gateway.advance(now)
+            gateway.take_link_changes()
+            yield now
+        gateway.advance(now)
+        yield now
+
     def _blocks_of(self, player: "Player", gateway: Gateway) -> Iterator[RowBlock]:
-        gateway.status.state = GatewayState.RUNNING
-        for _ in self._steps(player):
+        for _ in self._steps(player, gateway):
             if player.is_full:
                 rows = player.take_rows()
                 yield RowBlock(rows, 0, rows.count)
         rows = player.take_rows(final=True)
         yield RowBlock(rows, 0, rows.count)
 
-    def _steps(self, player: "Player") -> Iterator[None]:
-        """Give all bytes to the player, which finds the frames and their times as ``_found`` does."""
+    def _steps(self, player: "Player", gateway: Gateway) -> Iterator[None]:
+        """Give all bytes to the player, which does what ``_play`` and ``_found`` do."""
         self.damage = []
-        player.set_bytes(self._period_ns, MAX_WAITING)
+        _start(gateway)
+        player.set_bytes(self._period_ns)
         rest = b""
         for data in chain(self.esc_bytes(0), (None,)):
             rest += data or b""
@@ -105,31 +130,16 @@ class DumpInput(Input):
                 yield
         self._describe_damage(player.counters)
 
-    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        """A gateway runs from the first frame on; it knows no more than the telemetry."""
-        esc = EscStream(self.setup.escs[0], 0)
-        status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
-        fields = [self.fields[index] for index in self._chosen(chosen)]
-        maker = RowMaker(fields, [esc], status, 0)
-        due = 0
-        for now, _, reading in self._found(esc):
-            if reading is None:
-                continue
-            while due < now and (due := esc.next_deadline()) < now:
-                maker.on_event(0, esc.advance(due), due)
-            events = esc.accept(reading, now, now)
-            if events & Event.LINK:
-                status.escs_ok = int(esc.up)
-                due = 0
-            maker.on_event(0, events, now)
-            yield from maker.take_rows()
-        yield from maker.finish()
-
     def chunks(self) -> Iterator[tuple[int, bytes]]:
         """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period after it."""
-        for time_ns, data, _ in self._found(EscStream(self.setup.escs[0], 0)):
-            if data:
-                yield time_ns, data
+        now = 0
+        with self._path.open("rb") as file:
+            for now, reading in self._found(PROTOCOLS[0].make()):
+                end = reading.offset + reading.form.length
+                while data := file.read(min(CHUNK, end - file.tell())):
+                    yield now, data
+            while data := file.read(CHUNK):
+                yield now, data
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         if esc:
@@ -146,33 +156,18 @@ class DumpInput(Input):
     def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
         return None
 
-    def _found(self, esc: EscStream) -> Iterator[tuple[int, bytes, Reading | None]]:
-        """Bytes up to the end of a frame, its time, and the frame; without a frame at the time of the one before.
-
-        The decoder of ``esc`` finds them. It is given the bytes up to the next header with each, so that its counters are of that time.
-        """
+    def _found(self, decoder: Any) -> Iterator[tuple[int, Reading]]:
+        """Each frame at its time. The decoder is given the bytes up to the next header with it: its counters are of that time."""
         self.damage = []
-        decoder = esc.decoder
-        waiting, at, now, lives = bytearray(), 0, 0, 0
+        now = lives = 0
         for piece in chain(self._pieces(), (b"",)):
-            waiting += piece
             for frame in decoder.feed(piece) if piece else decoder.flush():
                 if not frame.form.is_info:
                     now = lives * self._period_ns
                     lives += 1
                 else:
                     now = max(now, lives * self._period_ns - self._period_ns // 2)
-                end = frame.offset + frame.form.length - at
-                yield now, bytes(waiting[:end]), frame
-                del waiting[:end]
-                at += end
-            if len(waiting) > MAX_WAITING:
-                # no frame for long: what can belong to none any more goes
-                gone = len(waiting) - _LONGEST_FRAME
-                yield now, bytes(waiting[:gone]), None
-                del waiting[:gone]
-                at += gone
-        yield now, bytes(waiting), None
+                yield now, frame
         self._describe_damage(decoder.counters)
 
     def _describe_damage(self, counters: Counters) -> None:
@@ -194,3 +189,9 @@ class DumpInput(Input):
             yield from filter(None, pieces)
         if rest:
             yield rest
+
+
+def _start(gateway: Gateway) -> None:
+    """It runs before the first byte."""
+    gateway.port(0, True, 0)
+    gateway.start(0)
