@@ -64,5 +64,5 @@ lint:
 	@.venv/bin/python tests/run.py test --only lint --only types
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis tests/vm/.cache tests/foreign/.cache build dist
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis tests/vm/.cache tests/foreign/.cache tests/deb/.cache build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
