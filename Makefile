@@ -1,7 +1,7 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-all release soak hour bench golden docs wheels lint clean
+.PHONY: help demo test test-all release soak hour bench golden docs wheels deb lint clean
 
 help:
 	@echo 'make demo      show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
@@ -9,13 +9,14 @@ help:
 	@echo 'make test-all  what make test leaves out: faults, systemd, browser, broker, CANopen masters of others'
 	@echo '                                        (ARGS="--only faults|tools|masters --keep FOLDER")'
 	@echo 'make release   by hand, on a quiet machine, for hours: faults on emulated hardware, random faults, a recorded hour'
-	@echo '                                        (ARGS="--only qemu|soak|hour|mutants|put-in|machines|fuzz|wheels --keep FOLDER")'
+	@echo '                                        (ARGS="--only qemu|soak|hour|mutants|put-in|machines|fuzz|wheels|deb --keep FOLDER")'
 	@echo 'make soak      random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
 	@echo 'make hour      a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
 	@echo 'make bench     speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
 	@echo 'make golden    record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
 	@echo 'make docs      write docs/reference from the sources'
 	@echo 'make wheels    one wheel with the core in C for x86-64, arm64 and armv7, each tried under qemu-user   (ARGS=FOLDER)'
+	@echo 'make deb       Debian packages for amd64, arm64 and armhf, with all libraries   (ARGS=FOLDER)'
 	@echo 'make lint      ruff and mypy only'
 	@echo 'make clean     remove .venv and all caches'
 
@@ -59,10 +60,14 @@ wheels:
 	@tests/bootstrap.sh wheels
 	@.venv/bin/python tests/native/wheels.py $(ARGS)
 
+deb:
+	@tests/bootstrap.sh wheels
+	@.venv/bin/python deb/make_deb.py $(ARGS)
+
 lint:
 	@tests/bootstrap.sh lint
 	@.venv/bin/python tests/run.py test --only lint --only types
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis tests/vm/.cache tests/foreign/.cache build dist
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis tests/vm/.cache tests/foreign/.cache tests/deb/.cache build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -7,7 +7,7 @@
 #   test-all  and User Mode Linux in any case, systemd, a browser, an MQTT broker, the CANopen masters of others (tests/foreign)
 #   wheels    as `lint`, and cross compilers and qemu-user
 #   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB; clang, cross
-#             compilers and their QEMU
+#             compilers and their QEMU; debootstrap and lintian
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
@@ -199,6 +199,7 @@ case $what in
         install_clang
         install_cross_compilers
         install_other_machines
+        install_programs "Debian packages in fresh roots" debootstrap lintian
         ;;
     wheels) install_project test '.[test]'; install_cross_compilers ;;
     *) die "$what: demo, lint, test, test-all, wheels or release" ;;

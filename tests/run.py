@@ -7,7 +7,8 @@ test-all  what `test` leaves out: faults (the fault programme in User Mode Linux
           under a real systemd, a browser, a broker ...) and masters (CANopen masters of others, and more, on a vcan)
 release   by hand, on a quiet machine: qemu (the fault programme on emulated hardware), soak (random faults), hour (recorded),
           mutants (share of a sample that the tests kill, not below that of 0.5.0), put-in (a list of faults that they must see),
-          machines (the exported core on other machines), fuzz (the core in C under fuzzers, ten minutes each)
+          machines (the exported core on other machines), fuzz (the core in C under fuzzers, ten minutes each),
+          deb (the Debian packages in fresh roots of both releases)
 
 The lanes of a tier run side by side. A step runs once, and what it prints appears when it ends. Exit code 0: all that ran has
 passed. What could not be run is listed with the line that enables it; with CI=true that and each skipped test is a failure. The
@@ -59,11 +60,14 @@ STEPS = {
     "wheels": "python tests/native/wheels.py {scratch}",
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
     "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} -s -o faulthandler_timeout=900 tests/native/test_fuzz.py",
+    "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
     "test-all": (("faults", "masters"), ("tools",)),
-    "release": (("qemu", "soak", "hour", "mutants", "put-in", "machines", "fuzz", "wheels"),),
+    "release": (
+        ("qemu", "soak", "hour", "mutants", "put-in", "machines", "fuzz", "wheels", "deb"),
+    ),
 }
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
 """Of one step: the two that CI runs end within its 90 minutes whatever happens."""
@@ -94,6 +98,17 @@ NEEDS = {
     ),
     "machines": (CROSS, ENABLE_CROSS),
     "fuzz": (("clang",), "sudo apt-get install clang"),
+    "deb": (
+        (
+            "debootstrap",
+            "lintian",
+            "linux.uml",
+            "aarch64-linux-gnu-gcc",
+            "arm-linux-gnueabihf-gcc",
+            "qemu-arm",
+        ),
+        f"{ENABLE_UML} debootstrap lintian gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user",
+    ),
 }
 """What a step needs besides Python, "vcan" being a kernel with one, and the line that enables it."""
 

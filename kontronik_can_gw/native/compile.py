@@ -20,6 +20,7 @@ CROSS_COMPILERS = {
 """By machine; Debian's gcc, gcc-aarch64-linux-gnu and gcc-arm-linux-gnueabihf."""
 OF_NO_LIBRARY = (
     *_OPTIMISED,
+    "-s",
     "-nostdlib",
     "-U_FORTIFY_SOURCE",
     "-U_TIME_BITS",

@@ -1,0 +1,191 @@
+"""What is in the Debian packages, made here without a network: from these sources, with stand-ins for the libraries and the core's objects.
+
+That they can be installed, upgraded and removed, and that the gateway runs from them, is tried in fresh Debian roots by `make release`
+(in_fresh_roots.py).
+"""
+
+import gzip
+import importlib.metadata
+import io
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import make_deb
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+PROJECT = make_deb.PROJECT
+LEFT_OUT = {"wrapt", "markdown-it-py", "pygments", "argparse-addons", "crccheck"}
+"""What a library names and no command of ours imports."""
+VENDORED = {
+    canonicalize_name(pin.name): pin
+    for line in (make_deb.HERE / "vendored.txt").read_text().splitlines()
+    if not line.startswith("#")
+    for pin in [Requirement(line.split(" --hash")[0])]
+}
+OWN = f"./usr/lib/{make_deb.NAME}/kontronik_can_gw/"
+
+if shutil.which("dpkg-deb") is None:
+    pytest.skip("no dpkg-deb: it is Debian's and Ubuntu's", allow_module_level=True)
+
+
+def zipped(path: Path, files: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(path, "w") as file:
+        for name, content in files.items():
+            file.writestr(name, content)
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The packages by architecture."""
+    folder = tmp_path_factory.mktemp("deb")
+    sources = [path for path in (PROJECT / "kontronik_can_gw").rglob("*") if path.is_file()]
+    files = {
+        str(path.relative_to(PROJECT)): path.read_bytes()
+        for path in sources
+        if path.suffix in (".py", ".toml", ".service")
+    }
+    for machine in make_deb.MACHINES.values():
+        files[f"kontronik_can_gw/native/core-{machine}.so"] = machine.encode()
+    wheel = zipped(folder / "gateway.whl", files)
+    library = {"bitstruct/__init__.py": b"", "bitstruct/c.so": b"", "bitstruct.data/scripts/x": b""}
+    libraries = [zipped(folder / "bitstruct.whl", library)]
+    packages = make_deb.make(wheel, libraries, folder)
+    return {path.stem.rpartition("_")[2]: path.read_bytes() for path in packages}
+
+
+def contents(package: bytes, part: str = "--fsys-tarfile") -> dict[str, tarfile.TarInfo]:
+    return {member.name: member for member in opened(package, part).getmembers()}
+
+
+def opened(package: bytes, part: str = "--fsys-tarfile") -> tarfile.TarFile:
+    done = subprocess.run(
+        ["dpkg-deb", part, "/dev/stdin"], input=package, capture_output=True, check=True
+    )
+    return tarfile.open(fileobj=io.BytesIO(done.stdout))
+
+
+def text(package: bytes, name: str, part: str = "--fsys-tarfile") -> str:
+    file = opened(package, part).extractfile(name)
+    assert file is not None
+    content = file.read()
+    return (gzip.decompress(content) if name.endswith(".gz") else content).decode()
+
+
+def test_each_architecture_has_its_object_alone_and_depends_on_python_alone(
+    made: dict[str, bytes],
+) -> None:
+    assert set(made) == {"amd64", "arm64", "armhf"}
+    for architecture, package in made.items():
+        objects = [name for name in contents(package) if name.endswith(".so")]
+        assert objects == [f"{OWN}native/core-{make_deb.MACHINES[architecture]}.so"]
+        assert text(package, objects[0]) == make_deb.MACHINES[architecture]
+        control = dict(
+            re.findall(r"^(\S+): (.*)$", text(package, "./control", "--ctrl-tarfile"), re.MULTILINE)
+        )
+        assert (control["Architecture"], control["Depends"]) == (architecture, "python3 (>= 3.11)")
+        assert control["Version"] == make_deb.version()
+
+
+def test_nothing_is_in_etc_or_var_and_all_is_roots(made: dict[str, bytes]) -> None:
+    found = contents(made["amd64"])
+    assert [name for name in found if name.startswith(("./etc", "./var", "./run"))] == []
+    for name, member in found.items():
+        executable = member.isdir() or name.endswith(
+            ("/bin/kontronik-can-gw", "take-over", "rtupdate")
+        )
+        assert (member.uid, member.gid, member.uname) == (0, 0, "root"), name
+        assert member.mode & 0o777 == (0o755 if executable else 0o644), name
+
+
+def test_units_rules_completion_and_manual_are_in_place(made: dict[str, bytes]) -> None:
+    package = made["armhf"]
+    found = contents(package)
+    for kind in ("", "-mqtt", "-metrics"):
+        for instance in ("", "@"):
+            unit = text(
+                package, f"./usr/lib/systemd/system/kontronik-can-gw{kind}{instance}.service"
+            )
+            assert unit.startswith("[Unit]\n")
+            assert re.search(
+                "^ExecStart=/usr/bin/kontronik-can-gw (run|mqtt|metrics) ", unit, re.MULTILINE
+            )
+            assert re.search("@[A-Z]+@", unit) is None
+    for name in (
+        "lib/sysusers.d/kontronik-can-gw.conf",
+        "lib/tmpfiles.d/kontronik-can-gw.conf",
+        "lib/udev/rules.d/70-kontronik-can-gw.rules",
+        "share/doc/kontronik-can-gw/copyright",
+        "share/doc/kontronik-can-gw/examples/50-kontronik-can-gw-can0.network",
+        *(f"share/{place}" for place in make_deb.COMPLETIONS.values()),
+    ):
+        assert found[f"./usr/{name}"].size, name
+    manual = text(package, "./usr/share/man/man1/kontronik-can-gw.1.gz").replace("\\", "")
+    assert "COMMAND fI,'kontronik-can-gw service install'" in manual
+    assert "--wait" in manual
+
+
+def test_dpkg_can_verify_every_file(made: dict[str, bytes]) -> None:
+    package = made["arm64"]
+    sums = text(package, "./md5sums", "--ctrl-tarfile").splitlines()
+    listed = [line.split("  ", 1)[1] for line in sums]
+    assert sorted(listed) == sorted(
+        name[2:] for name, member in contents(package).items() if member.isfile()
+    )
+
+
+@pytest.mark.parametrize("name", [*make_deb.SCRIPTS, "rtupdate", "take-over"])
+def test_maintainer_scripts_are_shell(name: str) -> None:
+    script = make_deb.HERE / name
+    assert script.read_text().startswith("#!/bin/sh\n")
+    subprocess.run(["sh", "-n", script], check=True)
+
+
+def test_every_library_is_pinned_or_left_out_by_name() -> None:
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    waiting = [
+        Requirement(line)
+        for line in [*project["dependencies"], *extras["mqtt"], *extras["metrics"]]
+    ]
+    needed = set[str]()
+    while waiting:
+        requirement = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        if name in LEFT_OUT or name in needed:
+            continue
+        assert name in VENDORED, f"{name} is not in deb/vendored.txt"
+        (pinned,) = VENDORED[name].specifier
+        assert requirement.specifier.contains(pinned.version), (str(requirement), pinned.version)
+        needed.add(name)
+        waiting += map(Requirement, importlib.metadata.requires(name) or [])
+    assert needed == set(VENDORED)
+
+
+def test_no_command_imports_a_library_that_is_left_out() -> None:
+    script = (
+        "import importlib, pkgutil, sys\n"
+        "for name in sys.argv[1:]: sys.modules[name] = None\n"
+        "import kontronik_can_gw\n"
+        "for module in pkgutil.walk_packages(kontronik_can_gw.__path__, 'kontronik_can_gw.'):\n"
+        "    if not module.name.endswith('__main__') and '.core-' not in module.name:\n"
+        "        importlib.import_module(module.name)\n"
+        "from kontronik_can_gw.cli import main\n"
+        "assert main(['demo', '--seconds', '0.1']) == 0\n"
+        "import can.interfaces.socketcan, can.interfaces.slcan, can.interfaces.pcan, canopen, cantools.database\n"
+    )
+    modules = ["wrapt", "markdown_it", "pygments", "argparse_addons", "crccheck", "diskcache"]
+    modules += ["msgpack", "bitstruct.c", "numpy", "pyarrow", "asammdf"]
+    command = [sys.executable, "-c", script, *modules]
+    done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
