@@ -51,14 +51,14 @@ class Gateway:
         self.nodes: Nodes | None = None
         if canopen is not None:
             self.nodes = _nodes(canopen, layout, self.core, self.status)
-        self._outputs: tuple[Output, ...] = (
+        self.outputs: tuple[Output, ...] = (
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
         )
-        self.has_outputs = bool(self._outputs)
+        self.has_outputs = bool(self.outputs)
         """False: nothing but the layout's messages is sent, and no id to receive ever changes."""
-        self.core.followers = [Follower(each.events, each.on_event) for each in self._outputs]
-        self.conflicts = IdConflicts(self.core.own_ids, self._outputs)
+        self.core.followers = [Follower(each.events, each.on_event) for each in self.outputs]
+        self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
         self._being_saved: list[tuple[int, Output]] = []
         self._dropped = False
 
@@ -71,14 +71,14 @@ class Gateway:
         """The runtime has opened what it could: run. Nodes boot when there is a bus that can hear it."""
         self.status.state = GatewayState.RUNNING
         self.core.repeat(now)
-        for output in self._outputs:
+        for output in self.outputs:
             output.start(now, can_open)
 
     def stop(self, now: int) -> None:
         """The last word: a status that says the gateway is going."""
         self.status.state = GatewayState.STOPPING
         self.core.stop(now)
-        for output in self._outputs:
+        for output in self.outputs:
             output.stop(now)
 
     def receive_bytes(self, esc: int, data: bytes, now: int, since: int) -> None:
@@ -87,7 +87,9 @@ class Gateway:
 
     @property
     def receive_ids(self) -> frozenset[int]:
-        """The ids (29-bit ones with EXTENDED) of the frames that ``receive_frame`` is to be given; the same object until they change.
+        """The ids (29-bit ones with EXTENDED), and blocks of ids, of the frames that ``receive_frame`` is to be given.
+
+        The same object until they change.
 
         Those that the outputs listen to, and those that only this gateway sends with: another device that does is to be noticed.
         """
@@ -97,7 +99,7 @@ class Gateway:
         """A data frame of another device with one of ``receive_ids``, read at ``now``; it came ``at``."""
         if not frame.remote and self.conflicts.receive(frame.key, now):
             self.status.id_conflicts += 1
-        takers = [output for output in self._outputs if output.receive_ids]
+        takers = [output for output in self.outputs if output.receive_ids]
         if takers:
             self.core.expire(now)
         for output in takers:
@@ -109,13 +111,13 @@ class Gateway:
 
     def receive_overrun(self, now: int) -> None:
         """The CAN controller lost received frames."""
-        for output in self._outputs:
+        for output in self.outputs:
             output.overrun(now)
 
     def take_saves(self) -> list[tuple[int, Any]]:
         """Parameters to store, (ESC, what), oldest first; each is answered by one call of ``saved`` for that ESC, in this order."""
         found = []
-        for output in self._outputs:
+        for output in self.outputs:
             if output.saves:
                 found += output.saves
                 self._being_saved += [(esc, output) for esc, _ in output.saves]
@@ -125,7 +127,7 @@ class Gateway:
     def take_rejected_parameters(self) -> list[tuple[int, int]]:
         """Stored values that were rejected at a node's reset: (ESC, index << 8 | sub-index)."""
         found = []
-        for output in self._outputs:
+        for output in self.outputs:
             if output.rejected_parameters:
                 found += output.rejected_parameters
                 output.rejected_parameters = []
@@ -141,7 +143,7 @@ class Gateway:
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """What was stored for an ESC could not be read: its node runs on defaults and reports it."""
-        for output in self._outputs:
+        for output in self.outputs:
             output.parameters_damaged(esc, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
@@ -152,7 +154,7 @@ class Gateway:
         """Frames can be sent again after some were lost: say everything that has no cycle once more."""
         self.core.expire(now)
         self.core.repeat(now)
-        for output in self._outputs:
+        for output in self.outputs:
             output.can_returned(now)
 
     def held_up(self, now: int, dropped: bool) -> None:
@@ -162,7 +164,7 @@ class Gateway:
         """
         self.core.expire(now)
         self._dropped = dropped
-        for output in self._outputs:
+        for output in self.outputs:
             output.held_up(now)
 
     def set_can_state(self, state: CanState, now: int) -> None:
@@ -173,7 +175,7 @@ class Gateway:
             self.core.gateway_changed(now)
             if before is CanState.BUS_OFF and state is not CanState.DOWN:
                 self.core.repeat(now)  # what was handed over meanwhile never reached the bus
-        for output in self._outputs:
+        for output in self.outputs:
             output.on_can_state(before, state, now)
 
     def advance(self, now: int) -> None:
@@ -183,22 +185,22 @@ class Gateway:
         if self._dropped:
             self._dropped = False
             self.core.repeat(now)
-            for output in self._outputs:
+            for output in self.outputs:
                 output.make_anew(now)
-        for output in self._outputs:
+        for output in self.outputs:
             output.advance(now)
 
     def next_deadline(self, with_core: bool = True) -> int:
         """When ``advance`` is to be called at the latest."""
         due = self.core.next_deadline() if with_core else NEVER
-        for output in self._outputs:
+        for output in self.outputs:
             due = min(due, output.next_deadline())
         return due
 
     @property
     def frames_wait(self) -> bool:
         """True while ``take_frames`` has something to do."""
-        for output in self._outputs:
+        for output in self.outputs:
             if output.frames:
                 return True
         return self.core.is_pending
@@ -206,7 +208,7 @@ class Gateway:
     def take_frames(self, now: int) -> list[CanFrame]:
         """The frames to send: those of the outputs, oldest first, then those of the core that are due, with the values of now."""
         frames = self.core.take(now)
-        for output in reversed(self._outputs):
+        for output in reversed(self.outputs):
             if output.frames:
                 frames = output.frames + frames
                 output.frames.clear()
@@ -225,11 +227,11 @@ class Gateway:
     @property
     def node_changes(self) -> int:
         """Grows with each change of a node's state or node-ID."""
-        return sum([output.state_changes for output in self._outputs])
+        return sum([output.state_changes for output in self.outputs])
 
     def node_states(self) -> list[tuple[int, Any, int]]:
         """Of each ESC's node: node-ID, state, PDOs sent so far. Empty without nodes."""
-        return [state for output in self._outputs for state in output.node_states()]
+        return [state for output in self.outputs for state in output.node_states()]
 
 
 def _nodes(setup: "CanopenSetup", layout: Layout, core: Core, status: GatewayStatus) -> "Nodes":

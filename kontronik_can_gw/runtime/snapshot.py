@@ -124,14 +124,7 @@ def snapshot(
         "configuration": program.configuration,
         "monotonic_ns": now,
         "time": utc(wall),
-        "process": {
-            "pid": program.pid,
-            "start_ticks": program.ticks,
-            "pid_namespace": program.pid_namespace,
-            "started": program.started,
-            "uptime_s": _seconds(now - status.started_ns),
-            **asdict(process),
-        },
+        "process": _process(program, process, now - status.started_ns),
         "gateway": {
             "state": name_in_words(status.state.name),
             "esc_count": status.esc_count,
@@ -148,9 +141,21 @@ def snapshot(
             _node(port.name, *found)
             for port, found in zip(ports, gateway.node_states(), strict=False)
         ],
+        "outputs": {output.name: found for output in gateway.outputs if (found := output.facts())},
         "store": store and {"waiting": store.waiting, "last_error": store.last_error or None},
         "recording": None if recorder is None else asdict(recorder),
         "log": list(log_lines)[-LOG_LINES:],
+    }
+
+
+def _process(program: ProgramFacts, process: ProcessFacts, uptime_ns: int) -> Document:
+    return {
+        "pid": program.pid,
+        "start_ticks": program.ticks,
+        "pid_namespace": program.pid_namespace,
+        "started": program.started,
+        "uptime_s": _seconds(uptime_ns),
+        **asdict(process),
     }
 
 

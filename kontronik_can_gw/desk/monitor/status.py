@@ -190,6 +190,9 @@ def _lines(seen: Seen, document: Document, width: int | None) -> tuple[list[Text
         lines += wrapped(trouble, BAD, width)
     lines += alarm_lines(_alarms(document), width, None if width is None else _MAX_ALARM_LINES)
     lines += _node_lines(document, width)
+    for output in document.get("outputs", {}).values():  # 0.5.0 had none
+        for text in output["lines"]:
+            lines += wrapped(printable(text), "", width)
     if (store := document["store"]) and store["waiting"] > 0:
         lines.append(line((f"{store['waiting']} parameters wait for the disk", POOR)))
     if (recording := document["recording"]) and recording["file"]:
