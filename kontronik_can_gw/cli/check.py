@@ -48,6 +48,13 @@ def main(args: argparse.Namespace) -> int:
         show()
         load += bits_per_second(nodes.nodes) / config.can.bitrate
         frames += frames_per_second(nodes.nodes)
+    for setup in loaded.outputs:
+        show(f"# {setup.title}")
+        for line in (*setup.lines(), ""):
+            show(line)
+        further_frames, bits = setup.traffic()
+        load += bits / config.can.bitrate
+        frames += further_frames
     if (folder := record_folder(config)) is not None:
         show(f"# captures: {in_words(config, folder)}")
     show(

@@ -29,6 +29,8 @@ DEFAULTS: dict[str, dict[str, object]] = {
     | {"bind": {}, "e2e_data_ids": {}, "units": {}, "send_type": {}, "messages": (), "unbound": "error", "flags_on_loss": None},
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
+    "dronecan": {"enabled": False, "node_id": 0, "per_esc_nodes": False, "name": "kontronik_can_gw", "first_index": 0}
+    | {"rate_hz": 50, "extended_hz": 0, "rpm": "motor", "health": "gateway", "log_messages": True},
     "run": {"wait_for_devices": False, "realtime_priority": None},
     "statistics": {"file": None},
     "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100},
@@ -42,7 +44,8 @@ _WHOLE = """
 can bitrate 10000 1000000, can data_bitrate 10000 8000000, dbc base_id 0 536870911, dbc id_step 1 536870911, dbc flags_on_loss 0 1,
 run realtime_priority 1 99, canopen vendor_id 0 4294967295, canopen serial 0 4294967295, canopen node_id 1 127, record part_mb 1 4000,
 record part_minutes 1 10000, record keep_mb 0 10000000, record min_free_mb 0 10000000, esc node_id 1 127, esc pole_pairs 1 100,
-esc cell_count 0 255, esc telemetry_timeout_ms 20 60000"""
+esc cell_count 0 255, esc telemetry_timeout_ms 20 60000, dronecan node_id 0 125, dronecan first_index 0 31, dronecan rate_hz 1 200,
+dronecan extended_hz 0 200"""
 RANGES = {
     (table, key): (int(low), int(high))
     for table, key, low, high in map(str.split, _WHOLE.split(","))
@@ -52,7 +55,7 @@ can interface, can channel, dbc file, dbc node, esc port, canopen eds, canopen s
 mqtt ca_file, mqtt cert_file, mqtt key_file, mqtt username, mqtt password_file"""
 _FLAGS = """
 can fd, run wait_for_devices, dbc enabled, mqtt tls, mqtt retain, canopen enabled, canopen self_start, canopen read_only,
-canopen cia402_mirrors"""
+canopen cia402_mirrors, dronecan enabled, dronecan per_esc_nodes, dronecan log_messages"""
 STRINGS, BOOLEANS = (
     [(table, key) for table, key in map(str.split, text.split(","))] for text in (_TEXTS, _FLAGS)
 )
@@ -111,6 +114,9 @@ TAKEN: dict[tuple[str, str], list[object]] = {
     **{place: [True, False] for place in BOOLEANS},
     ("canopen", "node_id"): [1, 127, 255],
     ("esc", "node_id"): [1, 127, 255],
+    ("dronecan", "name"): ["a", "com.example.esc-1_2", "x" * 60],
+    ("dronecan", "rpm"): ["motor", "output", "electrical"],
+    ("dronecan", "health"): ["gateway", "esc"],
     ("mqtt", "rate"): [0.01, 0.5, 1, 20, 20.0],
     ("esc", "name"): ["a", "Left", "esc_1", "A23456789012"],
     ("dbc", "on_loss"): ["silent", "not_available"],
@@ -132,6 +138,9 @@ REFUSED: list[tuple[str, str, str, list[Any]]] = [
     *((*place, "is not a text", ["", "  ", "\n", 7, True, ["x"], {}]) for place in STRINGS),
     *((*place, "is not true or false", [0, 1, "true", [], {}]) for place in BOOLEANS),
     *((table, "node_id", "128 is outside 1..127 and not 255", [128]) for table in ("canopen", "esc")),
+    ("dronecan", "name", "is not a name of small letters", ["A", "a..b", ".a", "a b", "ä", "x" * 61]),
+    ("dronecan", "rpm", "is none of motor, output, electrical", ["Motor", "x"]),
+    ("dronecan", "health", "is none of gateway, esc", ["escs", "x"]),
     ("mqtt", "broker", "is not a broker, as broker.example, 192.168.1.5:1883 or [fe80::1]:1883", [
         *("mqtt://a", "a:0", "a:65536", "a b", "::1", "a/b", "u@a", "-a", "a:", ":1883", "a\n")]),
     *(("mqtt", key, "is not the beginning of topics", [
@@ -269,7 +278,7 @@ KNOWN_IN_CAN = "Known: interface, channel, bitrate, fd, data_bitrate, options."
 NEEDED = "esc: at least one [[esc]] with its port is needed. `kontronik-can-gw init` shows one."
 MISTAKES: list[tuple[dict[str, Any], str]] = [
     (tables() | {"cann": {}}, "cann: unknown table. Did you mean can?"),
-    (tables() | {"xyzzy": {}}, "xyzzy: unknown table. Known: can, dbc, canopen, run, statistics, record, mqtt, esc."),
+    (tables() | {"xyzzy": {}}, "xyzzy: unknown table. Known: can, dbc, canopen, dronecan, run, statistics, record, mqtt, esc."),
     (tables() | {"can": {"bitrte": 1}}, "can.bitrte: unknown key. Did you mean bitrate?"),
     (tables() | {"run": {"x": 1}}, "run.x: unknown key. Known: wait_for_devices, realtime_priority."),
     (tables() | {"can": 3}, "can: is a table, written [can]"),
