@@ -1,9 +1,33 @@
-"""The CAN frame as the pure core receives it and hands it out."""
+"""The CAN frame as the pure core receives it and hands it out, and ids as numbers in sets."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 EXTENDED = 0x80000000
 """Marks a 29-bit id where ids of both lengths are numbers in one set, as SocketCAN does."""
+MAX_EXTENDED_ID = 0x1FFFFFFF
+_KEY = 0xFFFFFFFF
+
+
+def id_block(can_id: int, mask: int) -> int:
+    """All 29-bit ids that agree with ``can_id`` in the bits of ``mask``, as one number among keys.
+
+    The bits that are free stand above bit 31.
+    """
+    return (~mask & MAX_EXTENDED_ID) << 32 | EXTENDED | can_id & mask
+
+
+def id_and_mask(key: int) -> tuple[int, int]:
+    """Key (bit 31: 29 bits) and mask of a key or block; all bits of a key count."""
+    return key & _KEY, _KEY & ~(key >> 32)
+
+
+def block_of(key: int, keys: Iterable[int]) -> int | None:
+    """The first block among ``keys`` that holds a key."""
+    for each in keys:
+        if each > _KEY and not (key ^ each) & _KEY & ~(each >> 32):
+            return each
+    return None
 
 
 class CanFrame(NamedTuple):

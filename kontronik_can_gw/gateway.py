@@ -87,7 +87,9 @@ class Gateway:
 
     @property
     def receive_ids(self) -> frozenset[int]:
-        """The ids (29-bit ones with EXTENDED) of the frames that ``receive_frame`` is to be given; the same object until they change.
+        """The ids (29-bit ones with EXTENDED), and blocks of ids, of the frames that ``receive_frame`` is to be given.
+
+        The same object until they change.
 
         Those that the outputs listen to, and those that only this gateway sends with: another device that does is to be noticed.
         """

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, block_of, id_and_mask
 from kontronik_can_gw.output import NO_IDS, Output, Owner
 
 _OVER_NS = 10 * SECOND
@@ -12,10 +12,14 @@ _ECHO_NS = SECOND // 5
 
 
 class Conflict:
-    """Another device sends with an id of ours. ``whose``: what it is here; ``over``: that has ceased."""
+    """Another device sends with an id of ours. ``whose``: what it is here; ``output``: that has it, None: the gateway.
 
-    def __init__(self, key: int, owner: Owner, now: int) -> None:
+    ``over``: that has ceased.
+    """
+
+    def __init__(self, key: int, owner: Owner, output: Output | None, now: int) -> None:
         self.key = key
+        self.output = output
         self.whose = owner.what
         self.node = owner.esc
         self.begun = self.last = now
@@ -24,11 +28,16 @@ class Conflict:
 
     @property
     def can_id(self) -> int:
-        return self.key & ~EXTENDED
+        """Of a block the lowest."""
+        return self.key & MAX_EXTENDED_ID
 
     @property
-    def is_extended(self) -> bool:
-        return bool(self.key & EXTENDED)
+    def ids(self) -> str:
+        """The id, or the ids of a block, in words."""
+        mask = id_and_mask(self.key)[1] & MAX_EXTENDED_ID
+        if mask != MAX_EXTENDED_ID:
+            return f"29-bit ids with {self.can_id:X}h in their bits {mask:X}h"
+        return f"{'29-bit id' if self.key & EXTENDED else 'id'} {self.can_id:X}h"
 
 
 class IdConflicts:
@@ -38,7 +47,8 @@ class IdConflicts:
         self._of_gateway = of_gateway
         self._outputs = outputs
         self._routed: list[frozenset[int]] | None = None
-        self._own: Mapping[int, Owner] = {}
+        self._own: dict[int, tuple[Owner, Output | None]] = {}
+        self._own_blocks: tuple[int, ...] = ()
         self._receive_ids = NO_IDS
         self._present: dict[int, Conflict] = {}
         self._news: list[Conflict] = []
@@ -58,16 +68,19 @@ class IdConflicts:
             else:
                 return
         self._routed = [output.receive_ids for output in self._outputs]
-        own = dict(self._of_gateway)
+        own: dict[int, tuple[Owner, Output | None]]
+        own = {key: (owner, None) for key, owner in self._of_gateway.items()}
         for output in self._outputs:
-            own |= output.own_ids()
-        self._own = own
+            own |= {key: (owner, output) for key, owner in output.own_ids().items()}
+        self._own, self._own_blocks = own, tuple(key for key in own if key >> 32)
         self._receive_ids = frozenset(own).union(*self._routed)
 
     def first_own_id(self) -> int | None:
         """The lowest id of ours that is of no ESC's node; None without any."""
         self._follow()
-        return min((key for key, owner in self._own.items() if owner.esc is None), default=None)
+        return min(
+            (key for key, (owner, _) in self._own.items() if owner.esc is None), default=None
+        )
 
     def can_opened(self, now: int) -> None:
         """The interface was opened (again): what we sent before may still come back, and is no conflict."""
@@ -76,12 +89,12 @@ class IdConflicts:
     def receive(self, key: int, now: int) -> bool:
         """A data frame of another device; True where its id is ours."""
         self._follow()
-        owner = self._own.get(key)
-        if owner is None or now < self._echoes_until:
+        own = key if key in self._own else block_of(key, self._own_blocks)
+        if own is None or now < self._echoes_until:
             return False
-        conflict = self._present.get(key)
+        conflict = self._present.get(own)
         if conflict is None:
-            conflict = self._present[key] = Conflict(key, owner, now)
+            conflict = self._present[own] = Conflict(own, *self._own[own], now)
             self._news.append(conflict)
             self._report(conflict, True, now)
         conflict.count += 1
@@ -96,7 +109,10 @@ class IdConflicts:
             conflict.over = True
             del self._present[conflict.key]
             self._news.append(conflict)
-            if conflict.node not in {other.node for other in self._present.values()}:
+            if not any(
+                (each.output, each.node) == (conflict.output, conflict.node)
+                for each in self._present.values()
+            ):
                 self._report(conflict, False, now)
 
     def take(self) -> list[Conflict]:
@@ -105,6 +121,5 @@ class IdConflicts:
         return news
 
     def _report(self, conflict: Conflict, present: bool, now: int) -> None:
-        if conflict.node is not None:
-            for output in self._outputs:
-                output.collision(conflict.node, present, now)
+        if conflict.output is not None and conflict.node is not None:
+            conflict.output.collision(conflict.node, present, now)

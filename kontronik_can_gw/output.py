@@ -4,12 +4,12 @@ The gateway holds its outputs in a tuple and treats all alike. An output overrid
 is integer nanoseconds of one monotonic clock.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
-from kontronik_can_gw.esc.telemetry import Event
+from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 
 NEVER = 1 << 62
 """Later than every deadline, ns."""
@@ -17,7 +17,7 @@ NO_IDS: frozenset[int] = frozenset()
 
 
 class Owner(NamedTuple):
-    """What sends with an id: ``esc`` is the ESC whose node it is, None: the gateway."""
+    """What sends with an id: ``esc`` is the ESC whose node it is, the first of several; None: no node."""
 
     esc: int | None
     what: str
@@ -26,19 +26,26 @@ class Owner(NamedTuple):
 class Output:
     """One way onto the bus. Frames are appended to ``frames``, oldest first; the owner empties it."""
 
+    name = ""
+    """Of what ``facts`` says."""
     events = Event.ALL
     """What ``on_event`` is given: with at least one of these. The fewer, the less the core is interrupted."""
 
     def __init__(self) -> None:
         self.frames: list[CanFrame] = []
         self.receive_ids: frozenset[int] = NO_IDS
-        """The ids (29-bit ones with EXTENDED) that ``receive`` is to be given; the same object until they or ``own_ids`` change."""
+        """The ids (29-bit ones with EXTENDED) and blocks of ids (frames.id_block) that ``receive`` is to be given.
+
+        The same object until they or ``own_ids`` change.
+        """
         self.saves: list[tuple[int, Any]] = []
         """(ESC, parameters) to store; the owner empties it and answers each by ``saved``, in this order."""
         self.rejected_parameters: list[tuple[int, int]] = []
         """(ESC, index << 8 | sub-index) of stored values that were rejected at a reset; the owner empties it."""
         self.state_changes = 0
         """Grows with each change of a node's state or node-ID."""
+        self.news: list[str] = []
+        """What is to be logged of such a change; the owner empties it."""
 
     @property
     def marks(self) -> tuple[int, ...]:
@@ -47,7 +54,11 @@ class Output:
         return ids, changes, len(self.saves), len(self.rejected_parameters)
 
     def own_ids(self) -> Mapping[int, Owner]:
-        """The ids that only this output sends with, and what for."""
+        """The ids, and blocks of ids, that only this output sends with, and what for."""
+        return {}
+
+    def facts(self) -> dict[str, Any]:
+        """What is to be known of this output, as JSON; ``lines`` are for people. Empty: nothing."""
         return {}
 
     def node_states(self) -> list[tuple[int, Any, int]]:
@@ -98,3 +109,47 @@ class Output:
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """What was stored for an ESC could not be read."""
+
+
+class Given(NamedTuple):
+    """What an output is made from, besides the ESCs: what a capture holds of it."""
+
+    table: Any
+    """Its table of the configuration."""
+    identity: bytes
+    """A digest of what identifies this machine; empty where there is nothing."""
+    version: tuple[int, int]
+    """Of the program: major and minor."""
+    seed: int
+    """A random number of 64 bits, of this start."""
+
+
+class OutputSetup(Protocol):
+    """An output that can be made, and what is to be known of it before."""
+
+    @property
+    def name(self) -> str:
+        """As in outputs.OUTPUTS."""
+
+    @property
+    def title(self) -> str:
+        """What they are, in a sentence."""
+
+    @property
+    def given(self) -> Given:
+        """What it is made from."""
+
+    def make(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> Output:
+        """The output as it is at the start."""
+
+    def taken_ids(self) -> Mapping[int, str]:
+        """The ids and blocks of ids that no message may have, and what has them."""
+
+    def traffic(self) -> tuple[float, float]:
+        """Frames and bits a second to be expected, with the most stuffing."""
+
+    def warnings(self, bitrate: int) -> list[str]:
+        """What may not work as it is meant, on a bus with this bit rate."""
+
+    def lines(self) -> list[str]:
+        """What ``check`` shows."""

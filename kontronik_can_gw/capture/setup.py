@@ -9,10 +9,11 @@ JSON keys of the header (run and recorder add created_ns, run, part, monotonic_n
     ports                their serial ports
     dbc                  file, text (one character a byte), fd, silent_on_loss and the fields of DbcSettings; null without it
     canopen              eds (file, text), nodes, stored, escs (settings as configured); null without it
+    outputs              further ones by their names: table (as in the configuration), identity, version, seed; not in captures of 0.5.0
 """
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,8 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.output import Given, OutputSetup
+from kontronik_can_gw.outputs import OUTPUTS, setup_of
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
@@ -38,7 +41,7 @@ if TYPE_CHECKING:
 Header = Mapping[str, Any]
 _UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, UserError)
 """What a header raises that holds anything."""
-_LATEST = 1 << 62
+_LATEST, _SEEDS = 1 << 62, (1 << 64) - 1
 _KINDS = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
 
 
@@ -57,6 +60,7 @@ class CaptureSetup:
     file: str = ""
     version: int = VERSION
     """Of the capture's format; 1: of 0.5.0."""
+    outputs: tuple[OutputSetup, ...] = ()
 
     def header(self) -> dict[str, Any]:
         """The header's JSON content."""
@@ -79,6 +83,7 @@ class CaptureSetup:
             "ports": list(self.ports),
             "dbc": dbc,
             "canopen": None if self.canopen is None else _canopen_json(self.canopen),
+            "outputs": {setup.name: _output_json(setup.given) for setup in self.outputs},
         }
 
     @classmethod
@@ -104,8 +109,9 @@ class CaptureSetup:
             file = (str(dbc["file"]), dbc["text"].encode("latin-1"))
             settings = _dbc_settings(dbc)
         found = header["canopen"]
+        escs = tuple(_esc(esc) for esc in header["escs"])
         return cls(
-            tuple(_esc(esc) for esc in header["escs"]),
+            escs,
             tuple(map(str, header["ports"])),
             file,
             settings,
@@ -115,6 +121,7 @@ class CaptureSetup:
             str(header["configuration"]),
             str(header["file"]),
             header["version"],
+            tuple(_output(name, of, escs) for name, of in header.get("outputs", {}).items()),
         )
 
     def database(self) -> tuple["Database", Layout] | None:
@@ -128,6 +135,7 @@ class CaptureSetup:
         """The gateway in its state before the start."""
         return Gateway(
             *(self.escs, layout, now, self.silent_on_loss, self.canopen),
+            further=[setup.make for setup in self.outputs],
             packs_at_once=self.version == 1,
         )
 
@@ -154,6 +162,20 @@ def _canopen(found: Mapping[str, Any]) -> "CanopenSetup":
         tuple(decode(text.encode("ascii")) for text in found["stored"]),
         tuple(_esc(esc) for esc in found["escs"]),
     )
+
+
+def _output_json(given: Given) -> dict[str, Any]:
+    return given._asdict() | {"table": asdict(given.table), "identity": given.identity.hex()}
+
+
+def _output(name: str, found: Mapping[str, Any], escs: Sequence[EscSettings]) -> OutputSetup:
+    """Settings checked like those of a configuration."""
+    if name not in OUTPUTS:
+        raise ValueError(f"{str(name)[:40]!r} is no output that this version knows")
+    table = getattr(parse({name: found["table"], "esc": [{"port": "-"}]}, "the capture"), name)
+    identity, seed = bytes.fromhex(found["identity"]), _number(found["seed"], 0, _SEEDS)
+    major, minor = (_number(each, 0, 255) for each in found["version"])
+    return setup_of(name, Given(table, identity, (major, minor), seed), escs)
 
 
 def _dbc_settings(found: Mapping[str, Any]) -> DbcSettings:

@@ -88,6 +88,8 @@ def summary(path: Path, loaded: Loaded, warnings: int) -> Iterator[str]:
                 f"node {node.node_id}, {_counted(sum(tpdo.valid for tpdo in node.tpdos), 'TPDO')}"
             )
             yield f"  CANopen   {each.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else sent}"
+    for output in loaded.outputs:
+        yield f"  {output.title}"
     if (folder := record_folder(config)) is not None:
         yield f"  captures  {in_words(config, folder)}"
     load, frames = _traffic(loaded)
@@ -107,6 +109,10 @@ def _traffic(loaded: Loaded) -> tuple[float, float]:
         nodes = loaded.canopen.nodes(loaded.escs).nodes
         load += bits_per_second(nodes) / can.bitrate
         frames += frames_per_second(nodes)
+    for output in loaded.outputs:
+        more, bits = output.traffic()
+        load += bits / can.bitrate
+        frames += more
     return load, frames
 
 

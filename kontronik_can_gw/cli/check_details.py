@@ -30,6 +30,10 @@ def details(loaded: Loaded) -> Iterator[str]:
         yield f"# CANopen nodes by {loaded.canopen.eds.name}"
         yield from node_table(loaded.canopen.nodes(loaded.escs), loaded)
         yield ""
+    for output in loaded.outputs:
+        yield f"# {output.title}"
+        yield from output.lines()
+        yield ""
 
 
 def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:

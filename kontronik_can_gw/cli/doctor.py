@@ -15,8 +15,9 @@ from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.assemble import Loaded, assemble
-from kontronik_can_gw.config.keys import SHIPPED, Config
+from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.nodes import parameter_folder
+from kontronik_can_gw.config.output_keys import SHIPPED
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor.can import check_can
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity

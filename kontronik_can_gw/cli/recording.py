@@ -47,7 +47,10 @@ def recorded(
     )
     recorder = Recorder(settings)
     recorder.words = in_words(loaded.config, folder)
-    gateway = RecordedGateway(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.canopen)
+    gateway = RecordedGateway(
+        *(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.canopen),
+        further=[setup.make for setup in loaded.outputs],
+    )
     known = {
         "created_ns": now,
         "state": state_of(gateway),
@@ -71,4 +74,5 @@ def setup_of(loaded: Loaded) -> CaptureSetup:
         loaded.canopen,
         as_toml(config),
         config.file,
+        outputs=loaded.outputs,
     )

@@ -157,7 +157,8 @@ class _Run:
             return recorded(loaded, self._args.record, now, silent)
         from kontronik_can_gw.gateway import Gateway
 
-        return Gateway(loaded.escs, loaded.layout, now, silent, loaded.canopen), None
+        further = [setup.make for setup in loaded.outputs]
+        return Gateway(loaded.escs, loaded.layout, now, silent, loaded.canopen, further), None
 
 
 def _begin_realtime(priority: int | None, wait: bool) -> None:

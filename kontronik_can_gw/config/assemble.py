@@ -1,12 +1,14 @@
 """Loads a configuration and the files that it names: ESCs, DBC, CANopen nodes, stored parameters. Reports all mistakes at once."""
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw import __version__
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
 from kontronik_can_gw.dbc.loss import unreported, unsupplied
@@ -16,6 +18,9 @@ from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.output import Given, OutputSetup
+from kontronik_can_gw.outputs import OUTPUTS, setup_of
+from kontronik_can_gw.runtime.machine import identity_digest
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.plan import Layout
 
@@ -24,6 +29,8 @@ if TYPE_CHECKING:
 
     from kontronik_can_gw.canopen.nodes import CanopenSetup
     from kontronik_can_gw.runtime.store import ParameterStore
+
+_NODES = "the CANopen nodes"
 
 
 @contextmanager
@@ -65,6 +72,8 @@ class Loaded:
     warnings: tuple[str, ...] = ()
     dbc: bytes = b""
     """The DBC file as it was read."""
+    outputs: tuple[OutputSetup, ...] = ()
+    """Of the outputs besides DBC and CANopen."""
 
 
 def load_configuration(
@@ -109,6 +118,29 @@ def check_devices(config: Config) -> None:
         raise UserError(*problems)
 
 
+def _outputs(
+    config: Config, problems: list[str], taken: dict[int, str], bits: dict[str, float]
+) -> tuple[OutputSetup, ...]:
+    """The setups of the outputs in the tuple that are enabled. Adds mistakes in their tables, the ids they take, the bits/s they need."""
+    found = []
+    for name in OUTPUTS:
+        table = getattr(config, name)
+        if not table.enabled:
+            continue
+        major, minor, *_ = map(int, re.findall(r"\d+", __version__))
+        seed = int.from_bytes(os.urandom(8), "big")
+        given = Given(table, identity_digest(), (major, minor), seed)
+        try:
+            setup = setup_of(name, given, config.escs)
+        except UserError as error:
+            problems += [f"{config.file}: {problem}" for problem in error.problems]
+            continue
+        taken |= setup.taken_ids()
+        bits[setup.title] = setup.traffic()[1]
+        found.append(setup)
+    return tuple(found)
+
+
 def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     """The objects made from a configuration. Without a store its files are only read.
 
@@ -120,19 +152,20 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     escs, plain, kept = config.escs, None, None
     ignored: list[str] = []
     taken: dict[int, str] = {}
-    bits = 0.0
+    bits: dict[str, float] = {}
     if config.canopen.enabled:  # what only nodes need is not loaded without them
         from kontronik_can_gw.config import nodes
 
         with collecting(problems):
             plain = nodes.plain_setup(config)
-            taken, bits, ignored = nodes.needs(plain, plain.esc_settings(config.escs))
+            of_nodes = plain.esc_settings(config.escs)
+            taken, bits[_NODES], ignored = nodes.needs(plain, of_nodes)
         if plain is not None and not problems:
             kept = nodes.read_stored(config, store)
             escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
-    database, layout, dbc = None, Layout("", "", ()), b""
+    outputs = _outputs(config, problems, taken, bits)
+    database, layout, dbc, file = None, Layout("", "", ()), b"", str(config.dbc_path)
     if config.dbc.enabled:
-        file = str(config.dbc_path)
         with collecting(problems):
             dbc = read_dbc(config.dbc_path)
             found = parse_database(dbc, file, ignored)
@@ -143,18 +176,17 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     warnings = [check_load(layout, bitrate, data_bitrate, bits)]
     canopen = None
     if plain is not None and kept is not None:
-        foreign = {
-            message.can_id: message.name for message in layout.messages if not message.extended
-        }
+        foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
         canopen, given_way = nodes.with_stored(plain, kept.stored, config, escs, foreign)
         if canopen is not plain:
-            _, bits, _ = nodes.needs(canopen, escs)
+            _, bits[_NODES], _ = nodes.needs(canopen, escs)
         warnings += [
             *given_way,
             *kept.warnings,
-            *nodes.load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits),
+            *nodes.load_of_stored(warnings[0], layout, bitrate, data_bitrate, sum(bits.values())),
         ]
+    warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(bitrate)]
     damaged = () if kept is None else tuple(kept.damaged)
     mute = [*unreported(layout, config.dbc.on_loss == "silent"), *unsupplied(layout, escs)]
     said = tuple(warning for warning in (*config.warnings, *ignored, *mute, *warnings) if warning)
-    return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)
+    return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc, outputs)

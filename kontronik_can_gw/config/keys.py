@@ -3,40 +3,39 @@
 Check (``parse``), JSON Schema and TOML text (``export``) and the docs come from these rows.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.config.kinds import (
-    BINDINGS,
     BOOLEAN,
     BROKER,
     ESC_NAME,
     LEVEL,
-    NAMES,
     RATIO,
     TEXT,
     TOPIC,
-    Kind,
-    choice,
     choice_of,
     integer,
-    meanings,
+    key,
     number,
     options,
-    table_of,
+)
+from kontronik_can_gw.config.output_keys import (
+    NODE_ID,
+    SHIPPED,
+    CanopenConfig,
+    DbcConfig,
+    DronecanConfig,
 )
 from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.dbc.timing import SEND_TYPES
 from kontronik_can_gw.esc.protocols import PROTOCOLS, device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
-from kontronik_can_gw.signals import units
 
-SHIPPED = "shipped"
 REQUIRED = MISSING
 """Default of a key that has to be given."""
 REMOVED_KEYS: dict[str, str] = {
@@ -48,17 +47,7 @@ REMOVED_KEYS: dict[str, str] = {
 For a year each is ignored with a warning: a gateway must not fall silent after an upgrade.
 """
 
-_NODE_ID = integer(1, 127, also=UNCONFIGURED)
-_CAN_ID_MAX, _UINT32_MAX = 0x1FFFFFFF, 0xFFFFFFFF
 _OF_CAN = frozenset({"interface", "channel", "bitrate", "fd", "data_bitrate"})
-
-
-def _key(kind: Kind, default: Any, doc: str) -> Any:
-    """A row of a table below."""
-    metadata = {"kind": kind, "doc": doc}
-    if isinstance(default, dict):
-        return field(default_factory=default.copy, metadata=metadata)
-    return field(default=default, metadata=metadata)
 
 
 # fmt: off
@@ -66,80 +55,25 @@ def _key(kind: Kind, default: Any, doc: str) -> Any:
 class CanConfig:
     """The CAN interface."""
 
-    interface: str = _key(TEXT, "socketcan",
+    interface: str = key(TEXT, "socketcan",
         "python-can interface name: socketcan, virtual, pcan, kvaser, slcan ...")
-    channel: str = _key(TEXT, "can0", "channel of that interface, as can0")
-    bitrate: int = _key(integer(10_000, 1_000_000), 500_000,
+    channel: str = key(TEXT, "can0", "channel of that interface, as can0")
+    bitrate: int = key(integer(10_000, 1_000_000), 500_000,
         "bit rate in bit/s; with socketcan it is set by the system and only the bus load is computed from it")
-    fd: bool = _key(BOOLEAN, False, "allow CAN FD messages (longer than 8 bytes)")
-    data_bitrate: int = _key(integer(10_000, 8_000_000), 2_000_000,
+    fd: bool = key(BOOLEAN, False, "allow CAN FD messages (longer than 8 bytes)")
+    data_bitrate: int = key(integer(10_000, 8_000_000), 2_000_000,
         "bit rate of the CAN FD data phase in bit/s")
-    options: Mapping[str, str | float] = _key(options("can", _OF_CAN), {},
+    options: Mapping[str, str | float] = key(options("can", _OF_CAN), {},
         "further options of the python-can interface, as host or ttyBaudrate")
-
-
-@dataclass(frozen=True)
-class DbcConfig:
-    """The DBC output."""
-
-    enabled: bool = _key(BOOLEAN, True, "send the messages of a DBC")
-    file: str = _key(TEXT, SHIPPED,
-        "DBC file, relative to this configuration; 'shipped' is the one of this package")
-    node: str | None = _key(TEXT, None, "transmitter node in the DBC whose messages are sent")
-    messages: Sequence[str] = _key(NAMES, (),
-        "names of the messages to send, '*' for any characters, as [\"Motor_*\"] (default: all of the node)")
-    unbound: str = _key(choice("error", "start_value"), "error",
-        "signals bound to nothing: 'error' refuses them, "
-        "'start_value' sends their GenSigStartValue (else NotAvailable, else 0) for ever")
-    on_loss: str = _key(choice("not_available", "silent"), "not_available",
-        "without telemetry: 'not_available' sends values marked as such, 'silent' stops messages with an ESC's values")
-    flags_on_loss: int | None = _key(integer(0, 1), None,
-        "what flags without NotAvailable in their value table hold without telemetry "
-        "(default: their own GenSigStartValue, else 0)")
-    base_id: int | None = _key(integer(0, _CAN_ID_MAX), None,
-        "move the messages so that the lowest id is this")
-    id_step: int | None = _key(integer(1, _CAN_ID_MAX), None,
-        "distance of the ids from ESC to ESC when a one-ESC DBC serves several")
-    bind: Mapping[str, str | float] = _key(BINDINGS, {},
-        "'Message.Signal' or 'Signal' = a source ('battery_voltage', 'left.battery_voltage') or a constant number")
-    e2e_data_ids: Mapping[str, int] = _key(table_of(integer(0, 0xFFFF)), {},
-        "message name = AUTOSAR E2E data id")
-    units: Mapping[str, str] = _key(meanings(units.names()), {},
-        "unit text of the DBC = the unit that it means")
-    send_type: Mapping[str, str] = _key(meanings(tuple(SEND_TYPES)), {},
-        "GenMsgSendType of the DBC = what it means")
-
-
-@dataclass(frozen=True)
-class CanopenConfig:
-    """The CANopen nodes, one for each ESC."""
-
-    enabled: bool = _key(BOOLEAN, False, "be a CANopen node for each ESC")
-    node_id: int = _key(_NODE_ID, 1,
-        "node-ID of the first ESC, the others follow; 255: all wait for LSS")
-    eds: str = _key(TEXT, SHIPPED,
-        "EDS file the nodes are built from, relative to this configuration; 'shipped' is the one of this package")
-    vendor_id: int | None = _key(integer(0, _UINT32_MAX), None,
-        "vendor-ID in 1018h:1; only CiA assigns one (default: as the EDS says)")
-    serial: int | None = _key(integer(0, _UINT32_MAX), None,
-        "serial number of the first node in 1018h:4, the others follow (default: made from the machine's id)")
-    self_start: bool = _key(BOOLEAN, False,
-        "go OPERATIONAL after boot-up without a master (1F80h); otherwise as the EDS says")
-    read_only: bool = _key(BOOLEAN, False, "refuse every write over the bus, and LSS")
-    cia402_mirrors: bool = _key(BOOLEAN, True,
-        "show the objects 6000h..67FFh (speed, DC link voltage, error code) that generic drive tools know")
-    store: str | None = _key(TEXT, None,
-        "folder of what masters store (default: the service's state folder; else for root /var/lib/kontronik-can-gw, "
-        "for others ~/.local/state/kontronik-can-gw)")
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """How the gateway runs."""
 
-    wait_for_devices: bool = _key(BOOLEAN, False,
+    wait_for_devices: bool = key(BOOLEAN, False,
         "at start: wait for ports and interfaces that are missing instead of ending with an error")
-    realtime_priority: int | None = _key(integer(1, 99), None,
+    realtime_priority: int | None = key(integer(1, 99), None,
         "real-time priority (SCHED_FIFO) and locked memory, so that the load of other programs delays no frame "
         "(default: normal priority)")
 
@@ -148,7 +82,7 @@ class RunConfig:
 class StatisticsConfig:
     """Statistics for ``kontronik-can-gw status`` and ``kontronik-can-gw metrics``."""
 
-    file: str | None = _key(TEXT, None,
+    file: str | None = key(TEXT, None,
         "JSON file that is replaced each second, relative to this configuration "
         "(default: status.json in the service's runtime folder; without one none)")
 
@@ -157,15 +91,15 @@ class StatisticsConfig:
 class RecordConfig:
     """Captures of all input, to be replayed and converted later."""
 
-    directory: str | None = _key(TEXT, None,
+    directory: str | None = key(TEXT, None,
         "folder of the captures, relative to this configuration; 'state' is a folder captures in the service's "
         "state folder (default: nothing is recorded but by `run --record`)")
-    part_mb: int = _key(integer(1, 4000), 64, "begin another file at this size in megabytes")
-    part_minutes: int = _key(integer(1, 10_000), 60,
+    part_mb: int = key(integer(1, 4000), 64, "begin another file at this size in megabytes")
+    part_minutes: int = key(integer(1, 10_000), 60,
         "begin another file after this time in minutes")
-    keep_mb: int = _key(integer(0, 10_000_000), 0,
+    keep_mb: int = key(integer(0, 10_000_000), 0,
         "remove the oldest captures of the folder when all together have more megabytes; 0: remove nothing")
-    min_free_mb: int = _key(integer(0, 10_000_000), 100,
+    min_free_mb: int = key(integer(0, 10_000_000), 100,
         "record nothing while fewer megabytes are free on the file system")
 
 
@@ -173,25 +107,25 @@ class RecordConfig:
 class MqttConfig:
     """What ``kontronik-can-gw mqtt`` publishes, and where."""
 
-    broker: str | None = _key(BROKER, None,
+    broker: str | None = key(BROKER, None,
         "MQTT broker, as broker.example or 192.168.1.5:1883 (default port 1883, with TLS 8883)")
-    tls: bool = _key(BOOLEAN, False, "encrypt, and check the broker's certificate and name")
-    ca_file: str | None = _key(TEXT, None,
+    tls: bool = key(BOOLEAN, False, "encrypt, and check the broker's certificate and name")
+    ca_file: str | None = key(TEXT, None,
         "certificate of the authority that signed the broker's, relative to this configuration "
         "(default: those of the system)")
-    cert_file: str | None = _key(TEXT, None,
+    cert_file: str | None = key(TEXT, None,
         "certificate to show to the broker, relative to this configuration")
-    key_file: str | None = _key(TEXT, None,
+    key_file: str | None = key(TEXT, None,
         "key of that certificate, relative to this configuration")
-    username: str | None = _key(TEXT, None, "user name at the broker")
-    password_file: str | None = _key(TEXT, None,
+    username: str | None = key(TEXT, None, "user name at the broker")
+    password_file: str | None = key(TEXT, None,
         "file with the password on its first line, relative to this configuration")
-    gateway: str | None = _key(LEVEL, None,
+    gateway: str | None = key(LEVEL, None,
         "name of this gateway in the topics (default: the host name)")
-    topic: str = _key(TOPIC, "kontronik", "what all topics begin with")
-    rate: float = _key(number(0.01, 20), 1.0, "state messages of each ESC in a second")
-    retain: bool = _key(BOOLEAN, False, "let the broker keep the last state message of each ESC")
-    discovery: str | None = _key(TOPIC, None,
+    topic: str = key(TOPIC, "kontronik", "what all topics begin with")
+    rate: float = key(number(0.01, 20), 1.0, "state messages of each ESC in a second")
+    retain: bool = key(BOOLEAN, False, "let the broker keep the last state message of each ESC")
+    discovery: str | None = key(TOPIC, None,
         "topic prefix of Home Assistant's discovery, there mostly 'homeassistant' (default: no discovery)")
 
     @property
@@ -209,22 +143,22 @@ class MqttConfig:
 class EscConfig:
     """One ESC and its serial port."""
 
-    port: str = _key(TEXT, REQUIRED, "serial port, best by /dev/serial/by-id/...")
-    name: str = _key(ESC_NAME, "",
+    port: str = key(TEXT, REQUIRED, "serial port, best by /dev/serial/by-id/...")
+    name: str = key(ESC_NAME, "",
         "short name, prefix of messages and signals with several ESCs (the shipped DBC has room for 6 letters); "
         "default esc1, esc2 ...")
-    pole_pairs: int = _key(integer(1, 100), 1,
+    pole_pairs: int = key(integer(1, 100), 1,
         "pole pairs of the motor (half the number of magnets)")
-    gear: Fraction = _key(RATIO, Fraction(1),
+    gear: Fraction = key(RATIO, Fraction(1),
         "motor revolutions per output revolution: a number or 'numerator/denominator'")
-    cell_count: int = _key(integer(0, 255), 0, "cells of the battery; 0: as the ESC reports")
-    telemetry_timeout_ms: int = _key(integer(20, 60_000), 250,
+    cell_count: int = key(integer(0, 255), 0, "cells of the battery; 0: as the ESC reports")
+    telemetry_timeout_ms: int = key(integer(20, 60_000), 250,
         "live values older than this are not available")
-    node_id: int | None = _key(_NODE_ID, None,
+    node_id: int | None = key(NODE_ID, None,
         "CANopen node-ID of this ESC; 255: waits for LSS (default: counted on from canopen.node_id)")
-    device: str | None = _key(choice_of(device_names), None,
+    device: str | None = key(choice_of(device_names), None,
         "the device that belongs here; another one is reported (CANopen EMCY 7510h)")
-    protocol: str = _key(choice_of(protocol_names), PROTOCOLS[0].name,
+    protocol: str = key(choice_of(protocol_names), PROTOCOLS[0].name,
         "what the ESC's telemetry line speaks")
 
     @property
@@ -253,6 +187,7 @@ class Config:
     can: CanConfig
     dbc: DbcConfig
     canopen: CanopenConfig
+    dronecan: DronecanConfig
     run: RunConfig
     statistics: StatisticsConfig
     record: RecordConfig

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import field
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -17,6 +18,14 @@ class Kind(NamedTuple):
     schema: dict[str, Any]
     check: Callable[[Any], Any]
     """The value as it is used; ValueError says what is wrong with it."""
+
+
+def key(kind: Kind, default: Any, doc: str) -> Any:
+    """A row of a table: what it may hold, its default, its meaning."""
+    metadata = {"kind": kind, "doc": doc}
+    if isinstance(default, dict):
+        return field(default_factory=default.copy, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 def _boolean(value: Any) -> bool:
@@ -215,6 +224,12 @@ TOPIC = pattern(
 )
 LEVEL = pattern(
     "level", "[A-Za-z0-9_-]{1,64}", "is not a name of 1 to 64 letters, digits, _ and -", 200
+)
+NODE_NAME = pattern(
+    "string",
+    r"[a-z0-9_-]+(\.[a-z0-9_-]+)*",
+    "is not a name of small letters, digits, - and _, with dots in between, of at most 60",
+    longest=60,
 )
 ESC_NAME = pattern(
     "string",

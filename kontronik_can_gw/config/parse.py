@@ -19,6 +19,7 @@ from kontronik_can_gw.dbc.binding import VALUES_BY_KEY
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.outputs import OUTPUTS
 
 
 def load(path: Path) -> Config:
@@ -209,10 +210,9 @@ def _output_problems(config: Config) -> Iterator[str]:
                 yield f"statistics.file: {str(path)!r} is {what}, which would be overwritten"
     if config.canopen.enabled:
         yield from _node_id_problems(config)
-    elif not config.dbc.enabled:
-        yield (
-            "dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one."
-        )
+    elif not config.dbc.enabled and not any(getattr(config, name).enabled for name in OUTPUTS):
+        names = ", ".join(f"{name}.enabled" for name in ("dbc", "canopen", *OUTPUTS))
+        yield f"{names}: all are false, so nothing would be sent. Enable one."
 
 
 def _node_id_problems(config: Config) -> Iterator[str]:

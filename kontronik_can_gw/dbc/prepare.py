@@ -17,6 +17,7 @@ from kontronik_can_gw.dbc.reader import choose_node, listed
 from kontronik_can_gw.dbc.settings import Compilation, DbcSettings
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.frames import EXTENDED, block_of
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def compile_layout(
 ) -> Layout:
     """Compile all of our messages. UserError with all mistakes at once.
 
-    ``taken_ids``: 11-bit ids already in use (COB-IDs of our CANopen nodes), and their users.
+    ``taken_ids``: ids and blocks of ids already in use (as COB-IDs of our CANopen nodes), and their users.
     """
     node = choose_node(database, settings.node, file)
     job = Compilation(database, file, settings, Binder(escs, settings.bind), fd_allowed)
@@ -130,9 +131,11 @@ def _clashes(
         counted = Counter(signal.name for signal in message.signals)
         for name in (name for name, count in counted.items() if count > 1):
             yield f"{file}: {message.name}.{name}: two signals have this name. Rename one."
-        if not message.is_extended_frame and message.frame_id in taken:
+        key = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+        user = key if key in taken else block_of(key, taken)
+        if user is not None:
             yield (
-                f"{file}: {message.name}: id {message.frame_id:X}h is used by {taken[message.frame_id]}. "
+                f"{file}: {message.name}: id {message.frame_id:X}h is used by {taken[user]}. "
                 f"Move the message (free for all: 680h..6DFh) or change the node-ID."
             )
 
@@ -170,14 +173,16 @@ def _timing_warnings(job: Compilation, plans: Sequence[MessagePlan]) -> Iterator
 
 
 def check_load(
-    layout: Layout, bitrate: int, data_bitrate: int = 2_000_000, further_bits: float = 0
+    layout: Layout,
+    bitrate: int,
+    data_bitrate: int = 2_000_000,
+    further: Mapping[str, float] | None = None,
 ) -> str | None:
-    """A warning above 50 % computed bus load, UserError above 100 %, else None. ``further_bits``: bits per second of CANopen nodes."""
-    load = layout.bus_load(bitrate, data_bitrate) + further_bits / bitrate
-    what = "the CANopen nodes" if not layout.messages else f"{layout.file}: the messages"
-    if layout.messages and further_bits:
-        what += " and the CANopen nodes"
-    text = f"{what} need {load:.0%} of {bitrate // 1000} kbit/s"
+    """A warning above 50 % computed bus load, UserError above 100 %, else None. ``further``: other outputs and their bits per second."""
+    further = further or {}
+    load = layout.bus_load(bitrate, data_bitrate) + sum(further.values()) / bitrate
+    who = [*([f"{layout.file}: the messages"] if layout.messages else []), *further]
+    text = f"{' and '.join(who)} need {load:.0%} of {bitrate // 1000} kbit/s"
     if load > REFUSE_LOAD:
         raise UserError(
             f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime; inhibit times) or raise can.bitrate."

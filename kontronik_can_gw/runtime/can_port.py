@@ -11,13 +11,13 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
 
-from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, block_of, id_and_mask
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.transmit_queue import Sent
 
 RECEIVE_LIMIT, _DISCARD_LIMIT = 64, 4096
 """Frames, error frames among them, that one call of ``receive`` or ``discard`` takes at most."""
-MAX_STANDARD_ID, MAX_EXTENDED_ID = 0x7FF, 0x1FFFFFFF
+MAX_STANDARD_ID = 0x7FF
 # An enumeration's members are slow to look up.
 _DOWN, _UNKNOWN = CanState.DOWN, CanState.UNKNOWN
 _OK = Sent.OK
@@ -45,6 +45,7 @@ class CanPort(ABC):
         self.drained = True
         """Whether the last ``receive`` left nothing: what it did not return may have been taken, as error frames are."""
         self._ids: frozenset[int] = frozenset()
+        self._blocks: tuple[int, ...] = ()
         self._known_drops = 0
 
     @abstractmethod
@@ -67,15 +68,19 @@ class CanPort(ABC):
         self.state = state
 
     def set_receive_ids(self, ids: Collection[int]) -> None:
-        """From now on receive data frames with these ids and no others. ValueError for a number that is no id."""
+        """From now on receive data frames with these ids, in these blocks, and no others. ValueError for a number that is neither."""
         if any(
             not 0 <= can_id <= MAX_STANDARD_ID
-            and not EXTENDED <= can_id <= EXTENDED | MAX_EXTENDED_ID
+            and not EXTENDED <= id_and_mask(can_id)[0] <= EXTENDED | MAX_EXTENDED_ID
             for can_id in ids
         ):
             raise ValueError(f"no identifiers: {sorted(ids)}")
         self._ids = frozenset(ids)
+        self._blocks = tuple(can_id for can_id in ids if can_id >> 32)
         self._filter()
+
+    def _is_wanted(self, key: int) -> bool:
+        return key in self._ids or block_of(key, self._blocks) is not None
 
     @abstractmethod
     def receive(self, limit: int = RECEIVE_LIMIT) -> Received:

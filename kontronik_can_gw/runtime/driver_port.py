@@ -10,10 +10,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import (
-    MAX_EXTENDED_ID,
     MAX_STANDARD_ID,
     RECEIVE_LIMIT,
     CanPort,
@@ -79,10 +78,12 @@ class DriverPort(CanPort):
     def _filter_bus(self) -> None:
         """Ask the driver for our ids; one that cannot filter is left to the thread."""
         filters: can.typechecking.CanFilters = [
-            {"can_id": each & ~EXTENDED, "can_mask": MAX_EXTENDED_ID, "extended": True}
-            if each & EXTENDED
-            else {"can_id": each, "can_mask": MAX_STANDARD_ID, "extended": False}
-            for each in sorted(self._ids)
+            {
+                "can_id": key & MAX_EXTENDED_ID,
+                "can_mask": mask & (MAX_EXTENDED_ID if key & EXTENDED else MAX_STANDARD_ID),
+                "extended": bool(key & EXTENDED),
+            }
+            for key, mask in map(id_and_mask, sorted(self._ids))
         ]
         for wanted in (filters, None):
             with contextlib.suppress(Exception):  # each driver fails in its own way
@@ -157,7 +158,7 @@ class DriverPort(CanPort):
     def _wanted(self, message: "can.Message") -> bool:
         """A data frame with one of our ids, not sent by ourselves."""
         return (
-            message.arbitration_id | (EXTENDED if message.is_extended_id else 0) in self._ids
+            self._is_wanted(message.arbitration_id | (EXTENDED if message.is_extended_id else 0))
             and not message.is_remote_frame
             and not message.is_error_frame
             and message.is_rx

@@ -22,6 +22,8 @@ class GatewayFacts(NamedTuple):
     status: GatewayStatus
     nodes: Sequence[tuple[int, Any, int]]
     """As Gateway.node_states."""
+    outputs: Mapping[str, Any]
+    """What further outputs say of themselves, by their names."""
     core: str
     """Its language, and as Gateway.core_note."""
     core_note: str
@@ -31,7 +33,8 @@ def gateway_facts(gateway: Gateway) -> GatewayFacts:
     """What it knows now."""
     escs = [esc.frozen() for esc in gateway.escs]
     core = gateway.core.language, gateway.core_note
-    return GatewayFacts(escs, copy(gateway.status), gateway.node_states(), *core)
+    outputs = {output.name: found for output in gateway.outputs if (found := output.facts())}
+    return GatewayFacts(escs, copy(gateway.status), gateway.node_states(), outputs, *core)
 
 
 @dataclass(frozen=True)

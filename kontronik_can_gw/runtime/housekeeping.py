@@ -129,6 +129,10 @@ class Housekeeping:
 
     def report_nodes(self, now: int) -> None:
         """Log which nodes have another state or node-ID, and stored values that were rejected."""
+        for output in self._gateway.outputs:
+            for text in output.news:
+                log.info("%s", text)
+            output.news.clear()
         for index, key in self._gateway.take_rejected_parameters():
             log.warning(
                 "%s: the stored %04Xh:%02X is ignored: it does not fit this EDS, or clashes",
@@ -152,8 +156,7 @@ class Housekeeping:
     def _log_conflicts(self, now: int) -> None:
         """Others on the bus begin, or cease, to send with our ids."""
         for conflict in self._gateway.conflicts.take():
-            bits = "29-bit id" if conflict.is_extended else "id"
-            which = f"CAN {self._can.config.channel}: {bits} {conflict.can_id:X}h"
+            which = f"CAN {self._can.config.channel}: {conflict.ids}"
             if conflict.over:
                 text = f"{which}: nobody else sends with it"
                 self._conditions.end(which, text, now, f"; {conflict.count} frames")

@@ -21,6 +21,16 @@ def machine_identity(root: Path = Path("/")) -> bytes:
     return found
 
 
+def identity_digest(root: Path = Path("/")) -> bytes:
+    """A digest of the identity, which may be shown; empty without one."""
+    identity = machine_identity(root)
+    if not identity:
+        return b""
+    import hashlib  # which loads OpenSSL: 4 MB, and not every gateway needs it
+
+    return hashlib.sha256(identity + _NAME.encode()).digest()
+
+
 def serial_number(number: int, name: str, identity: bytes) -> int:
     """1018h:4 of the ESC with this number (1 ...) and name: always the same on this board, different on others.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway import Gateway, MakeOutput
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.signals.plan import Layout
 
@@ -34,8 +34,9 @@ class RecordedGateway(Gateway):
         now: int,
         silent_on_loss: bool = False,
         canopen: "CanopenSetup | None" = None,
+        further: Sequence[MakeOutput] = (),
     ) -> None:
-        super().__init__(escs, layout, now, silent_on_loss, canopen)
+        super().__init__(escs, layout, now, silent_on_loss, canopen, further)
         self._put = put
         self._counters = self._counters_now()
         self._line_errors = [0] * len(escs)

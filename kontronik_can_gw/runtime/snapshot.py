@@ -73,14 +73,7 @@ def snapshot(
         "configuration": program.configuration,
         "monotonic_ns": now,
         "time": utc(wall),
-        "process": {
-            "pid": program.pid,
-            "start_ticks": program.ticks,
-            "pid_namespace": program.pid_namespace,
-            "started": program.started,
-            "uptime_s": _seconds(now - status.started_ns),
-            **vars(process),
-        },
+        "process": _process(program, process, now - status.started_ns),
         "gateway": {
             "state": name_in_words(status.state.name),
             "esc_count": status.esc_count,
@@ -96,9 +89,21 @@ def snapshot(
         "nodes": [
             _node(port.name, *found) for port, found in zip(ports, gateway.nodes, strict=False)
         ],
+        "outputs": gateway.outputs,
         "store": store and {"waiting": store.waiting, "last_error": store.last_error or None},
         "recording": None if recorder is None else vars(recorder),
         "log": list(log_lines)[-LOG_LINES:],
+    }
+
+
+def _process(program: ProgramFacts, process: ProcessFacts, uptime_ns: int) -> Document:
+    return {
+        "pid": program.pid,
+        "start_ticks": program.ticks,
+        "pid_namespace": program.pid_namespace,
+        "started": program.started,
+        "uptime_s": _seconds(uptime_ns),
+        **vars(process),
     }
 
 

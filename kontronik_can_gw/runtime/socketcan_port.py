@@ -11,10 +11,9 @@ from pathlib import Path
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import (
-    MAX_EXTENDED_ID,
     MAX_STANDARD_ID,
     RECEIVE_LIMIT,
     CanPort,
@@ -104,7 +103,7 @@ class SocketCanPort(CanPort):
                 can_id, size, content = _CLASSIC.unpack(data)
             if can_id & _ERROR_FLAG:
                 self._follow(can_id, content[1])
-            elif can_id in self._ids:
+            elif self._is_wanted(can_id):
                 # with another flag set, of a remote frame, it is none of ours
                 frame = CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd)
                 frames.append((frame, _monotonic(ancillary)))
@@ -198,12 +197,14 @@ def kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:
 
     The flags are part of the mask, so that remote frames, and those of the other length, with the same number stay out.
     """
-    step = 1
-    while len({can_id // step for can_id in ids}) > _MAX_FILTERS:
+    step, flags = 1, EXTENDED | _REMOTE
+    found = [id_and_mask(each) for each in sorted(ids) if each >> 32]
+    found = [(first, flags | mask & MAX_EXTENDED_ID) for first, mask in found]
+    ids = frozenset(each for each in ids if not each >> 32)
+    while len({can_id // step for can_id in ids}) > _MAX_FILTERS - len(found):
         step *= 2
-    blocks = sorted({can_id // step * step for can_id in ids})
-    flags, low = EXTENDED | _REMOTE, step - 1
-    return [
+    blocks, low = sorted({can_id // step * step for can_id in ids}), step - 1
+    return found + [
         (first, flags | (MAX_EXTENDED_ID if first & EXTENDED else MAX_STANDARD_ID) & ~low)
         for first in blocks
     ]

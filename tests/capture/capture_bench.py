@@ -1,7 +1,7 @@
 """A gateway that is recorded while random things happen to it, without a clock: what it sent, and the entries."""
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,6 +32,7 @@ def made(
     escs: int = 1,
     canopen: bool = False,
     of_esc: Callable[[int], dict[str, object]] = esc,
+    dronecan: Mapping[str, object] | None = None,
     **dbc: object,
 ) -> tuple[CaptureSetup, Layout]:
     """A gateway's making, and the layout of what it sends. ``of_esc``: the configuration of each ESC but for its port."""
@@ -39,6 +40,7 @@ def made(
         "can": {"interface": "virtual"},
         "dbc": dbc,
         "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
+        "dronecan": dronecan or {},
         "esc": [{"port": f"/dev/ttyUSB{n}"} | of_esc(n) for n in range(escs)],
     }
     loaded = assemble(parse(tables, "bench.toml"))
@@ -57,7 +59,8 @@ class Bench:
     def __post_init__(self) -> None:
         canopen: CanopenSetup | None = self.setup.canopen
         self.gateway = RecordedGateway(
-            self._put, self.setup.escs, self.layout, START, self.setup.silent_on_loss, canopen
+            *(self._put, self.setup.escs, self.layout, START, self.setup.silent_on_loss, canopen),
+            further=[setup.make for setup in self.setup.outputs],
         )
         self._waiting = TransmitQueue()
         self._saves: list[int] = []
@@ -156,7 +159,11 @@ class Bench:
                 ]
             )
             gateway.status.received_frames += 1
-            gateway.receive_frame(CanFrame(can_id & 0x7FF, data), now, now - rng.randrange(50 * MS))
+            if can_id >> 31:  # a block: one of its ids
+                frame = CanFrame(can_id & 0x1FFFFFFF | rng.randrange(0x80), data, True)
+            else:
+                frame = CanFrame(can_id, data)
+            gateway.receive_frame(frame, now, now - rng.randrange(50 * MS))
 
 
 def capture_file(

@@ -32,6 +32,8 @@ DEFAULTS: dict[str, dict[str, object]] = {
     | {"bind": {}, "e2e_data_ids": {}, "units": {}, "send_type": {}, "messages": (), "unbound": "error", "flags_on_loss": None},
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
+    "dronecan": {"enabled": False, "node_id": 0, "per_esc_nodes": False, "name": "kontronik_can_gw", "first_index": 0}
+    | {"rate_hz": 50, "extended_hz": 0, "rpm": "motor", "health": "gateway", "log_messages": True},
     "run": {"wait_for_devices": False, "realtime_priority": None},
     "statistics": {"file": None},
     "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100},
@@ -45,7 +47,8 @@ _WHOLE = """
 can bitrate 10000 1000000, can data_bitrate 10000 8000000, dbc base_id 0 536870911, dbc id_step 1 536870911, dbc flags_on_loss 0 1,
 run realtime_priority 1 99, canopen vendor_id 0 4294967295, canopen serial 0 4294967295, canopen node_id 1 127, record part_mb 1 4000,
 record part_minutes 1 10000, record keep_mb 0 10000000, record min_free_mb 0 10000000, esc node_id 1 127, esc pole_pairs 1 100,
-esc cell_count 0 255, esc telemetry_timeout_ms 20 60000"""
+esc cell_count 0 255, esc telemetry_timeout_ms 20 60000, dronecan node_id 0 125, dronecan first_index 0 31, dronecan rate_hz 1 200,
+dronecan extended_hz 0 200"""
 RANGES = {
     (table, key): (int(low), int(high))
     for table, key, low, high in map(str.split, _WHOLE.split(","))
@@ -55,7 +58,7 @@ can interface, can channel, dbc file, dbc node, esc port, canopen eds, canopen s
 mqtt ca_file, mqtt cert_file, mqtt key_file, mqtt username, mqtt password_file"""
 _FLAGS = """
 can fd, run wait_for_devices, dbc enabled, mqtt tls, mqtt retain, canopen enabled, canopen self_start, canopen read_only,
-canopen cia402_mirrors"""
+canopen cia402_mirrors, dronecan enabled, dronecan per_esc_nodes, dronecan log_messages"""
 STRINGS, BOOLEANS = (
     [(table, key) for table, key in map(str.split, text.split(","))] for text in (_TEXTS, _FLAGS)
 )
@@ -104,6 +107,9 @@ TAKEN: dict[tuple[str, str], list[object]] = {
     **{place: [True, False] for place in BOOLEANS},
     ("canopen", "node_id"): [1, 127, 255],
     ("esc", "node_id"): [1, 127, 255],
+    ("dronecan", "name"): ["a", "com.example.esc-1_2", "x" * 60],
+    ("dronecan", "rpm"): ["motor", "output", "electrical"],
+    ("dronecan", "health"): ["gateway", "esc"],
     ("mqtt", "rate"): [0.01, 0.5, 1, 20, 20.0],
     ("esc", "name"): ["a", "Left", "esc_1", "A23456789012"],
     ("dbc", "on_loss"): ["silent", "not_available"],

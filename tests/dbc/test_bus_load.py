@@ -94,11 +94,11 @@ def test_half_of_the_bus_is_no_warning_and_all_of_it_no_error() -> None:
 
 def test_the_bits_of_canopen_nodes_count_too() -> None:
     layout = layout_of(message_of("LeftBatteryVoltage"))
-    assert check_load(layout, 36_000, further_bits=4_500) is None
-    warning = str(check_load(layout, 36_000, further_bits=8_100))
+    assert check_load(layout, 36_000, further={"the CANopen nodes": 4_500}) is None
+    warning = str(check_load(layout, 36_000, further={"the CANopen nodes": 8_100}))
     assert warning.startswith(
         "my_car.dbc: the messages and the CANopen nodes need 60% of 36 kbit/s"
     )
     assert "CANopen" not in str(check_load(layout, 18_000))
-    alone = str(check_load(Layout("", "", ()), 1_000_000, further_bits=600_000))
+    alone = str(check_load(Layout("", "", ()), 1_000_000, further={"the CANopen nodes": 600_000}))
     assert alone.startswith("the CANopen nodes need 60% of 1000 kbit/s")

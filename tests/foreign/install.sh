@@ -1,7 +1,8 @@
 #!/bin/sh
-# Installs the CANopen masters and the decoder of others that tests/vcan/test_foreign_masters.py uses:
+# Installs programs of others that tests/vcan/test_foreign_masters.py and tests/dronecan/test_foreign_reader.py use:
 #   zencan-cli  a master in Rust, by cargo             about 90 s, needs cargo and a C linker
 #   canopen     a master in JavaScript, by npm         about 10 s, needs node, npm, make, g++ and python3
+#   dronecan    a reader of DroneCAN in Rust, by cargo   about 20 s, needs cargo and a C linker
 #   tshark      Wireshark's decoder, from Debian       about 25 s, needs root or a sudo that asks nothing
 # They go to tests/foreign/.cache, tshark to the system. What is there already is left alone. What cannot be had is
 # named, and the others are installed all the same; the exit code then is 1.
@@ -36,6 +37,15 @@ install_zencan() {
     quietly env CARGO_PROFILE_RELEASE_OPT_LEVEL=0 CARGO_PROFILE_RELEASE_STRIP=true \
         cargo install --locked --root "$cache/zencan" --version "$zencan" zencan-cli ||
         lacks "zencan-cli: cargo install failed"
+}
+
+install_dronecan_reader() {
+    target=$cache/dronecan_reader
+    [ -x "$target/release/dronecan-reader" ] && [ "$target/release/dronecan-reader" -nt "$here/dronecan_reader/src/main.rs" ] && return
+    have cargo || { lacks "dronecan-reader: no cargo: install Rust and run $0 again"; return; }
+    say "dronecan-reader (cargo build)"
+    quietly cargo build --release --locked --manifest-path "$here/dronecan_reader/Cargo.toml" --target-dir "$target" ||
+        lacks "dronecan-reader: cargo build failed"
 }
 
 install_node_canopen() {
@@ -74,4 +84,5 @@ install_tshark() {
 [ "${1:-}" = masters ] || install_tshark
 install_node_canopen
 install_zencan
+install_dronecan_reader
 exit $missing

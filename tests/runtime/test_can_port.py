@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
@@ -152,6 +152,27 @@ def test_any_set_of_ids_fits_into_the_kernels_filters(
         assert {each for each in range(0x800) if passes(each)} == short_ids
         twins = {each | EXTENDED for each in short_ids} - ids
         assert not any(passes(each) for each in twins)
+
+
+def test_a_block_of_ids_is_one_filter_beside_as_many_ids_as_there_are(
+    port: CanPort, fake: FakeSocket
+) -> None:
+    requests = id_block(0x80AA, 0xFFFF)
+    port.set_receive_ids({0x601, requests})
+    both = EXTENDED | REMOTE
+    assert filters_of(fake) == [(EXTENDED | 0x80AA, both | 0xFFFF), (0x601, both | 0x7FF)]
+    assert len(socketcan_port.kernel_filters(frozenset({*range(0x800), requests}))) <= 512
+    fake.inbox = [
+        packet(0x1E0180AA | EXTENDED, b"1"),
+        packet(0x80AA | EXTENDED, b"2"),
+        packet(0x80AB | EXTENDED, b"another"),
+        packet(0x0AA, b"11 bits"),
+        packet(0x80AA | EXTENDED | REMOTE, b"remote"),
+    ]
+    assert frames_of(port) == [
+        CanFrame(0x1E0180AA, b"1", True),
+        CanFrame(0x80AA, b"2", True),
+    ]
 
 
 @pytest.mark.parametrize("wrong", [-1, 0x800, EXTENDED - 1, EXTENDED | 0x2000_0000, 1 << 32])
@@ -461,6 +482,15 @@ def test_one_thread_brings_the_wanted_frames_in_order() -> None:
         other.send(message(0x601))
         other.send(message(0x603))
         assert receive(port, 1) == [CanFrame(0x603, b"")]
+
+
+def test_a_driver_brings_the_frames_of_a_block() -> None:
+    with virtual() as (port, other):
+        port.set_receive_ids({0x601, id_block(0x80AA, 0xFFFF)})
+        for can_id in (0x80AA, 0x80AB, 0x1F0180AA):
+            other.send(message(can_id, is_extended_id=True))
+        other.send(message(0x601))
+        assert [frame.can_id for frame in receive(port, 3)] == [0x80AA, 0x1F0180AA, 0x601]
 
 
 def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> None:

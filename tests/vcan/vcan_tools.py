@@ -1,4 +1,4 @@
-"""The bench of the end-to-end tests: ESCs, a gateway process, witnesses of the bus.
+"""The bench of the end-to-end tests: ESCs, a gateway process, witnesses of the bus, a master.
 
 No test here passes or fails by how fast the machine is. It waits for an event, with a limit that no working machine reaches, and
 judges order, values and counts. A ``Chain`` sends an ESC's next frame when the bus has shown the one before; what has to be shown
@@ -14,8 +14,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
+import canopen
 from bus_watch import SECOND, BusWatch
 from encoding import Identity
 from feeder import CURRENT, SPEED
@@ -23,6 +24,7 @@ from harness import LoggedProcess, PtyPort
 from raw_bus import RawBus
 from signals import table_sent
 
+from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Sent, SimulatedEsc
@@ -351,9 +353,52 @@ def bench(*escs: EscOptions) -> Iterator[Bench]:
 
 # --- CANopen
 
+EDS = shipped("eds/kontronik_esc.eds")
 SERIAL = 0x00100200
 
 
 def canopen_table(store: Path, node_id: int = 1, more: str = "") -> str:
     """The table of a configuration that makes each ESC a node, from ``node_id`` on."""
     return f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{store}"\n{more}\n'
+
+
+class Master:
+    """The canopen library as the master of a bus: its network and remote nodes made from the shipped EDS."""
+
+    def __init__(self, interface: str) -> None:
+        self.network = canopen.Network()
+        self.network.connect(interface="socketcan", channel=interface)
+        self._objects = canopen.import_od(str(EDS))
+
+    def node(self, node_id: int) -> canopen.RemoteNode:
+        """The node with this ID, from now on or since an earlier call."""
+        if node_id in self.network:
+            return cast(canopen.RemoteNode, self.network[node_id])
+        node = canopen.RemoteNode(node_id, self._objects)
+        node.sdo.RESPONSE_TIMEOUT = LIMIT_S
+        self.network.add_node(node)
+        return node
+
+    def upload(self, node_id: int, index: int, sub: int = 0) -> bytes:
+        return bytes(self.node(node_id).sdo.upload(index, sub))
+
+    def number(self, node_id: int, index: int, sub: int = 0) -> int:
+        """A whole number by SDO, without sign."""
+        return int.from_bytes(self.upload(node_id, index, sub), "little")
+
+    def write(self, node_id: int, index: int, sub: int, value: int, size: int) -> None:
+        self.node(node_id).sdo.download(index, sub, value.to_bytes(size, "little"))
+
+    def refusal(self, act: Callable[[], object]) -> int:
+        """The code of the abort that an act ends with."""
+        try:
+            act()
+        except canopen.SdoAbortedError as error:
+            return int(error.code)
+        raise AssertionError("it was not refused")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.network.disconnect()

@@ -250,6 +250,9 @@ def _further(document: Document) -> Iterator[Text]:
         rate = f", {rates[at]:.0f} PDOs/s" if at < len(rates) else ""
         state = f"node {node['node_id']} {node['state']}{rate}"
         yield line(f"{node['esc']}: {'waits for LSS' if node['node_id'] is None else state}")
+    for output in document.get("outputs", {}).values():  # 0.5.0 had none
+        for text in output["lines"]:
+            yield from wrapped(printable(text), "", _WIDTH)
     if (store := document["store"]) and store["waiting"] > 0:
         yield line((f"{store['waiting']} parameters wait for the disk", "yellow"))
     if (recording := document["recording"]) and recording["file"]:

@@ -124,8 +124,9 @@ class CaptureInput(CaptureFiles):
 
     @property
     def _is_for_c(self) -> bool:
-        """The core in C may play it at full speed: no CANopen node has frames of its own, or changes settings."""
-        return self.setup.version > 1 and self.setup.canopen is None
+        """The core in C may play it at full speed: no output has frames of its own, or changes settings."""
+        setup = self.setup
+        return setup.version > 1 and setup.canopen is None and not setup.outputs
 
     def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
         """Without messages; nodes are there, because they may change pole pairs and gear."""

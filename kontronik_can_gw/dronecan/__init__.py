@@ -1,0 +1,1 @@
+"""DroneCAN nodes that report the ESCs to an autopilot (specification 1.0 on classic CAN)."""

@@ -1,0 +1,141 @@
+"""What is reported of one ESC: its measurements while they are fresh, and the errors that begin and end."""
+
+from collections.abc import Iterator
+from fractions import Fraction
+from textwrap import wrap
+
+from kontronik_can_gw.dronecan import types
+from kontronik_can_gw.esc.decoder import Data, ErrorBit, Severity
+from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry
+from kontronik_can_gw.esc.values import scaled, steps_of, values_of
+
+SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
+"""Key ``rpm`` of the configuration to the value that is sent."""
+_QUIET_NS = 10 * SECOND
+"""An error that comes and goes is logged at most this often."""
+_BEC_FLAGS = {"bec_overvoltage": 1, "bec_undervoltage": 2, "bec_overcurrent": 4}
+_LEVELS = {Severity.ERROR: 3, Severity.WARNING: 2}
+_FLAG_BITS = 18
+"""Bits of the error word in StatusExtended; another flag says that there is a higher one."""
+
+
+class EscReport:
+    """One ESC with its index on the bus. ``rpm``: a key of SPEEDS."""
+
+    def __init__(self, esc: EscTelemetry, index: int, rpm: str) -> None:
+        self.esc = esc
+        self.index = index
+        self._values = values = values_of(esc.protocol)
+        self._volts, self._amperes, self._celsius, self._opening, self._throttle, self._word = (
+            values[name]
+            for name in (
+                *("battery_voltage", "battery_current", "power_stage_temperature"),
+                *("output_opening", "throttle", "operating_errors"),
+            )
+        )
+        self._speed = values[SPEEDS[rpm]]
+        self._slope = Fraction(1, self._speed.per_unit)
+        self._bits = [
+            bit
+            for bit in esc.protocol.errors.get("operating_errors", ())
+            if bit.severity in _LEVELS and not bit.is_summary
+        ]
+        self._errors = sum(1 << bit for bit in self._bits if bit.severity is Severity.ERROR)
+        self._before = self._logged = self._onsets = 0
+        self._turns = False
+        self._quiet_until: dict[int, int] = {}
+
+    @property
+    def word(self) -> int:
+        """The operating errors; 0 while they are not known."""
+        return steps_of(self._word, self.esc, self.esc.live) or 0
+
+    @property
+    def health(self) -> int:
+        """Of the ESC, as NodeStatus has it."""
+        if not self.esc.up:
+            return types.WARNING
+        word = self.word
+        if word & self._errors:
+            return types.ERROR
+        return types.WARNING if any(word >> bit & 1 for bit in self._bits) else types.OK
+
+    def follow(self) -> None:
+        """Count errors that begin; not those of the link's return, which may be old."""
+        word = self.word
+        self._onsets += (word & ~self._before & self._errors).bit_count()
+        self._before = word
+
+    def status(self) -> bytes | None:
+        """esc.Status; None without fresh telemetry: its speed has no value for that, so silence it is."""
+        live = self.esc.live
+        if live is None:
+            return None
+        rpm = scaled(self._speed, self.esc, steps_of(self._speed, self.esc, live), self._slope)
+        if rpm is None:
+            return None
+        if rpm and not self._turns:
+            self._onsets = 0  # errors since the motor was started
+        self._turns = bool(rpm)
+        celsius = self._number(self._celsius, live)
+        return types.status(
+            self._onsets,
+            self._number(self._volts, live),
+            self._number(self._amperes, live),
+            types.kelvin(celsius),
+            rpm,
+            int(self._number(self._opening, live) or 0),
+            self.index,
+        )
+
+    def status_extended(self) -> bytes | None:
+        """esc.StatusExtended; None without fresh telemetry."""
+        live = self.esc.live
+        if live is None:
+            return None
+        word = self.word
+        flags = word & (1 << _FLAG_BITS) - 1 | (word >> _FLAG_BITS != 0) << _FLAG_BITS
+        return types.status_extended(
+            abs(int(self._number(self._throttle, live) or 0)),
+            int(self._number(self._opening, live) or 0),
+            *(types.UNKNOWN_MOTOR_TEMPERATURE, 0, flags, self.index),
+        )
+
+    def bec(self) -> tuple[bytes, bytes] | None:
+        """CircuitStatus and Temperature of the BEC; None without fresh telemetry, and of an ESC that measures nothing there."""
+        live, values = self.esc.live, self._values
+        volts, amperes, celsius = (
+            self._number(values[name], live)
+            for name in ("bec_voltage", "bec_current", "bec_temperature")
+        )
+        if volts is None and amperes is None and celsius is None:
+            return None
+        flags = sum(flag for name, flag in _BEC_FLAGS.items() if self._number(values[name], live))
+        is_hot = bool(self._number(values["bec_overtemperature"], live))
+        circuit = types.circuit_status(self.index, volts, amperes, flags)
+        return circuit, types.temperature(self.index, types.kelvin(celsius), is_hot)
+
+    def log(self, now: int) -> Iterator[bytes]:
+        """LogMessages of an error or warning that has begun or ended; of one at a time, and none of what is not known now."""
+        if not self.esc.up:
+            return
+        word = self.word
+        for bit in self._bits:
+            mask = 1 << bit
+            if (word ^ self._logged) & mask and now >= self._quiet_until.get(bit, 0):
+                self._logged ^= mask
+                self._quiet_until[bit] = now + _QUIET_NS
+                yield from self._texts(bit, bool(word & mask))
+                return
+
+    def _texts(self, bit: ErrorBit, begins: bool) -> Iterator[bytes]:
+        name = self.esc.settings.name
+        level, text = _LEVELS[bit.severity], f"{name}: {bit.meaning}. {bit.remedy}"
+        if not begins:
+            level, text = 1, f"{name}: over: {bit.meaning}"
+        for part in wrap(text, types.MAX_TEXT):
+            yield types.log_message(level, name, part)
+
+    def _number(self, value: object, live: Data | None) -> float | None:
+        found = steps_of(value, self.esc, live)  # type: ignore[arg-type]
+        return None if found is None else found / value.per_unit  # type: ignore[attr-defined]

@@ -1,0 +1,132 @@
+"""What the DroneCAN output is made from: its nodes, what it needs of the bus, what is to be said about it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+
+from kontronik_can_gw.dronecan.esc_report import SPEEDS
+from kontronik_can_gw.dronecan.nodes import Dronecan
+from kontronik_can_gw.dronecan.transport import MAX_NODE_ID
+from kontronik_can_gw.dronecan.types import MAX_ESC_INDEX, MAX_RPM
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.frames import id_block
+from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.output import Given
+from kontronik_can_gw.signals.plan import classic_bits
+
+_USUAL_BITRATE = 1_000_000
+_STATUS, _EXTENDED, _BEC, _NODE_STATUS = (8, 8, 3), (8,), (8, 6), (8,)
+"""Data bytes of the frames of esc.Status, esc.StatusExtended, CircuitStatus and Temperature, NodeStatus."""
+_RESOLUTION = (
+    "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V, 0.063 V from 64 V; "
+    "current 0.031 A from 32 A, 0.063 A from 64 A, 0.125 A from 128 A; temperature 0.25 K"
+)
+
+
+@dataclass(frozen=True)
+class NodeSetup:
+    """One node. ``node_id`` 0: an allocator chooses it; ``escs``: numbers of its ESCs."""
+
+    node_id: int
+    name: str
+    unique_id: bytes
+    escs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class DronecanSetup:
+    """OutputSetup; ``given.table`` is a DronecanConfig."""
+
+    given: Given
+    escs: tuple[EscSettings, ...]
+
+    name = "dronecan"
+    title = "the DroneCAN nodes"
+
+    @cached_property
+    def nodes(self) -> tuple[NodeSetup, ...]:
+        """The gateway's node, or one for each ESC; a unique id is the same for this machine and name, and others' are others."""
+        table, found = self.given.table, []
+        numbers = range(len(self.escs))
+        for place, group in enumerate(
+            [(n,) for n in numbers] if table.per_esc_nodes else [numbers]
+        ):
+            own = f".{self.escs[place].name.lower()}" if table.per_esc_nodes else ""
+            name = table.name + own
+            unique_id = sha256(self.given.identity + name.encode()).digest()[:16]
+            node_id = table.node_id and table.node_id + place
+            found.append(NodeSetup(node_id, name, unique_id, tuple(group)))
+        return tuple(found)
+
+    def make(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> Dronecan:
+        return Dronecan(self, escs, gateway)
+
+    def taken_ids(self) -> Mapping[int, str]:
+        """Whatever parses as a frame of one of our nodes; of a node-ID that is not known yet, everything."""
+        if not self.given.table.node_id:
+            return {id_block(0, 0): "DroneCAN, whose node-ID an allocator chooses"}
+        return {
+            id_block(node.node_id, 0x7F): f"DroneCAN node {node.node_id} (bits 0 to 6 of its ids)"
+            for node in self.nodes
+        }
+
+    def traffic(self) -> tuple[float, float]:
+        table, escs = self.given.table, len(self.escs)
+        rates = [(size, table.rate_hz * escs) for size in _STATUS]
+        rates += [(size, table.extended_hz * escs) for size in _EXTENDED]
+        rates += [(size, escs) for size in _BEC]
+        rates += [(size, len(self.nodes)) for size in _NODE_STATUS]
+        bits = sum(rate * classic_bits(size, True) for size, rate in rates)
+        return sum(rate for _, rate in rates), bits
+
+    def warnings(self, bitrate: int) -> list[str]:
+        found = []
+        if bitrate != _USUAL_BITRATE:
+            found.append(
+                f"dronecan: can.bitrate is {bitrate // 1000} kbit/s; autopilots run DroneCAN at 1000 kbit/s"
+            )
+        if not self.given.identity:
+            found.append(
+                "dronecan: this machine has no id, so unique ids come from the names alone: "
+                "give each gateway on a bus its own dronecan.name"
+            )
+        return found
+
+    def lines(self) -> list[str]:
+        table, escs, found = self.given.table, self.escs, []
+        for node in self.nodes:
+            who = ", ".join(
+                f"{escs[n].name} is esc_index {table.first_index + n}" for n in node.escs
+            )
+            node_id = node.node_id or "asks an allocator"
+            found.append(f"node {node_id}, {node.name}, unique id {node.unique_id.hex()}: {who}")
+        sent = f"esc.Status at {table.rate_hz} Hz while telemetry is fresh"
+        if table.extended_hz:
+            sent += f", esc.StatusExtended at {table.extended_hz} Hz"
+        return [
+            *found,
+            f"{sent}; NodeStatus, CircuitStatus and Temperature of the BEC each second",
+            f"rpm is {SPEEDS[table.rpm]}, at most {MAX_RPM}: what is more is sent as that",
+            _RESOLUTION,
+        ]
+
+
+def configured(given: Given, escs: Sequence[EscSettings]) -> DronecanSetup:
+    """The setup. UserError with the mistakes in the table of the configuration."""
+    setup, problems = DronecanSetup(given, tuple(escs)), []
+    last = setup.nodes[-1].node_id
+    if last > MAX_NODE_ID:
+        highest = MAX_NODE_ID + 1 - len(setup.nodes)
+        problems.append(
+            f"dronecan.node_id: that of the last node would be {last}. Choose one up to {highest}."
+        )
+    last = given.table.first_index + len(escs) - 1
+    if last > MAX_ESC_INDEX:
+        problems.append(
+            f"dronecan.first_index: esc_index of the last ESC would be {last}. There are 0 to {MAX_ESC_INDEX}."
+        )
+    if problems:
+        raise UserError(*problems)
+    return setup

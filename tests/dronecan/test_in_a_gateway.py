@@ -1,0 +1,260 @@
+"""The output in its gateway: configuration, `check`, other outputs, captures, `status`, and what it costs when it is off."""
+
+import json
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import capture_bench
+import pytest
+from command_line import run
+from dronecan_bench import LIVE, Bench, answers_of, loaded
+from test_replay_is_identical import replayed
+
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.desk.monitor import status
+from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
+from kontronik_can_gw.runtime.process import ProcessFacts
+from kontronik_can_gw.runtime.snapshot import snapshot
+
+ON = {"enabled": True, "node_id": 42, "per_esc_nodes": True, "extended_hz": 7}
+TOML = """
+[can]
+interface = "virtual"
+bitrate = {bitrate}
+[dbc]
+{dbc}
+[dronecan]
+enabled = true
+{more}
+[[esc]]
+port = "/dev/ttyUSB0"
+name = "left"
+[[esc]]
+port = "/dev/ttyUSB1"
+name = "right"
+"""
+EXTENDED_DBC = """VERSION ""
+BU_: Gw
+BO_ {number} Voltage: 8 Gw
+ SG_ LeftBatteryVoltage : 0|16@1+ (0.01,0) [0|655] "V" Vector__XXX
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_ "GenMsgCycleTime" 100;
+"""
+
+
+def checked(
+    folder: Path, more: str = "", dbc: str = "enabled = false", bitrate: int = 1_000_000
+) -> tuple[object, str, str]:
+    file = folder / "a.toml"
+    file.write_text(TOML.format(more=more, dbc=dbc, bitrate=bitrate))
+    done = run("check", "-c", file)
+    return done.code, done.out, done.err
+
+
+def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
+    code, out, err = checked(tmp_path, "node_id = 42\nfirst_index = 4\nextended_hz = 10")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    (node,) = [line for line in lines if line.startswith("node 42, kontronik_can_gw, unique id")]
+    assert node.endswith("left is esc_index 4, right is esc_index 5")
+    assert "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V" in out
+    assert "rpm is motor_speed, at most 131071" in out
+    # 2 x (50 x (8, 8, 3 bytes) + 10 x 8 bytes + 8 + 6 bytes) + 8 bytes, 29 bits, worst stuffing
+    bits = 2 * (50 * (160 + 160 + 110) + 10 * 160 + 160 + 140) + 160
+    assert f"# bus load {bits / 1e6:.1%} of 1000 kbit/s: 325 frames/s" in out
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "bitrate", "load"), [(50, 500_000, ""), (100, 125_000, "69% of 125 kbit/s")]
+)
+def test_check_warns_of_another_bit_rate_and_of_a_full_bus(
+    tmp_path: Path, rate_hz: int, bitrate: int, load: str
+) -> None:
+    code, _, err = checked(tmp_path, f"node_id = 42\nrate_hz = {rate_hz}", bitrate=bitrate)
+    assert code == 0
+    assert f"can.bitrate is {bitrate // 1000} kbit/s; autopilots run DroneCAN at 1000 kbit/s" in err
+    assert (f"the DroneCAN nodes need {load}" in err) == bool(load)
+    code, _, err = checked(tmp_path, "node_id = 42\nrate_hz = 200", bitrate=125_000)
+    assert code == 2
+    assert "the DroneCAN nodes need" in err
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        (
+            "node_id = 125\nper_esc_nodes = true",
+            "a.toml: dronecan.node_id: that of the last node would be 126. Choose one up to 124.",
+        ),
+        (
+            "first_index = 31",
+            "a.toml: dronecan.first_index: esc_index of the last ESC would be 32. There are 0 to 31.",
+        ),
+        ('name = "Left"', "a.toml: dronecan.name: 'Left' is not a name of small letters"),
+    ],
+)
+def test_a_mistake_is_refused_in_one_line(tmp_path: Path, more: str, reason: str) -> None:
+    code, _, err = checked(tmp_path, more)
+    assert code == 2
+    assert reason in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("can_id", "more", "user"),
+    [
+        (0x1034522A, "node_id = 42", "DroneCAN node 42 (bits 0 to 6 of its ids)"),
+        (0x2B, "node_id = 42\nper_esc_nodes = true", "DroneCAN node 43"),
+        (0x10345210, "node_id = 0", "DroneCAN, whose node-ID an allocator chooses"),
+        (0x1034522B, "node_id = 42", ""),
+    ],
+)
+def test_a_dbc_whose_ids_are_frames_of_our_node_is_refused(
+    tmp_path: Path, can_id: int, more: str, user: str
+) -> None:
+    (tmp_path / "own.dbc").write_text(EXTENDED_DBC.format(number=can_id | 1 << 31))
+    code, _, err = checked(tmp_path, more, 'file = "own.dbc"')
+    assert code == (2 if user else 0)
+    if user:
+        assert f"Voltage: id {can_id:X}h is used by {user}" in err
+    (tmp_path / "own.dbc").write_text(EXTENDED_DBC.format(number=can_id & 0x7FF))
+    assert checked(tmp_path, more, 'file = "own.dbc"')[0] == 0  # 11 bits: another frame
+
+
+def test_without_an_id_of_the_machine_the_names_have_to_differ(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("kontronik_can_gw.config.assemble.identity_digest", lambda: b"")
+    (warning,) = loaded().warnings
+    assert "give each gateway on a bus its own dronecan.name" in warning
+    nodes = loaded(2, per_esc_nodes=True).outputs[0].nodes  # type: ignore[attr-defined]
+    assert len({node.unique_id for node in nodes}) == 2
+
+
+def test_nothing_of_it_is_loaded_when_it_is_off() -> None:
+    code = (
+        "import sys\nfrom kontronik_can_gw.config.assemble import assemble\nfrom kontronik_can_gw.config.parse import parse\n"
+        "import kontronik_can_gw.cli.run, kontronik_can_gw.gateway, kontronik_can_gw.runtime.loop, kontronik_can_gw.capture.setup\n"
+        "assemble(parse({'can': {'interface': 'virtual'}, 'esc': [{'port': '/dev/ttyUSB0'}]}, 'a.toml'))\n"
+        "print([m for m in sys.modules if 'dronecan' in m or m == 'hashlib'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("canopen", [False, True])
+def test_other_outputs_send_what_they_send_without_it(canopen: bool) -> None:
+    """Every 11-bit frame, its bytes and its time; SDO answers too."""
+    found = []
+    for enabled in (True, False):
+        bench = Bench(
+            2, given=loaded(2, dbc=True, canopen=canopen, enabled=enabled, extended_hz=33)
+        )
+        rng = random.Random(6)
+        for _ in range(80):
+            bench.live = [
+                LIVE._replace(
+                    electrical_speed=rng.randrange(70_000), operating_errors=1 << rng.randrange(24)
+                )
+                if rng.random() < 0.9
+                else None
+                for _ in range(2)
+            ]
+            bench.run(0.1)
+            if canopen:
+                bench.receive(*answers_of(rng))
+        found.append([each for each in bench.frames if not each[1].extended])
+        assert bool([each for each in bench.frames if each[1].extended]) == enabled
+    assert found[0] == found[1]
+    assert len(found[0]) > 1000
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("node_id", [42, 0])
+def test_a_replay_is_identical_to_the_run(seed: int, node_id: int) -> None:
+    """On a bus where anything comes, with node-IDs of an allocator too; at its seed, from the bytes of the capture."""
+    setup, layout = capture_bench.made(2, canopen=bool(seed), dronecan=ON | {"node_id": node_id})
+    bench = capture_bench.Bench(setup, layout).live(seed, 6)
+    frames = [frame for frame in replayed(bench) if not frame.received]
+    assert frames == bench.sent
+    assert sum(each.frame.extended for each in frames) > (0 if node_id == 0 else 300)
+
+
+def header() -> dict[str, object]:
+    setup, _ = capture_bench.made(2, dronecan=ON)
+    found: dict[str, object] = json.loads(json.dumps(setup.header()))
+    return found
+
+
+def test_the_header_makes_the_same_nodes_on_any_machine() -> None:
+    setup, _ = capture_bench.made(2, dronecan=ON)
+    again = CaptureSetup.of(json.loads(json.dumps(setup.header())))
+    assert again.outputs == setup.outputs
+    old = header()
+    del old["outputs"]  # as in a capture of 0.5.0
+    assert CaptureSetup.of(old).outputs == ()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"xyzzy": {}},
+        {"dronecan": {}},
+        {"dronecan": 7},
+        {"dronecan": {"table": {"rate_hz": 0}}},
+        {"dronecan": {"table": {"name": "ä" * 3000}}},
+        {"dronecan": {"table": {"first_index": 31}}},
+        {"dronecan": {"identity": "zz"}},
+        {"dronecan": {"seed": -1}},
+        {"dronecan": {"version": 6}},
+        {"dronecan": {"version": "x.y"}},
+        {"dronecan": {"version": [1, 2, 3]}},
+        7,
+    ],
+)
+def test_a_header_that_no_recorder_wrote_is_refused(change: object) -> None:
+    made = header()
+    if isinstance(change, dict) and isinstance(of := change.get("dronecan"), dict) and of:
+        held = made["outputs"]["dronecan"]  # type: ignore[index]
+        change = {
+            "dronecan": held | {k: held[k] | v if isinstance(v, dict) else v for k, v in of.items()}
+        }
+    made["outputs"] = change
+    with pytest.raises(ValueError, match="the header cannot be used"):
+        CaptureSetup.of(made)
+
+
+def document(bench: Bench) -> dict[str, object]:
+    return snapshot(
+        gateway_facts(bench.gateway),
+        now=bench.now,
+        wall=time.time(),
+        program=program_facts("a.toml"),
+        process=ProcessFacts(),
+        ports=[PortFacts(esc.settings.name, "/dev/x", True) for esc in bench.gateway.escs],
+        can=CanFacts("socketcan", "can0", 1_000_000, True),
+    )
+
+
+def test_status_shows_the_nodes() -> None:
+    bench = Bench(2, per_esc_nodes=True).run(1)
+    made = document(bench)
+    facts = made["outputs"]["dronecan"]  # type: ignore[index]
+    assert [node["node_id"] for node in facts["nodes"]] == [42, 43]
+    assert facts["status_sent"] == 100
+    json.dumps(made)
+    seen = status.judge(Path("status.json"), made, bench.now)
+    shown = "\n".join(line.plain for line in status.lines_of(seen))
+    assert "DroneCAN 42 kontronik_can_gw.e0: operational" in shown
+    waiting = Bench(node_id=0).run(2.5)
+    shown = "\n".join(
+        line.plain
+        for line in status.lines_of(status.judge(Path("s"), document(waiting), waiting.now))
+    )
+    assert (
+        "DroneCAN kontronik_can_gw: waits for a node-ID, 2 requests" in shown
+        or "3 requests" in shown
+    )

@@ -1,0 +1,182 @@
+"""What a node of ours answers: asked by the package ``dronecan``, by too many, and by what is no request."""
+
+import pytest
+from dronecan_bench import LIVE, Bench, Peer, Reader, dronecan, loaded, peers_frames
+
+from kontronik_can_gw.dronecan.nodes import MAX_ANSWERS
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.frames import EXTENDED, CanFrame, id_block
+from kontronik_can_gw.gateway import Gateway
+
+protocol = dronecan.uavcan.protocol
+GetSet = protocol.param.GetSet
+
+
+def test_node_info_says_who_it_is() -> None:
+    bench = Bench(2, per_esc_nodes=True, name="com.example.gw").run(2.2)
+    peer = Peer(bench)
+    infos = [peer.ask(protocol.GetNodeInfo.Request(), node_id) for node_id in (42, 43)]
+    assert [bytes(info.name.to_bytes()) for info in infos] == [
+        b"com.example.gw.e0",
+        b"com.example.gw.e1",
+    ]
+    ids = [bytes(info.hardware_version.unique_id.to_bytes()) for info in infos]
+    assert len(set(ids)) == 2
+    assert all(any(each) for each in ids)
+    assert infos[0].status.uptime_sec == 2
+    assert infos[0].hardware_version.major == 1
+    other = Bench(given=loaded(name="com.example.gw.e0"))  # the same name: the same on this machine
+    again = Peer(other.run(0.1)).ask(protocol.GetNodeInfo.Request(), 42)
+    assert bytes(again.hardware_version.unique_id.to_bytes()) == ids[0]
+
+
+def value(answer: object) -> object:
+    """What a GetSet response holds; None for an empty one."""
+    kind = dronecan.get_active_union_field(answer.value)  # type: ignore[attr-defined]
+    if kind == "empty":
+        return None
+    found = getattr(answer.value, kind)  # type: ignore[attr-defined]
+    return bytes(found.to_bytes()).decode() if kind == "string_value" else found
+
+
+def test_parameters_are_listed_and_read_by_name() -> None:
+    bench = Bench(2, first_index=4, rpm="output").run(0.1)
+    peer = Peer(bench)
+    listed = []
+    for index in range(100):
+        answer = peer.ask(GetSet.Request(index=index), 42)
+        if not len(answer.name):
+            assert value(answer) is None
+            break
+        listed.append((bytes(answer.name.to_bytes()).decode(), value(answer)))
+    expected = [("rate_hz", 50), ("extended_hz", 0), ("rpm", "output")]
+    for number in (0, 1):
+        expected += [(f"e{number}.esc_index", 4 + number), (f"e{number}.pole_pairs", 7)]
+        expected += [(f"e{number}.gear", pytest.approx(10))]
+    assert listed == expected
+    for name, held in listed:
+        request = GetSet.Request(index=77)
+        request.name.from_bytes(name.encode())
+        assert value(peer.ask(request, 42)) == held
+    request = GetSet.Request()
+    request.name.from_bytes(b"xyzzy")
+    assert not len(peer.ask(request, 42).name)
+
+
+def test_what_somebody_sets_stays_as_it_is() -> None:
+    bench = Bench(rate_hz=25).run(0.1)
+    peer = Peer(bench)
+    for field, given in (("integer_value", 1), ("real_value", 2.5), ("boolean_value", 1)):
+        request = GetSet.Request(index=0)
+        setattr(request.value, field, given)
+        assert value(peer.ask(request, 42)) == 25
+    request = GetSet.Request()
+    request.value.string_value.from_bytes(b"electrical")
+    request.name.from_bytes(b"rpm")
+    assert value(peer.ask(request, 42)) == "motor"
+    bench.clear()
+    assert len(bench.run(1).of("Status")) == 25
+
+
+def test_a_restart_is_refused() -> None:
+    bench = Bench().run(0.1)
+    request = protocol.RestartNode.Request(magic_number=protocol.RestartNode.Request().MAGIC_NUMBER)
+    assert not Peer(bench).ask(request, 42).ok
+
+
+def test_nothing_that_an_autopilot_commands_is_received() -> None:
+    """RawCommand and the others that drive an ESC: our filters let none of them in."""
+    bench = Bench(4, per_esc_nodes=True, node_id=0)
+    blocks = bench.gateway.receive_ids
+    assert blocks
+    for kind in (1030, 1031, 1010, 1011):  # RawCommand, RPMCommand, actuator commands
+        for priority in range(32):
+            for source in range(1, 128):
+                key = EXTENDED | priority << 24 | kind << 8 | source
+                assert not any(not (key ^ b) & 0xFFFFFFFF & ~(b >> 32) for b in blocks)
+
+
+def test_requests_that_never_end_are_answered_now_and_then() -> None:
+    bench = Bench().run(0.5)
+    for _ in range(2000):
+        bench.receive(*peers_frames(protocol.GetNodeInfo.Request(), 100, to=42))
+    facts = bench.output.facts()
+    assert facts["requests_answered"] == MAX_ANSWERS
+    assert facts["requests_unanswered"] == 2000 - MAX_ANSWERS
+    bench.run(1)
+    assert Peer(bench).ask(protocol.GetNodeInfo.Request(), 42) is not None
+    assert len(bench.of("Status")) > 70  # measurements went on
+
+
+@pytest.mark.parametrize(
+    "data", ["", "00", "0004", "000405", "0001000000", "0005", "0007", "00040a41"]
+)
+def test_a_get_set_request_that_is_cut_off_is_no_request(data: str) -> None:
+    bench = Bench().run(0.1)
+    bench.clear()
+    payload = bytes.fromhex(data)
+    bench.receive(CanFrame(0x1E0BAAE4, payload + b"\xc0", True))
+    answers = [frame for _, frame in bench.frames if frame.can_id & 0x80]
+    assert not answers
+    assert Peer(bench).ask(GetSet.Request(index=0), 42) is not None
+
+
+def test_another_device_with_our_node_id_is_reported_and_we_go_on() -> None:
+    bench = Bench(2, per_esc_nodes=True, canopen=True, dbc=True).run(0.5)
+    taken = bench.gateway.conflicts.take
+    bench.receive(*peers_frames(protocol.NodeStatus(), 43))
+    (begun,) = taken()
+    assert begun.ids == "29-bit ids with 2Bh in their bits 7Fh"
+    assert begun.whose == "DroneCAN node-ID 43"
+    states = [node["state"] for node in bench.output.facts()["nodes"]]
+    assert states == ["operational", "another device has this node-ID"]
+    bench.run(1)
+    assert [bench.of("NodeStatus", node)[-1].payload.health for node in (42, 43)] == [0, 1]
+    emergencies = [frame for _, frame in bench.frames if 0x81 <= frame.can_id <= 0xFF]
+    assert not emergencies  # it is no node-ID of CANopen
+    for source in (43, 43, 43):  # of any type and priority: one conflict
+        bench.receive(*peers_frames(protocol.debug.LogMessage(), source, priority=3))
+    assert not taken()
+    bench.run(11)
+    assert [each.over for each in taken()] == [True]
+    assert {node["state"] for node in bench.output.facts()["nodes"]} == {"operational"}
+
+
+def test_blocks_of_ids_are_told_apart() -> None:
+    gateway: Gateway = Bench(per_esc_nodes=True, escs=2).gateway
+    own = {id_block(node, 0x7F) for node in (42, 43)}
+    asked = {id_block(0x8080 | node << 8, 0xFF80) for node in (42, 43)}
+    assert gateway.receive_ids == own | asked
+    assert id_block(0x1FFFFFFF, 0x7F) == id_block(0x7F, 0x7F)
+
+
+def test_the_foreign_monitor_sees_the_nodes() -> None:
+    bench = Bench(2, per_esc_nodes=True)
+    peer = Peer(bench)
+    monitor = dronecan.app.node_monitor.NodeMonitor(peer.node)
+    for _ in range(30):
+        bench.run(0.1)
+        peer.spin()
+    seen = {entry.node_id: entry for entry in monitor.find_all(lambda _: True)}
+    assert set(seen) == {42, 43}
+    for entry in seen.values():
+        assert entry.status.health == entry.status.HEALTH_OK
+        assert entry.status.mode == entry.status.MODE_OPERATIONAL
+        assert entry.info is not None
+
+
+def test_a_reader_of_another_hand_finds_no_fault_in_a_long_run() -> None:
+    """Every frame belongs to a transfer that is whole and of a type that is known; transfer ids count on."""
+    bench = Bench(3, extended_hz=20)
+    reader = Reader()
+    for turn in range(40):
+        bench.live[turn % 3] = LIVE._replace(operating_errors=1 << turn % 24)
+        bench.run(0.5)
+    ids: dict[int, int] = {}
+    for at, frame in bench.frames:
+        reader.read(at, frame)
+        if frame.data[-1] & 0x80:
+            number = frame.data[-1] & 0x1F
+            assert number == (ids.get(frame.can_id, number - 1) + 1) % 32
+            ids[frame.can_id] = number
+    assert bench.now > 20 * SECOND
