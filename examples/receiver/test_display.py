@@ -18,7 +18,7 @@ def display() -> Iterator[Display]:
 
 
 def test_telemetry_is_shown(bench: Bench, display: Display) -> None:
-    bench.plug_in("--cells", "6")
+    bench.plug_in()
     until(lambda: display.shown("BatteryVoltage"))
     voltage = display.shown("BatteryVoltage")
     assert isinstance(voltage, float)

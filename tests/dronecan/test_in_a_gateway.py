@@ -46,16 +46,20 @@ BA_DEF_DEF_ "GenMsgCycleTime" 100;
 
 
 def checked(
-    folder: Path, more: str = "", dbc: str = "enabled = false", bitrate: int = 1_000_000
+    folder: Path,
+    more: str = "",
+    *words: str,
+    dbc: str = "enabled = false",
+    bitrate: int = 1_000_000,
 ) -> tuple[object, str, str]:
     file = folder / "a.toml"
     file.write_text(TOML.format(more=more, dbc=dbc, bitrate=bitrate))
-    done = run("check", "-c", file)
+    done = run("check", "-c", file, *words)
     return done.code, done.out, done.err
 
 
 def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
-    code, out, err = checked(tmp_path, "node_id = 42\nfirst_index = 4\nextended_hz = 10")
+    code, out, err = checked(tmp_path, "node_id = 42\nfirst_index = 4\nextended_hz = 10", "-v")
     assert (code, err) == (0, "")
     lines = out.splitlines()
     (node,) = [line for line in lines if line.startswith("node 42, kontronik_can_gw, unique id")]
@@ -64,7 +68,7 @@ def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
     assert "rpm is motor_speed, at most 131071" in out
     # 2 x (50 x (8, 8, 3 bytes) + 10 x 8 bytes + 8 + 6 bytes) + 8 bytes, 29 bits, worst stuffing
     bits = 2 * (50 * (160 + 160 + 110) + 10 * 160 + 160 + 140) + 160
-    assert f"# bus load {bits / 1e6:.1%} of 1000 kbit/s: 325 frames/s" in out
+    assert f"bus load  {bits / 1e6:.1%}, 325 frames/s" in out
 
 
 @pytest.mark.parametrize(
