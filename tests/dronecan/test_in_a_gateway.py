@@ -120,12 +120,12 @@ def test_a_dbc_whose_ids_are_frames_of_our_node_is_refused(
     tmp_path: Path, can_id: int, more: str, user: str
 ) -> None:
     (tmp_path / "own.dbc").write_text(EXTENDED_DBC.format(number=can_id | 1 << 31))
-    code, _, err = checked(tmp_path, more, 'file = "own.dbc"')
+    code, _, err = checked(tmp_path, more, dbc='file = "own.dbc"')
     assert code == (2 if user else 0)
     if user:
         assert f"Voltage: id {can_id:X}h is used by {user}" in err
     (tmp_path / "own.dbc").write_text(EXTENDED_DBC.format(number=can_id & 0x7FF))
-    assert checked(tmp_path, more, 'file = "own.dbc"')[0] == 0  # 11 bits: another frame
+    assert checked(tmp_path, more, dbc='file = "own.dbc"')[0] == 0  # 11 bits: another frame
 
 
 def test_without_an_id_of_the_machine_the_names_have_to_differ(
