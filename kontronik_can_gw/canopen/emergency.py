@@ -2,8 +2,8 @@
 
 from collections import deque
 from collections.abc import Callable
-from functools import partial, reduce
-from operator import or_
+from functools import partial
+from struct import Struct
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
@@ -22,6 +22,7 @@ from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.output import NEVER
 
 _MAX_PENDING = 64
+_DATA = Struct("<HBBI")
 
 
 class Emergencies:
@@ -48,8 +49,8 @@ class Emergencies:
         self.mask = 0xFFFFFFFF
         self._inhibit_ns = 0
         self._word = 0  # of the ESC
-        self._registered: set[int] = set()
-        """Codes of the ESC's bits that set bits of 1001h."""
+        self._registered = 0
+        """Bits of 1001h that the ESC's error word sets."""
         self._active: dict[Condition, None] = {}
         self._unreported: dict[Condition, None] = {}
         self._last_is_error = False  # what was sent last is an error, not 0000h
@@ -82,8 +83,10 @@ class Emergencies:
     @property
     def register(self) -> int:
         """1001h."""
-        codes = {condition.code for condition in self._active} | self._registered
-        return reduce(or_, map(register_of, codes), 0)
+        found = self._registered
+        for condition in self._active:
+            found |= register_of(condition.code)
+        return found
 
     @property
     def code(self) -> int:
@@ -99,9 +102,7 @@ class Emergencies:
         if word == self._word and not force:
             return
         self._word = word
-        bits, code = self._bits.reported(word, self.mask), self._bits.code
-        self._registered = self._bits.registered(word, self.mask)
-        wanted = {Condition(code(bit), bit, 0): None for bit in range(32) if bits >> bit & 1}
+        wanted, self._registered = self._bits.of(word, self.mask)
         gone = [c for c in self._active if c.source != FROM_GATEWAY and c not in wanted]
         for condition in gone:
             del self._active[condition]
@@ -202,13 +203,13 @@ class Emergencies:
 
     def _report(self, condition: Condition | None) -> None:
         if condition is None:
-            head, tail = bytes((0, 0, self.register, FROM_GATEWAY)), bytes(4)
+            data = _DATA.pack(0, self.register, FROM_GATEWAY, 0)
         else:
-            head = condition.code.to_bytes(2, "little") + bytes((self.register, condition.source))
-            from_gateway = condition.source == FROM_GATEWAY
-            tail = (condition.detail if from_gateway else self._word).to_bytes(4, "little")
+            code, source, detail = condition
+            last = detail if source == FROM_GATEWAY else self._word
+            data = _DATA.pack(code, self.register, source, last)
         # the newest is never the one that finds no room
-        self._pending.append((condition, head + tail))
+        self._pending.append((condition, data))
 
     # --- objects
 

@@ -6,8 +6,9 @@
     error code   1001h   ESC bit number, FFh: gateway   ESC's error word; gateway: byte 4 says which, see GatewayError
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import Enum, IntFlag
+from functools import lru_cache
 from typing import NamedTuple, Self
 
 from kontronik_can_gw.esc.decoder import ErrorBit, Severity
@@ -25,12 +26,18 @@ class Register(IntFlag):
 
 
 _REGISTER_OF_CLASS = {
-    0x2: Register.CURRENT,
-    0x3: Register.VOLTAGE,
-    0x4: Register.TEMPERATURE,
-    0x8: Register.COMMUNICATION,
-    0xF: Register.MANUFACTURER,
+    of_class: int(Register.GENERIC | bit)
+    for of_class, bit in {
+        0x2: Register.CURRENT,
+        0x3: Register.VOLTAGE,
+        0x4: Register.TEMPERATURE,
+        0x8: Register.COMMUNICATION,
+        0xF: Register.MANUFACTURER,
+    }.items()
 }
+_GENERIC = int(Register.GENERIC)
+_MAX_WORDS = 256
+"""Error words of which the emergencies are kept."""
 FROM_GATEWAY = 0xFF
 
 
@@ -91,7 +98,16 @@ class Condition(NamedTuple):
 
 def register_of(code: int) -> int:
     """The bits of 1001h that an error code sets: the generic one and that of its class."""
-    return int(Register.GENERIC | _REGISTER_OF_CLASS.get(code >> 12, 0))
+    return _REGISTER_OF_CLASS.get(code >> 12, _GENERIC)
+
+
+class Reported(NamedTuple):
+    """What is said of an ESC's error word."""
+
+    conditions: tuple[Condition, ...]
+    """Those that get an emergency, by their bits."""
+    register: int
+    """The bits of 1001h that it sets."""
 
 
 class BitCodes:
@@ -106,20 +122,28 @@ class BitCodes:
         ]
         self._summary_bits = sum(bit for bit, _ in self._summaries)
         self._error_bits = sum(1 << bit for bit in bits if bit.severity is Severity.ERROR)
+        self.of = lru_cache(_MAX_WORDS)(self._of)
+        """Of an error word and a mask: a bit in the mask gets an emergency, a summary bit only where it is not explained by another.
+
+        1001h shows all errors, and the warnings in the mask."""
 
     def code(self, bit: int) -> int:
         """The emergency code of a bit: a standard one where there is one, else FF00h + bit."""
         return self._codes.get(bit, 0xFF00 + bit)
 
-    def reported(self, word: int, mask: int) -> int:
-        """The bits that get an emergency: those in the mask, a summary bit only where it is not explained by another."""
+    def _of(self, word: int, mask: int) -> Reported:
+        summary_free = word & ~self._summary_bits
         bits = word & mask
         for summary, explained_by in self._summaries:
-            if word & explained_by & ~self._summary_bits:
+            if summary_free & explained_by:
                 bits &= ~summary
-        return bits
+        register = 0
+        for bit in _bits_of(summary_free & self._error_bits | bits):
+            register |= register_of(self.code(bit))
+        return Reported(
+            tuple(Condition(self.code(bit), bit, 0) for bit in _bits_of(bits)), register
+        )
 
-    def registered(self, word: int, mask: int) -> set[int]:
-        """The codes that set bits of 1001h: of all errors, and of the warnings in the mask."""
-        bits = word & self._error_bits & ~self._summary_bits | self.reported(word, mask)
-        return {self.code(bit) for bit in range(32) if bits >> bit & 1}
+
+def _bits_of(word: int) -> Iterator[int]:
+    return (bit for bit in range(32) if word >> bit & 1)

@@ -167,7 +167,7 @@ class Node:
     def on_event(self, events: int, now: int) -> None:
         """Something of the ESC changed: bits of telemetry.Event."""
         self._esc_objects.on_event(events, now)
-        self.set_due()
+        self.due = min(self.due, self.emergencies.due)  # the others move on at most
 
     def advance(self, now: int) -> None:
         """Let time pass."""

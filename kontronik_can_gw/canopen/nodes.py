@@ -130,8 +130,11 @@ class Nodes(Output):
         return self.due
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        self.nodes[esc].on_event(events, now)
-        self._after(now)
+        node = self.nodes[esc]
+        node.on_event(events, now)
+        if self.rerouted or self._to_watchers:
+            self._after(now)
+        self.due = min(self.due, node.due)
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         """The CAN controller's state changed, or it is down again before a frame was sent."""

@@ -102,8 +102,13 @@ class NativeCore:
         return Turns(self._handle.library, self._handle.core, len(self.escs))
 
     def follow(self, found: int, now: int) -> None:
-        """Follow an event that a turn came back with, and what else there is."""
-        self._handle.follow(found, now)
+        """Follow an event that a turn came back with; if there are others it comes back with each."""
+        self._follow(found >> 8, found & 0xFF, now)
+
+    def follow_others(self, now: int) -> None:
+        """Follow these, where the rest of the turn is the loop's."""
+        handle = self._handle
+        handle.follow(handle.library.kcg_next_event(handle.core), now)
 
     @property
     def is_pending(self) -> bool:

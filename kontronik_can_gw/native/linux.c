@@ -234,7 +234,8 @@ static int wait_for_turn(kcg_turns *t)
 /* A turn, or the rest of one after an event: until there is one (`found`), or to its end; false where something is left of it. */
 static int turn(kcg_turns *t)
 {
-    t->found = -1;
+    if (t->found >= 0)
+        t->found = kcg_next_event(t->core);
     while (t->at < t->ready && t->found < 0)
         if (!serve(t))
             return 0;

@@ -41,7 +41,7 @@ typedef struct {
 int kcg_watch(kcg_turns *t);
 void kcg_begin(kcg_turns *t);
 /* Turn until there is something for the loop: 0, and `fds` says what is ready; or until `found` is an event to be followed: 1. Then it is called
-   again, with the frames that the outputs have made of it in `frames`, or kcg_leave: the rest of the turn is the loop's. */
+   again (and asks kcg_next_event), with the frames that the outputs have made of it in `frames`, or kcg_leave: the rest of the turn is the loop's. */
 int kcg_turn(kcg_turns *t);
 void kcg_leave(kcg_turns *t);
 uint32_t kcg_turns_size(void);

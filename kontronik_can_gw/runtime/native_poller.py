@@ -84,6 +84,7 @@ class NativePoller(Poller):
         turns.begin()
         while turns.run():
             if not self._follow():
+                self._core.follow_others(state.now)
                 if state.size:
                     self._core.receive(*turns.read())
                 turns.leave()
