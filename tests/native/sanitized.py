@@ -10,7 +10,13 @@ import pytest
 from kontronik_can_gw.native.compile import compile_core, compiler
 from kontronik_can_gw.native.objects import OPTIONS
 
-_SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-wrapv")
+SANITIZED = (
+    "-g",
+    "-O1",
+    "-fsanitize=address,undefined",
+    "-fno-sanitize-recover=all",
+    "-fno-wrapv",
+)
 
 
 def run_sanitized(folder: Path, *command: str) -> str:
@@ -18,7 +24,7 @@ def run_sanitized(folder: Path, *command: str) -> str:
     program, target = compiler(), folder / "core.so"
     if program is None:
         pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev")
-    assert compile_core(target, ("-g", "-O1", *_SANITIZERS, *OPTIONS)) is None
+    assert compile_core(target, (*SANITIZED, *OPTIONS)) is None
     asked = [[program, f"-print-file-name=lib{name}.so"] for name in ("asan", "ubsan")]
     found = [subprocess.run(each, capture_output=True, text=True, check=True) for each in asked]
     environment = os.environ | {

@@ -8,12 +8,14 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 import wire_world
 from dialogue import shipped_eds
 from equality import layout, settings, stream
+from sanitized import run_sanitized
 
 from kontronik_can_gw.canopen.cob_ids import EMERGENCY, HEARTBEAT
 from kontronik_can_gw.canopen.node_settings import NodeSettings
@@ -249,3 +251,34 @@ def test_where_the_bus_does_not_take_all_the_newest_values_are_sent(
         assert all(any(data == other for other in all_of_it) for data in got)
     waiting = len(world.loop.can.transmitter.queue)
     assert status.sent_frames + status.replaced_frames + waiting == len(replayed)
+
+
+@pytest.mark.extended
+def test_turns_and_hold_ups_touch_nothing_outside_their_memory_and_nothing_is_undefined(
+    tmp_path: Path,
+) -> None:
+    found = run_sanitized(tmp_path, "-c", _UNDER_SANITIZERS)
+    assert all(int(count) > 50 for count in found.split()), found
+
+
+_UNDER_SANITIZERS = """
+import os, pathlib, sys
+del os.environ["LD_PRELOAD"]  # the compiler needs none
+os.environ["KONTRONIK_PURE"] = "0"
+import pytest, native_world, sanitized, test_hold_ups, test_turns_in_c
+from kontronik_can_gw.native import binding, load
+
+patch = pytest.MonkeyPatch()
+plain = binding.load(pathlib.Path(sys.argv[1]))
+patch.setattr(load, "library", lambda: (plain, ""))
+for seed, is_slow, has_nodes in ((0, False, True), (1, True, False), (5, False, True)):
+    with pytest.MonkeyPatch.context() as each:
+        world = test_turns_in_c.World(seed, is_slow, each, has_nodes)
+        world.run(80)
+        print(len(world.received))
+faked = native_world.library(sanitized.SANITIZED)
+patch.setattr(native_world, "library", lambda: faked)
+hold_ups = test_hold_ups.test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true
+for seed in range(3):
+    hold_ups.hypothesis.inner_test(seed, 60, 10, 0.05, seed % 2, seed % 3)
+"""

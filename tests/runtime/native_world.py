@@ -37,12 +37,12 @@ class _Kernel(c.Structure):
 
 
 @cache
-def library() -> Any:
+def library(flags: tuple[str, ...] = ("-O1",)) -> Any:
     """The core in C with this kernel."""
     names = [f"-D{call}=fake_{call}" for call in (*_CALLS, "sendmmsg")]
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder, "core.so")
-        assert compile_core(target, ("-O1", *OPTIONS, *names, str(_KERNEL))) is None
+        assert compile_core(target, (*flags, *OPTIONS, *names, str(_KERNEL))) is None
         return load(target)
 
 
