@@ -3,7 +3,6 @@
 #include <string.h>
 
 #define SECOND INT64_C(1000000000)
-#define BYTE_NS (11 * SECOND / 115200)
 #define INFO_TIMEOUT (10 * SECOND)
 #define MIN_DISTANCE INT64_C(1000000)
 #define LONG_AGO (-(INT64_C(1) << 61))
@@ -1139,7 +1138,7 @@ static int accept_next(kcg *g)
         return 0;
     const kcg_found *f = &g->found[g->found_at++];
     kcg_esc *e = &g->esc[g->read_esc];
-    int64_t after = (g->read_end - f->end) * BYTE_NS, limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
+    int64_t after = (g->read_end - f->end) * KCG_BYTE_NS, limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
     if (g->read_now - g->read_bound + after > limit) /* the bytes after it in the same read make it old already */
         e->count[KCG_N_LATE]++;
     else
@@ -1194,7 +1193,7 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     g->again = 0;
     if (e->arrivals && now - e->arrival_bound[0] > e->settings.timeout)
         flush(NULL, e);
-    int64_t bound = earlier(now, since + ((int64_t)size - 1) * BYTE_NS); /* a pseudo terminal is faster than the wire */
+    int64_t bound = earlier(now, since + ((int64_t)size - 1) * KCG_BYTE_NS); /* a pseudo terminal is faster than the wire */
     g->read_esc = esc;
     g->read_now = now;
     g->read_bound = bound;

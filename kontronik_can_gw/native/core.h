@@ -38,6 +38,7 @@
 #endif
 enum { KCG_HELD = 43, KCG_BODY = 33, KCG_LONGEST = 44, KCG_PAGES = 64 };
 #define KCG_NEVER INT64_MAX
+#define KCG_BYTE_NS (11 * INT64_C(1000000000) / 115200) /* of a byte on the wire: 8E1 */
 
 /* Events of an ESC (telemetry.Event), and states of its link (telemetry.LinkState). */
 enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8, KCG_NEW_STATE = 16 };

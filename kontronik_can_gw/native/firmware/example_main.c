@@ -78,7 +78,6 @@ static void turn(void)
 /* --- the three hooks, of a PC ---------------------------------------------------------------------------------------- */
 
 #define MS INT64_C(1000000)
-#define BYTE_NS (11 * 1000 * MS / 115200)
 
 static int64_t simulated;
 
@@ -118,7 +117,7 @@ int main(int argc, char **argv)
     start();
     for (; simulated <= end; simulated += MS) {
         for (int esc = 0; esc < KCG_ESCS; esc++)
-            for (; line[esc] && due[esc] <= simulated; due[esc] += BYTE_NS) {
+            for (; line[esc] && due[esc] <= simulated; due[esc] += KCG_BYTE_NS) {
                 int byte = getc(line[esc]);
                 if (byte == EOF)
                     fclose(line[esc]), line[esc] = NULL;
