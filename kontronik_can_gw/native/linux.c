@@ -15,7 +15,6 @@
 #define MS INT64_C(1000000)
 #define MAX_FULL (250 * MS) /* how long the bus may take nothing */
 #define ASK_ALL (10 * MS) /* by how much values may seem older, where others come meanwhile, for the sake of fewer questions */
-#define BYTE_NS (11 * INT64_C(1000000000) / 115200)
 enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72 };
 
 static int64_t now_ns(void)
@@ -51,7 +50,7 @@ static int fetch(kcg_turns *t, int fd, kcg_input *in)
     in->served = 1;
     t->size = (uint32_t)size;
     t->since = in->undrained != KCG_DRAINED ? in->undrained : in->asked;
-    int64_t passed = t->since + size * BYTE_NS;
+    int64_t passed = t->since + size * KCG_BYTE_NS;
     in->undrained = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked at the turn's end */
     note(t, KCG_NOTE_BYTES, in->esc, t->data, t->size, t->since);
     return 1;
@@ -142,11 +141,11 @@ static int transmit(kcg_turns *t)
         if (t->unsent && !t->is_full) {
             uint32_t waiting = t->unsent;
             int went = hand_over(t), is_full = went < 0 && errno == EAGAIN;
+            if (t->unsent < waiting || !before || !is_full)
+                t->full_since = t->now;
             if (t->unsent && (!is_full || t->records || t->spoken))
                 return 0;
             kcg_gateway(t->core)[KCG_SEND_FAILURES] += is_full;
-            if (t->unsent < waiting || !before)
-                t->full_since = t->now;
             watch_room(t, is_full);
         }
     } while (kcg_pending(t->core) && !t->unsent);

@@ -94,7 +94,7 @@ class NativePoller(Poller):
         if recorded is not None:
             recorded.turned(turns.entries(), state.taken)
         if state.unsent:
-            can.transmitter.put(turns.unsent())
+            can.transmitter.put_refused(turns.unsent(), state.full_since)
         if state.found >= 0 and state.advanced:  # it ends at its own time, as in a replay
             self._core.advance_in_python(state.now)
             gateway.advance(state.now, with_core=False)

@@ -55,6 +55,11 @@ class Transmitter:
         if self.queue.put_all(frames):
             self._count_losses()
 
+    def put_refused(self, frames: Sequence[CanFrame], since: int) -> None:
+        """The same for frames that a turn in C could not send; the port has taken nothing ``since`` then."""
+        self._busy_since = since
+        self.put(frames)
+
     def transmit(self, port: CanPort, now: int) -> Sent | None:
         """Hand over what waits, as far as the port takes it, and return its answer: GONE also where it was busy for too long.
 
@@ -104,12 +109,14 @@ class Transmitter:
     def _busy(self, port: CanPort, answer: Sent, now: int) -> Sent:
         """The port takes no more for now; GONE if it has not for so long that it must be."""
         self._busy_since = self._busy_since or now
-        if now - self._busy_since > LASTING_BUSY_NS:
+        waits = LASTING_BUSY_NS - (now - self._busy_since)
+        if waits <= 0:
             if not port.reports_full:
                 return Sent.GONE
             self._stall(now)
         # a full one becomes writable when there is room
-        self.due = now + (LASTING_BUSY_NS if answer is Sent.FULL else BUSY_RETRY_NS)
+        lasting = waits if waits > 0 else LASTING_BUSY_NS
+        self.due = now + (lasting if answer is Sent.FULL else BUSY_RETRY_NS)
         return answer
 
     def _stall(self, now: int) -> None:

@@ -264,3 +264,14 @@ def test_in_the_middle_of_a_turn_the_rest_is_late_too_but_answers_are_not_lost(
         if int.from_bytes(data[:3], "little") == number and can_id == SPEED
     ] == []
     assert any(can_id == SPEED for can_id, _ in late), "and told that there is nothing"
+
+
+def test_a_bus_that_takes_nothing_is_reported_after_a_second(bench: Bench) -> None:
+    bench.world.bus.frame_ns = 10 * SECOND  # a few are in the kernel, and stay there
+    wire, begun = bench.wire, bench.world.now
+    wire.stream(begun, begun + 2 * SECOND, 10 * MS)
+    transmitter = bench.loop.can.transmitter
+    bench.run(990 * MS)
+    assert not transmitter.is_stalled
+    bench.run(60 * MS)
+    assert transmitter.is_stalled
