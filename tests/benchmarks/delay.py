@@ -45,11 +45,12 @@ file = "status.json"
 
 @benchmark("delay-full", "the same with 8 ESCs, recorder, statistics, CANopen and a polling master")
 def full(context: Context) -> list[Figure]:
-    """8 ESCs with recorder, status file, CANopen nodes and a master that polls them."""
+    """8 ESCs with recorder, status file, CANopen nodes and a master that asks 200 times a second for one of 20 objects."""
     runs = [once(context, "ours", 8, "--sdo", config=EVERYTHING) for _ in range(context.rounds)]
     context.data["runs"] = [run.result for run in runs]
     asked = sum(run.result["sdo_sent"] for run in runs)
     answered = sum(run.result["sdo_answers"] for run in runs)
+    lost = max(0, asked - answered - len(runs))  # the last of each run may be on its way
     answer = median([run.result["sdo_us"]["p99"] for run in runs])
     if not answered:
         raise RuntimeError("the nodes answered no SDO request")
@@ -57,12 +58,8 @@ def full(context: Context) -> list[Figure]:
     return [
         Figure("8 ESCs and all, median", of_runs(runs, "p50"), "us"),
         judged("8 ESCs and all, 99 %", of_runs(runs, "p99"), "us", "<= 1000", longest),
-        Figure(
-            "SDO answers, 99 %",
-            answer,
-            "us",
-            note=f"{asked} requests, {asked - answered} without one in 50 ms",
-        ),
+        Figure("SDO answers, 99 %", answer, "us"),
+        Figure("SDO requests not answered", lost, f"of {asked}", "0", lost == 0),
         Figure(
             "CPU, all of it", median([run.cpu_us for run in runs]), "us/frame", note=losses(runs)
         ),

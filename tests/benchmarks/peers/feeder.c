@@ -7,7 +7,7 @@
    five.dbc is compared with what the frames written say it must hold, in their order. The delay is from the write of a frame's last byte
    to the receipt of the fifth CAN frame that belongs to it.
    --file: write these pieces (feed_file) to the one ESC in place of live frames; the received frames go to standard output as lines
-   "ID DATA" in hex. --sdo: be a CANopen master that uploads 1018h:1 of nodes 1..N twenty times a second each. */
+   "ID DATA" in hex. --sdo: be a CANopen master that asks nodes 1..N in turn, 200 times a second in all, for 20 objects. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <poll.h>
@@ -282,16 +282,18 @@ static void *receiver(void *nothing)
 static void *master(void *nothing)
 {
     int64_t next = now_ns();
+    uint32_t asked = 0;
     (void)nothing;
     while (!stopping) {
         for (int i = 0; i < count && !stopping; i++) {
-            struct can_frame frame = {.can_id = 0x601 + i, .can_dlc = 8, .data = {0x40, 0x18, 0x10, 1}};
+            uint32_t n = asked++ / (uint32_t)count % 20; /* 2000h:1..10h, then 2020h:1..4 */
+            struct can_frame frame = {.can_id = 0x601 + i, .can_dlc = 8, .data = {0x40, n < 16 ? 0 : 0x20, 0x20, n % 16 + 1}};
             sdo_missed += sdo_at[i] != 0;
             sdo_at[i] = now_ns();
             sdo_sent++;
             if (send(bus, &frame, sizeof frame, 0) < 0)
                 return NULL;
-            next += 50000000 / count;
+            next += 5000000;
             sleep_until(next);
         }
     }
