@@ -63,7 +63,8 @@ def odd(chance: random.Random, last: Entry) -> Entry:
 
 def write_capture(chance: random.Random, path: Path, version: int = 2) -> Path:
     """A capture in which everything happens; in part damaged."""
-    bench = Bench(*made(chance.randint(1, 3), of_esc=lambda number: esc(chance, number)))
+    nodes = chance.random() < 0.4
+    bench = Bench(*made(chance.randint(1, 3), nodes, lambda number: esc(chance, number)))
     bench.live(chance.randrange(1000), 6)
     entries = [bench.entries[0]]
     for entry in bench.entries[1:]:

@@ -66,7 +66,8 @@ class CaptureInput(CaptureFiles):
     def batches(self, marked: bool = False) -> "Iterator[list[TimedFrame] | Frames]":
         """``marked``: the gateway's state in the frames is REPLAY."""
         found, player, now = None, None, self._created_ns
-        if self._is_for_c:
+        has_frames_of_its_own = self.setup.canopen is not None or self.setup.outputs
+        if self.setup.version > 1 and not has_frames_of_its_own:
             found = player_of(lambda _: self.setup.gateway(self.sent_layout, now), None, (), now)
         if found is None:
             gateway = self.setup.gateway(self.sent_layout, now)
@@ -99,7 +100,7 @@ class CaptureInput(CaptureFiles):
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:
         fields = [self.fields[index] for index in self._chosen(chosen)]
         found = None
-        if self._is_for_c:
+        if self.setup.version > 1:
             now = self._created_ns
             found = player_of(self._silent_gateway, fields, self.bus.escs, now)
         return None if found is None else self._blocks_of(*found)
@@ -121,12 +122,6 @@ class CaptureInput(CaptureFiles):
         for begin, end in pairwise(sorted({0, rows.count, *cuts})):
             wall_ns = self.wall_ns(times[begin])
             yield RowBlock(rows, begin, end, wall_ns=(wall_ns or 0) - times[begin])
-
-    @property
-    def _is_for_c(self) -> bool:
-        """The core in C may play it at full speed: no output has frames of its own, or changes settings."""
-        setup = self.setup
-        return setup.version > 1 and setup.canopen is None and not setup.outputs
 
     def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
         """Without messages; nodes are there, because they may change pole pairs and gear."""
