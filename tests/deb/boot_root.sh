@@ -1,15 +1,18 @@
 #!/bin/sh
-# Run by in_fresh_roots.py as root in a User Mode Linux: boots the systemd of a Debian root, read-only but for /run, /tmp and /var, which
-# are in memory. on_board.py runs in it, at the end of the boot.
-#   boot_root.sh ROOT OUTPUT-FOLDER
+# Run by in_fresh_roots.py as root in a User Mode Linux: boots the systemd of a Debian root, as it is or read-only with /var in memory.
+# SCRIPT of the output folder runs in it, at the end of the boot.
+#   boot_root.sh ROOT OUTPUT-FOLDER SCRIPT [ro]
 set -eu
-root=$1 out=$2
+root=$1 out=$2 script=$3
 ip link add vcan0 type vcan
 ip link set vcan0 up
 
 mount --rbind "$root" "$root"
-mount -o remount,bind,ro "$root"
-for folder in run tmp var; do mount -t tmpfs -o mode=755 tmpfs "$root/$folder"; done
+if [ "${4:-}" = ro ]; then
+    mount -o remount,bind,ro "$root"
+    mount -t tmpfs -o mode=755 tmpfs "$root/var"
+fi
+for folder in run tmp; do mount -t tmpfs -o mode=755 tmpfs "$root/$folder"; done
 mkdir -p "$root/var/log/journal" "$root/var/lib" "$root/var/tmp"
 mount --bind "$out" "$root/media"
 for folder in dev sys; do mount --rbind /$folder "$root/$folder"; done
@@ -22,7 +25,7 @@ cat >"$units/trial.service" <<X
 After=kontronik-can-gw.service
 [Service]
 Type=oneshot
-ExecStart=/usr/bin/python3 -B /media/on_board.py
+ExecStart=/usr/bin/python3 -B /media/$script
 StandardOutput=file:/media/said
 StandardError=inherit
 ExecStopPost=/bin/systemctl exit

@@ -234,17 +234,17 @@ def install_0_5_0(root: Root, work: Path) -> str:
     return text
 
 
-def booted(root: Root, work: Path) -> dict[str, Any]:
-    """What on_board.py saw after a boot of the root, read-only, in a virtual machine."""
-    out = work / f"{root.path.name}.out"
-    out.mkdir()
-    shutil.copy(HERE / "on_board.py", out)
+def booted(root: Root, out: Path, script: str, *how: str) -> dict[str, Any]:
+    """What a script saw after a boot of the root in a virtual machine; ``ro``: read-only, with /var in memory."""
+    out.mkdir(exist_ok=True)
+    for name in ("on_board.py", "on_upgrade.py"):
+        shutil.copy(HERE / name, out)
     command = [sys.executable, "-B", f"{PROJECT}/tests/vm/vm_run.py", "--backend", "uml"]
-    command += [f"--timeout={BOOT_LIMIT_S}", f"--rw={work}", "--"]
-    command += ["sh", f"{HERE}/boot_root.sh", str(root.path), str(out)]
+    command += [f"--timeout={BOOT_LIMIT_S}", f"--rw={root.path.parent}", "--"]
+    command += ["sh", f"{HERE}/boot_root.sh", str(root.path), str(out), script, *how]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    facts = out / "facts.json"
-    assert facts.exists(), done.stdout + done.stderr
+    facts, said = out / "facts.json", out / "said"
+    assert facts.exists(), done.stdout + done.stderr + (said.read_text() if said.exists() else "")
     found: dict[str, Any] = json.loads(facts.read_text())
     return found
 
@@ -253,6 +253,8 @@ def booted(root: Root, work: Path) -> dict[str, Any]:
 def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
     packages: dict[str, Path], root: Root, work: Path
 ) -> None:
+    for name in ("sysusers.d", "udev/rules.d"):  # systemd's, which this root lacks
+        (root.path / "etc" / name).mkdir(parents=True, exist_ok=True)
     before = root.files()
     configuration = install_0_5_0(root, work)
     said = root.install(packages["amd64"])
@@ -266,7 +268,7 @@ def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
     ]
     assert str((root.path / WANTS / UNIT).readlink()) == f"/usr/lib/systemd/system/{UNIT}"
 
-    facts = booted(root, work)
+    facts = booted(root, work / f"{root.path.name}.out", "on_board.py", "ro")
     assert facts["fresh"], facts["log"]
     assert "User=kontronik-can-gw\nActiveState=active\n" in facts["unit"]
     assert f"/lib/systemd/system/{UNIT}" in facts["unit"]
@@ -277,7 +279,7 @@ def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
     assert facts["writable"] == ["/var/lib"]
     assert f"{UNIT} is active" in facts["doctor"]
 
-    root.install(newer(packages["amd64"], work))
+    root.install(newer(packages["amd64"], work / "newer"))
     assert root.text(CONFIGURATION) == configuration
     assert "99" in root.run("dpkg-query", "-W", "kontronik-can-gw")
     root.run("apt-get", "remove", "-y", "kontronik-can-gw")
@@ -287,15 +289,39 @@ def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
     purge(root, before)
 
 
-def newer(package: Path, work: Path) -> Path:
-    """The same as version 99."""
-    tree = work / "newer"
-    shutil.rmtree(tree, ignore_errors=True)
-    subprocess.run(["dpkg-deb", "-R", package, tree], check=True)
-    control = tree / "DEBIAN/control"
-    control.write_text(re.sub("(?m)^Version: .*", "Version: 99", control.read_text()))
-    made = work / "newer.deb"
-    subprocess.run(["dpkg-deb", "--root-owner-group", "-b", tree, made], check=True)
+@both_releases
+def test_a_running_gateway_goes_on_after_an_upgrade_and_ends_with_the_package(
+    packages: dict[str, Path], root: Root, work: Path
+) -> None:
+    root.install(packages["amd64"])
+    text = root.text(CONFIGURATION).replace('"can0"', '"vcan0"')
+    text = re.sub("^port = .*", 'port = "/run/esc1"', text, flags=re.MULTILINE)
+    make_deb.put(root.path / CONFIGURATION, text)
+    out = work / f"{root.path.name}.out"
+    newer(packages["amd64"], out)
+    facts = booted(root, out, "on_upgrade.py")
+    assert facts["fresh"], facts["install said"]
+    assert facts["fresh after upgrade"], facts["upgrade said"]
+    before, after = facts["installed"], facts["upgraded"]
+    assert before["FragmentPath"] == f"/etc/systemd/system/{UNIT}"
+    assert after["FragmentPath"].endswith(f"/lib/systemd/system/{UNIT}")
+    assert after["FragmentPath"] != before["FragmentPath"]
+    assert (before["MainPID"] != after["MainPID"], after["NRestarts"]) == (True, "0")
+    assert facts["removed"]["ActiveState"] == "inactive", facts["removal said"]
+    assert facts["removed"]["LoadState"] == "not-found"
+    assert facts["left"] == "", facts["purge said"]
+
+
+def newer(package: Path, folder: Path) -> Path:
+    """The same as version 99, as newer.deb of a folder."""
+    folder.mkdir(exist_ok=True)
+    made = folder / "newer.deb"
+    with tempfile.TemporaryDirectory(dir=folder) as tree:
+        subprocess.run(["dpkg-deb", "-R", package, f"{tree}/x"], check=True)
+        control = Path(tree, "x/DEBIAN/control")
+        control.write_text(re.sub("(?m)^Version: .*", "Version: 99", control.read_text()))
+        command = ["dpkg-deb", "--root-owner-group", "-Zgzip", "-b", f"{tree}/x", str(made)]
+        subprocess.run(command, check=True)
     return made
 
 
