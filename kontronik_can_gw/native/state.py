@@ -12,6 +12,8 @@ from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 
 _STREAM = COUNTS.index("long_run_bytes") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""
+_PLACES = (("has_live", "live"), ("has_info", "info"), ("had_live", "live"), ("had_info", "info"))
+"""Of live data, info, and the newest ever of both: whether there is any, and its bytes."""
 _COUNT = {name: COUNTS.index(name) for name in ("losses", "late_frames", "suspect_frames")}
 
 
@@ -55,7 +57,7 @@ class NativeEsc(EscTelemetry):
         self._forms = [(struct.Struct("<" + codes), kind) for codes, kind in self.protocol.wire]
         self._generation = -1
         self._link_before = LinkState.NEVER_SEEN
-        self._readings: tuple[Data | None, ...] = (None,) * 4
+        self._readings: dict[int, Data | None] = {}
         self._counters_of = type(self.protocol.make().counters)
         self.drawn = NativeDrawn(state)
         self.line_errors = self.base_losses = self.base_line_errors = 0
@@ -93,20 +95,18 @@ class NativeEsc(EscTelemetry):
 
     def reading(self, place: int) -> Data | None:
         """Live data, info, and the newest ever of both; None where there is none."""
-        state = self._state
+        state, known = self._state, self._readings
         if state.generation != self._generation:
             self._generation = state.generation
-            live, info = (
-                tuple.__new__(kind, form.unpack_from(body))
-                for (form, kind), body in zip(self._forms, (state.live, state.info), strict=True)
-            )
-            self._readings = (
-                live if state.has_live else None,
-                info if state.has_info else None,
-                live if state.had_live else None,
-                info if state.had_info else None,
-            )
-        return self._readings[place]
+            known.clear()
+        elif place in known:
+            return known[place]
+        there, body = _PLACES[place]
+        known[place] = None
+        if getattr(state, there):
+            form, kind = self._forms[place & 1]
+            known[place] = tuple.__new__(kind, form.unpack_from(getattr(state, body)))
+        return known[place]
 
 
 _READ: dict[str, Callable[[NativeEsc], Any]] = {
