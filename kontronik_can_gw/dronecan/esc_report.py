@@ -1,18 +1,22 @@
 """What is reported of one ESC: its measurements while they are fresh, and the errors that begin and end."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from textwrap import wrap
 
 from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.esc.decoder import Data, ErrorBit, Severity
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry
-from kontronik_can_gw.esc.values import scaled, steps_of, values_of
+from kontronik_can_gw.esc.values import Kind, Value, scaled, steps_of, values_of
 
 SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
 """Key ``rpm`` of the configuration to the value that is sent."""
 _QUIET_NS = 10 * SECOND
 """An error that comes and goes is logged at most this often."""
+_BEC = (
+    *("bec_voltage", "bec_current", "bec_temperature"),
+    *("bec_overtemperature", "bec_overvoltage", "bec_undervoltage", "bec_overcurrent"),
+)
 _BEC_FLAGS = {"bec_overvoltage": 1, "bec_undervoltage": 2, "bec_overcurrent": 4}
 _LEVELS = {Severity.ERROR: 3, Severity.WARNING: 2}
 _FLAG_BITS = 18
@@ -26,11 +30,12 @@ class EscReport:
         self.esc = esc
         self.index = index
         self._values = values = values_of(esc.protocol)
-        self._volts, self._amperes, self._celsius, self._opening, self._throttle, self._word = (
-            values[name]
+        self._word = values["operating_errors"]
+        self._volts, self._amperes, self._celsius, self._opening, self._throttle = (
+            _reader(values[name], esc)
             for name in (
                 *("battery_voltage", "battery_current", "power_stage_temperature"),
-                *("output_opening", "throttle", "operating_errors"),
+                *("output_opening", "throttle"),
             )
         )
         self._speed = values[SPEEDS[rpm]]
@@ -77,14 +82,13 @@ class EscReport:
         if rpm and not self._turns:
             self._onsets = 0  # errors since the motor was started
         self._turns = bool(rpm)
-        celsius = self._number(self._celsius, live)
         return types.status(
             self._onsets,
-            self._number(self._volts, live),
-            self._number(self._amperes, live),
-            types.kelvin(celsius),
+            self._volts(live),
+            self._amperes(live),
+            types.kelvin(self._celsius(live)),
             rpm,
-            int(self._number(self._opening, live) or 0),
+            int(self._opening(live) or 0),
             self.index,
         )
 
@@ -96,24 +100,23 @@ class EscReport:
         word = self.word
         flags = word & (1 << _FLAG_BITS) - 1 | (word >> _FLAG_BITS != 0) << _FLAG_BITS
         return types.status_extended(
-            abs(int(self._number(self._throttle, live) or 0)),
-            int(self._number(self._opening, live) or 0),
+            abs(int(self._throttle(live) or 0)),
+            int(self._opening(live) or 0),
             *(types.UNKNOWN_MOTOR_TEMPERATURE, 0, flags, self.index),
         )
 
     def bec(self) -> tuple[bytes, bytes] | None:
         """CircuitStatus and Temperature of the BEC; None without fresh telemetry, and of an ESC that measures nothing there."""
-        live, values = self.esc.live, self._values
-        volts, amperes, celsius = (
-            self._number(values[name], live)
-            for name in ("bec_voltage", "bec_current", "bec_temperature")
-        )
+        live = self.esc.live
+        if live is None:
+            return None
+        values = {name: _reader(self._values[name], self.esc)(live) for name in _BEC}
+        volts, amperes, celsius, is_hot = (values[name] for name in _BEC[:4])
         if volts is None and amperes is None and celsius is None:
             return None
-        flags = sum(flag for name, flag in _BEC_FLAGS.items() if self._number(values[name], live))
-        is_hot = bool(self._number(values["bec_overtemperature"], live))
+        flags = sum(flag for name, flag in _BEC_FLAGS.items() if values[name])
         circuit = types.circuit_status(self.index, volts, amperes, flags)
-        return circuit, types.temperature(self.index, types.kelvin(celsius), is_hot)
+        return circuit, types.temperature(self.index, types.kelvin(celsius), bool(is_hot))
 
     def log(self, now: int) -> Iterator[bytes]:
         """LogMessages of an error or warning that has begun or ended; of one at a time, and none of what is not known now."""
@@ -136,6 +139,17 @@ class EscReport:
         for part in wrap(text, types.MAX_TEXT):
             yield types.log_message(level, name, part)
 
-    def _number(self, value: object, live: Data | None) -> float | None:
-        found = steps_of(value, self.esc, live)  # type: ignore[arg-type]
-        return None if found is None else found / value.per_unit  # type: ignore[attr-defined]
+
+def _reader(value: Value, esc: EscTelemetry) -> Callable[[Data], float | None]:
+    """What reads a value of live data, in its unit; None: not available."""
+    (word, *_), per_unit = value.words or (0,), value.per_unit
+    if not value.supplied:
+        return lambda _live: None
+    if value.kind is Kind.WIRE and not value.not_on:
+        return lambda live: live[word] / per_unit
+
+    def read(live: Data) -> float | None:
+        found = steps_of(value, esc, live)
+        return None if found is None else found / per_unit
+
+    return read

@@ -17,6 +17,7 @@ MAX_NODE_ID = 125
 MAX_PAYLOAD, MAX_TRANSFERS, TIMEOUT_NS = 300, 32, 2 * SECOND
 _SERVICE, _REQUEST = 0x80, 0x8000
 _START, _END, _TOGGLE, _ID_MASK = 0x80, 0x40, 0x20, 0x1F
+_BYTE = tuple(bytes((each,)) for each in range(256))
 
 
 class DataType(NamedTuple):
@@ -68,16 +69,16 @@ def transfer(
     can_id: int, seed: int, payload: bytes, transfer_id: int, queued: bool, page: int = 0
 ) -> list[CanFrame]:
     """The frames of a transfer. ``queued`` as in CanFrame; of others the first has this ``page``, the following ones count on."""
-    if len(payload) <= 7:
-        tail = _START | _END | transfer_id
-        return [CanFrame(can_id, payload + bytes((tail,)), True, False, page, False, queued)]
+    tail, size = _START | transfer_id, len(payload)
+    if size <= 7:
+        data = payload + _BYTE[tail | _END]
+        return [CanFrame(can_id, data, True, False, page, False, queued)]
     payload = crc_hqx(payload, seed).to_bytes(2, "little") + payload
     frames = []
-    tail, last = _START | transfer_id, len(payload) - 7
-    for at in range(0, len(payload), 7):
-        if at >= last:
+    for at in range(0, size + 2, 7):
+        if at + 7 >= size + 2:
             tail |= _END
-        data = payload[at : at + 7] + bytes((tail,))
+        data = payload[at : at + 7] + _BYTE[tail]
         frames.append(CanFrame(can_id, data, True, False, page, False, queued))
         tail = tail & ~_START ^ _TOGGLE
         page += 1

@@ -36,7 +36,9 @@ _STATUS = struct.Struct("<IeeeH")
 
 def _half(value: float | None) -> float:
     """For a float of 16 bits."""
-    return nan if value is None else max(-_MAX_HALF, min(value, _MAX_HALF))
+    if value is None:
+        return nan
+    return value if -_MAX_HALF <= value <= _MAX_HALF else _MAX_HALF if value > 0 else -_MAX_HALF
 
 
 def kelvin(celsius: float | None) -> float | None:
@@ -54,9 +56,10 @@ def status(
     index: int,
 ) -> bytes:
     """uavcan.equipment.esc.Status; ``temperature`` in K."""
-    rpm = max(-MAX_RPM - 1, min(rpm, MAX_RPM))
+    if not -MAX_RPM <= rpm <= MAX_RPM:
+        rpm = MAX_RPM if rpm > 0 else -MAX_RPM - 1
     head = _STATUS.pack(errors, _half(volts), _half(amperes), _half(temperature), rpm & 0xFFFF)
-    tail = (rpm >> 16 & 3) << 14 | max(0, min(percent, 127)) << 7 | index << 2
+    tail = (rpm >> 16 & 3) << 14 | min(percent, 127) << 7 | index << 2
     return head + tail.to_bytes(2, "big")
 
 

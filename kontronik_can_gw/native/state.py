@@ -12,6 +12,8 @@ from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 
 _STREAM = COUNTS.index("long_run_bytes") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""
+_PLACES = (("has_live", "live"), ("has_info", "info"), ("had_live", "live"), ("had_info", "info"))
+"""Of live data, info, and the newest ever of both: whether there is any, and its bytes."""
 
 
 class NativeDrawn:
@@ -53,7 +55,7 @@ class NativeEsc(EscTelemetry):
         assert self.protocol.wire is not None
         self._forms = [(struct.Struct("<" + codes), kind) for codes, kind in self.protocol.wire]
         self._generation = -1
-        self._readings: tuple[Data | None, ...] = (None,) * 4
+        self._readings: dict[int, Data | None] = {}
         self._counters_of = type(self.protocol.make().counters)
         self.drawn = NativeDrawn(state)
         self.line_errors = self.base_losses = self.base_line_errors = 0
@@ -63,7 +65,12 @@ class NativeEsc(EscTelemetry):
     def frozen(self) -> Self:
         twin = object.__new__(type(self))
         state = type(self._state).from_buffer_copy(self._state)
-        twin.__dict__ |= self.__dict__ | {"_state": state, "drawn": NativeDrawn(state)}
+        own = {
+            "_state": state,
+            "drawn": NativeDrawn(state),
+            "_readings": {},
+        }  # read in another thread
+        twin.__dict__ |= self.__dict__ | own
         return twin
 
     @property
@@ -77,20 +84,18 @@ class NativeEsc(EscTelemetry):
 
     def reading(self, place: int) -> Data | None:
         """Live data, info, and the newest ever of both; None where there is none."""
-        state = self._state
+        state, known = self._state, self._readings
         if state.generation != self._generation:
             self._generation = state.generation
-            live, info = (
-                tuple.__new__(kind, form.unpack_from(body))
-                for (form, kind), body in zip(self._forms, (state.live, state.info), strict=True)
-            )
-            self._readings = (
-                live if state.has_live else None,
-                info if state.has_info else None,
-                live if state.had_live else None,
-                info if state.had_info else None,
-            )
-        return self._readings[place]
+            known.clear()
+        elif place in known:
+            return known[place]
+        there, body = _PLACES[place]
+        known[place] = None
+        if getattr(state, there):
+            form, kind = self._forms[place & 1]
+            known[place] = tuple.__new__(kind, form.unpack_from(getattr(state, body)))
+        return known[place]
 
 
 _READ: dict[str, Callable[[NativeEsc], Any]] = {

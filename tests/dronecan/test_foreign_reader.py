@@ -30,8 +30,8 @@ def test_the_crate_reads_what_the_package_reads() -> None:
             )
         bench.run(0.1)
     assert Peer(bench).ask(protocol.GetNodeInfo.Request(), 42) is not None
-    for index in range(16):
-        assert Peer(bench).ask(protocol.param.GetSet.Request(index=index), 42) is not None
+    for number in range(16):
+        assert Peer(bench).ask(protocol.param.GetSet.Request(index=number), 42) is not None
     lines = "".join(f"{f.can_id:X}#{f.data.hex()}\n" for _, f in bench.frames if f.extended)
     done = subprocess.run([READER], input=lines, capture_output=True, text=True, check=True)
     found = [line.split() for line in done.stdout.splitlines()]

@@ -15,6 +15,7 @@ from test_replay_is_identical import replayed
 
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.desk.monitor import status
+from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
 from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.snapshot import snapshot
@@ -262,3 +263,23 @@ def test_status_shows_the_nodes() -> None:
         "DroneCAN kontronik_can_gw: waits for a node-ID, 2 requests" in shown
         or "3 requests" in shown
     )
+
+
+def test_live_frames_do_not_need_python_for_it() -> None:
+    """Whole turns in C go on between two moments at which it has something to say, and it names the next one."""
+    bench = Bench(2, extended_hz=20)
+    if bench.gateway.core.language != "C":
+        pytest.skip(bench.gateway.core_note)
+    assert not bench.gateway.core_note
+    followed: list[int] = []
+    on_event = bench.output.on_event
+
+    def noted(esc: int, events: int, now: int) -> None:
+        followed.append(events)
+        on_event(esc, events, now)
+
+    (follower,) = bench.gateway.core.followers
+    bench.gateway.core.followers = [follower._replace(on_event=noted)]
+    bench.run(1)
+    assert len(followed) == 2  # of 200 live frames the first of each ESC
+    assert 0 < bench.gateway.next_deadline(with_core=False) - bench.now <= 20 * MS
