@@ -15,7 +15,7 @@ from capture_bench import START, Bench, made
 from kontronik_can_gw.capture.format import Entry, Kind, read_number
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik import InfoData
+from kontronik_can_gw.esc.kontronik import InfoData, Layout, encode
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime import capture_part, recorder
 from kontronik_can_gw.runtime.capture_folder import is_ours
@@ -148,8 +148,7 @@ def test_the_header_shows_where_it_comes_from(tmp_path: Path) -> None:
     bed.put(1)
     bed.written()
     info = InfoData(device_and_variant=1 << 10 | 160, firmware_word=4 << 8 | 17)
-    bench.gateway.escs[0].last_info = info
-    bench.gateway.escs[0].layout = 1
+    bench.gateway.receive_bytes(0, encode(info, Layout.V4), START, START)
     bed.it.note(bench.gateway, 1)
     until(lambda: bed.it._recorded_devices == bed.it._devices)
     bed.it.close()
