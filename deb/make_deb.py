@@ -22,6 +22,7 @@ from email.utils import formatdate
 from pathlib import Path
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.cli.service_files import COMPANIONS, planned
 from kontronik_can_gw.native.objects import shared_object
 
 HERE = Path(__file__).resolve().parent
@@ -38,7 +39,6 @@ SERVICE = {
     "etc/systemd/network": f"usr/share/doc/{NAME}/examples",
 }
 """Where `service install` writes, and where a package puts the same."""
-_WRITTEN_BY = re.compile(r"\A# Written by .*\n")
 COMPLETIONS = {
     "bash": f"bash-completion/completions/{NAME}",
     "zsh": f"zsh/vendor-completions/_{NAME}",
@@ -107,14 +107,9 @@ def compressed(text: str | bytes) -> bytes:
 
 def put_service(tree: Path) -> None:
     """Units and the like, as `service install` writes them for a program in /usr/bin."""
-    with tempfile.TemporaryDirectory(prefix="kcg-deb.") as folder:
-        program = ("--executable", f"/usr/bin/{NAME}")
-        gateway("service", "install", "--root", folder, *program, "--mqtt", "--metrics")
-        for origin, place in SERVICE.items():
-            for path in sorted(Path(folder, origin).iterdir()):
-                if path.is_file():
-                    name = path.name.removesuffix(".example")
-                    put(tree / place / name, _WRITTEN_BY.sub("", path.read_text("utf-8")))
+    for place, text in planned(f"/usr/bin/{NAME}", COMPANIONS, "can0", 500_000):
+        folder = next(folder for folder in SERVICE if place.startswith(folder))
+        put(tree / SERVICE[folder] / Path(place).relative_to(folder), text)
 
 
 def manual_page() -> str:

@@ -1,3 +1,3 @@
 """Gateway from KONTRONIK ESC telemetry to CAN."""
 
-__version__ = "0.5.0"
+__version__ = "0.6.0"

@@ -95,7 +95,7 @@ def test_every_command_that_is_named_exists() -> None:
 def test_every_make_target_that_is_named_exists() -> None:
     makefile = (PROJECT / "Makefile").read_text(encoding="utf-8")
     for target in re.findall(r"`?make ([a-z]+)", ALL):
-        if target not in ("sure", "no"):
+        if target not in ("an", "no", "sure"):
             assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
