@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
+from typing import NamedTuple
 
 from kontronik_can_gw.dronecan.esc_report import SPEEDS
 from kontronik_can_gw.dronecan.nodes import Dronecan
@@ -25,8 +26,7 @@ _RESOLUTION = (
 )
 
 
-@dataclass(frozen=True)
-class NodeSetup:
+class NodeSetup(NamedTuple):
     """One node. ``node_id`` 0: an allocator chooses it; ``escs``: numbers of its ESCs."""
 
     node_id: int
