@@ -47,6 +47,8 @@ class Gateway:
         else:
             slots = 0 if canopen is None else canopen.pdos
             self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
+        self.layout = layout.fingerprint if layout.messages else None
+        """Of the messages, as it stands in a DBC that `dbc -c` writes; None without messages."""
         self.escs, self.status = self.core.escs, self.core.status
         self.nodes: Nodes | None = None
         if canopen is not None:

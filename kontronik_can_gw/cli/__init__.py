@@ -35,7 +35,7 @@ COMMANDS = {
     "convert": "convert recordings and CAN logs to tables and to CAN logs of other formats",
     "report": "a recorded flight as a page for a browser: summary, plots, events",
     "decode": "decode recorded UART bytes to JSON lines or CSV",
-    "replay": "play a recording on a CAN bus, on pseudo terminals, or as a log",
+    "replay": "play a recording on a CAN bus or on pseudo terminals",
     "simulate": "simulate ESCs on pseudo terminals",
     "mqtt": "publish the ESCs' values from the bus to an MQTT broker",
     "metrics": "serve a gateway's statistics for Prometheus",

@@ -34,6 +34,7 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "Type mosquitto_sub -h BROKER -W 2 --remove-retained -t homeassistant/device/kontronik_GATEWAY/config, and for "
         "each ESC -t homeassistant/device/kontronik_GATEWAY_ESC/config.",
     ("report", "--to"): "Type --until S.",
+    ("replay", "--to"): "Type --on can or --on pty; a log is made by kontronik-can-gw convert FILE flight.log.",
 }
 # fmt: on
 """Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.

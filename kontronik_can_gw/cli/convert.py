@@ -185,7 +185,9 @@ def _nothing(args: argparse.Namespace, recording: Input) -> str:
     """Why there is nothing to convert."""
     if args.start is not None or args.end is not None:
         return "nothing in it is between --from and --until"
-    if isinstance(recording, CanLogInput) and not recording.others:
+    if not isinstance(recording, CanLogInput):
+        return "nothing in it can be converted: it has no frame."
+    if not recording.others:
         return "nothing in it can be converted: it has no CAN frame."
     return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
 

@@ -1,21 +1,17 @@
-"""``replay``: plays a recording on a CAN bus, on pseudo terminals, or as a log."""
+"""``replay``: plays a recording on a CAN bus or on pseudo terminals."""
 
 import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.cli.progress import Progress
 from kontronik_can_gw.cli.terminals import terminals
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.desk.recordings.can_logs import SUFFIXES, CanLogWriter
-from kontronik_can_gw.desk.recordings.convert import Output
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput, Input, open_input
 from kontronik_can_gw.desk.recordings.marking import Marker
 from kontronik_can_gw.desk.recordings.pacing import Pace
@@ -43,37 +39,33 @@ def _speed(text: str) -> float | None:
 # fmt: off
 OPTIONS = (
     option("FILE", "the recording", type=Path),
-    option("--to", "where to", choices=("can", "pty", "log"), required=True),
+    option("--on", "what to play it on", choices=("can", "pty"), required=True),
     LAYOUT,
-    option("--speed FACTOR", "times real time, 0.01 to 1000, or max: as fast as possible (default 1; --to log is always max)",
-           type=_speed, default=1.0),
-    option("--interface NAME", "--to can: python-can interface (default socketcan)"),
-    option("--channel NAME", "--to can: its channel, as vcan0 (default: that of -c)"),
-    option("--unmarked", "--to can: do not mark the frames as replay"),
-    option("--link PATH", "--to pty: symbolic link; {n} is the ESC's number, from 1"),
-    option("--delay S", "--to pty: time for a gateway to open them (default 1)", type=number_from(0, 3600), default=1.0),
-    option("-o --output FILE", "--to log: file (default -: standard output)", default="-"),
-    option("--force", "--to log: replace FILE if it exists"),
+    option("--speed FACTOR", "times real time, 0.01 to 1000, or max: as fast as possible (default 1)", type=_speed, default=1.0),
+    option("--interface NAME", "--on can: python-can interface (default socketcan)"),
+    option("--channel NAME", "--on can: its channel, as vcan0 (default: that of -c)"),
+    option("--unmarked", "--on can: do not mark the frames as replay"),
+    option("--link PATH", "--on pty: symbolic link; {n} is the ESC's number, from 1"),
+    option("--delay S", "--on pty: time for a gateway to open them (default 1)", type=number_from(0, 3600), default=1.0),
 )
 # fmt: on
-_ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",), "log": ("force",)}
+_ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}
 EPILOG = """\
 FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
 bytes, or a CAN log (candump, ASC, BLF, TRC, MF4); a pipe, or - for standard input, is read to its end first. A capture
 is replayed through the gateway's core with the recorded clock: frames and times equal those of the live gateway bit for
 bit.
 
---to can  sends the frames on a CAN bus. The gateway's state in them is set to Replay (GatewayState), since they are old;
+--on can  sends the frames on a CAN bus. The gateway's state in them is set to Replay (GatewayState), since they are old;
           with --unmarked they are sent exactly as recorded. Refused while a gateway on this machine sends the same messages.
           Frames that the gateway had received are not sent; of a CAN log all frames are.
---to pty  plays an ESC's bytes on a pseudo terminal, one for each ESC, for a gateway to read: prints "esc1 /dev/pts/5".
---to log  writes the frames to -o FILE (.log, .asc, .blf, .trc, .mf4), or as a candump log to standard output, as fast as
-          possible.
+--on pty  plays an ESC's bytes on a pseudo terminal, one for each ESC, for a gateway to read: prints "esc1 /dev/pts/5".
+
+A log of the frames is made by kontronik-can-gw convert FILE flight.log.
 
 examples:
-  kontronik-can-gw replay flight.kcap --to can --channel vcan0
-  kontronik-can-gw replay flight.kcap --to pty --link /tmp/esc{n} --speed 4
-  kontronik-can-gw replay flight.kcap --to log -o flight.log
+  kontronik-can-gw replay flight.kcap --on can --channel vcan0
+  kontronik-can-gw replay flight.kcap --on pty --link /tmp/esc{n} --speed 4
 
 exit codes: 0 done, 1 failed while running, 2 wrong usage, or a file that is no recording
 """
@@ -83,13 +75,11 @@ def main(args: argparse.Namespace) -> int:
     """Replay args.file."""
     for place, names in _ONLY_FOR.items():
         given = [name for name in names if getattr(args, name)]
-        if place != args.to and given:
-            raise UserError(f"--{given[0]} is for --to {place}")
-    if args.to != "log" and args.output != "-":
-        raise UserError("--output is for --to log")
+        if place != args.on and given:
+            raise UserError(f"--{given[0]} is for --on {place}")
     pace = Pace(args.speed)
     with open_input(args.file, given_layout(args)) as recording, stopping_on_signals(pace.stop):
-        play = {"can": _to_can, "pty": _to_pty, "log": _to_log}[args.to]
+        play = {"can": _on_can, "pty": _on_pty}[args.on]
         text = play(args, recording, pace)
         if recording.times_assumed:
             assumed = recording.provenance["times"].removeprefix("assumed: ")
@@ -100,57 +90,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _to_log(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
-    name, to_screen = args.output, args.output == "-"
-    kind = "candump" if to_screen else _log_kind(name, args.file, args.force)
-    frames = recording.frames()
-    first = next(frames, None)
-    if first is None:
-        raise RunError("; ".join([f"{recording.name}: has no CAN frames", *recording.damage]))
-    try:
-        with (
-            Output(None if to_screen else Path(name), kind) as out,
-            Progress(recording.name, recording.size, to_screen) as progress,
-        ):
-            last, wall = first.time_ns, recording.wall_ns(first.time_ns)
-            channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
-            begun = None if wall is None else wall - last
-            writer = CanLogWriter(out.open(), kind, begun, last, channel, name)
-            count = 0
-            for time_ns, frame, received in chain((first,), frames):
-                if pace.stopped:
-                    break
-                # the wall clock of that time; it may have been set since
-                moved = 0 if wall is None else (recording.wall_ns(time_ns) or wall) - wall
-                last = max(last, time_ns if wall is None else first.time_ns + moved)
-                writer.write(last, frame, received)
-                count += 1
-                if not count & 0x3FF:
-                    progress.reach(recording.position)
-            writer.close()
-            out.is_whole = True
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise RunError(f"{name}: cannot be written: {error.strerror or error}.") from None
-    return f"{count} frames{'' if to_screen else f' to {name}'}"
-
-
-def _log_kind(name: str, source: Path, force: bool) -> str:
-    """The format of a log by its suffix. UserError where the file cannot be written."""
-    target = Path(name)
-    if target.suffix not in SUFFIXES:
-        raise UserError(
-            f"{name}: the ending of its name selects the format of the log: {', '.join(SUFFIXES)}"
-        )
-    if target.exists() and target.resolve() == source.resolve():
-        raise UserError(f"{name}: is the recording itself. Give another -o.")
-    if target.is_file() and not force:
-        raise UserError(f"{name}: exists. Give another -o, or --force.")
-    return SUFFIXES[target.suffix]
-
-
-def _to_can(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
+def _on_can(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
     capture = recording if isinstance(recording, CaptureInput) else None
     layout = recording.bus.layout if capture is None else capture.sent_layout
     can = _bus(args, recording, fd=any(plan.fd for plan in layout.messages))
@@ -189,7 +129,7 @@ def _bus(args: argparse.Namespace, recording: Input, fd: bool) -> CanConfig:
         return replace(can_config(recording.bus, args.interface, args.channel), fd=fd)
     if args.channel is None:
         raise UserError(
-            "--to can needs --channel, as vcan0, or a configuration (-c) that names one"
+            "--on can needs --channel, as vcan0, or a configuration (-c) that names one"
         )
     return CanConfig(args.interface or "socketcan", args.channel, fd=fd)
 
@@ -220,7 +160,7 @@ def _send(port: CanPort, frame: CanFrame, channel: str, pace: Pace) -> None:
         time.sleep(_BUSY_S)
 
 
-def _to_pty(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
+def _on_pty(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
     chunks = _chunks(recording)
     names = []
     if isinstance(recording, (CaptureInput, DumpInput)):
@@ -253,5 +193,5 @@ def _chunks(recording: Input) -> Iterator[tuple[int, int, bytes]]:
     if isinstance(recording, DumpInput):
         return ((time_ns, 0, data) for time_ns, data in recording.chunks())
     raise UserError(
-        f"{recording.name}: is a log of CAN frames, which has no bytes of ESCs. --to can and --to log are possible."
+        f"{recording.name}: is a log of CAN frames, which has no bytes of ESCs. --on can is possible."
     )

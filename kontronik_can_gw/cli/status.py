@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kontronik_can_gw.cli.arguments import JSON, option
+from kontronik_can_gw.cli.arguments import JSON, default_config, option
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.monitor.status import Seen, lines_of, look_at
@@ -35,7 +35,7 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "Default: all gateways that run as a service. Live: watch kontronik-can-gw status. Exit code 0: running and healthy; "
+    "Default: all gateways that run as a service; without any, that of gateway.toml in this folder. Live: watch kontronik-can-gw status. Exit code 0: running and healthy; "
     "1: running, but an ESC is not heard or nothing gets onto the CAN bus; 2: wrong usage; 3: not running, or no answer for 3 s."
 )
 
@@ -44,6 +44,9 @@ def main(args: argparse.Namespace) -> int:
     config = None if args.config is None else load(args.config)
     given = args.file if config is None else config.statistics_path
     seen = _look(given, config)
+    if not seen and config is None and (path := default_config()) is not None:
+        config = load(path)
+        seen = _look(config.statistics_path, config)
     if not seen and args.json:
         print(json.dumps({"gateways": []}))
     if not seen:

@@ -24,6 +24,8 @@ class GatewayFacts(NamedTuple):
     """As Gateway.node_states."""
     outputs: Mapping[str, Any]
     """What further outputs say of themselves, by their names."""
+    layout: str | None
+    """As Gateway.layout."""
     core: str
     """Its language, and as Gateway.core_note."""
     core_note: str
@@ -34,7 +36,9 @@ def gateway_facts(gateway: Gateway) -> GatewayFacts:
     escs = [esc.frozen() for esc in gateway.escs]
     core = gateway.core.language, gateway.core_note
     outputs = {output.name: found for output in gateway.outputs if (found := output.facts())}
-    return GatewayFacts(escs, copy(gateway.status), gateway.node_states(), outputs, *core)
+    return GatewayFacts(
+        escs, copy(gateway.status), gateway.node_states(), outputs, gateway.layout, *core
+    )
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,7 @@ def snapshot(
             "state": name_in_words(status.state.name),
             "esc_count": status.esc_count,
             "escs_ok": status.escs_ok,
+            "layout": gateway.layout,
             "core": gateway.core,
             "core_reason": gateway.core_note or None,
         },

@@ -43,27 +43,24 @@ def test_a_log_of_each_kind_holds_what_was_sent(
     suffix: str, bench: Bench, recording: Path, tmp_path: Path
 ) -> None:
     target = tmp_path / f"out{suffix}"
-    code, out, talk = replay(recording, "--to", "log", "-o", target)
-    assert (code, out) == (0, "")
-    assert talk == f"kontronik-can-gw: {len(bench.sent)} frames to {target}\n"
+    done = run("convert", "-q", recording, target, *["--to", "mf4-log"][: 2 * (suffix == ".mf4")])
+    assert (done.code, done.out, done.err) == (0, "", "")
     assert read(target) == [(f.frame.can_id, f.frame.data) for f in bench.sent]
     assert not list(tmp_path.glob("*.part"))
 
 
 def test_a_log_of_a_log_is_the_same_log(recording: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "1.log", tmp_path / "2.log"
-    assert replay(recording, "--to", "log", "-o", first)[0] == 0
-    assert replay(first, "--to", "log", "-o", second)[0] == 0
+    assert run("convert", recording, first).code == 0
+    assert run("convert", first, second).code == 0
     assert first.read_bytes() == second.read_bytes()
 
 
 def test_a_log_is_not_written_over_itself_and_has_no_bytes_of_escs(tmp_path: Path) -> None:
     log = written(tmp_path / "a.log", "(1.000000) can0 688#0000000000000000\n")
-    assert "is the recording itself" in refused(
-        2, "replay", log, "--to", "log", "-o", log, "--force"
-    )
+    assert "is IN. Give another OUT" in refused(2, "convert", log, log, "--force")
     assert "log of CAN frames, which has no bytes of ESCs" in refused(
-        2, "replay", log, "--to", "pty"
+        2, "replay", log, "--on", "pty"
     )
 
 
@@ -74,7 +71,7 @@ def test_it_stops_at_once_when_asked(tmp_path: Path) -> None:
     bench.gateway.advance(START + 3600 * SECOND)
     bench.take(START + 3600 * SECOND)
     path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
-    words = ["replay", str(path), "--to", "pty"]
+    words = ["replay", str(path), "--on", "pty"]
     with subprocess.Popen(
         [*PROGRAM, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as player:

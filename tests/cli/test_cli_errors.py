@@ -181,7 +181,7 @@ LONG = "x" * 300
     "words",
     [
         *(f"convert a {LONG}.csv", f"convert {LONG} a.csv", f"report a -o {LONG}"),
-        *(f"replay {LONG} --to log", f"monitor {LONG}", f"dbc -o {LONG}", f"check -c {LONG}"),
+        *(f"replay {LONG} --on pty", f"monitor {LONG}", f"dbc -o {LONG}", f"check -c {LONG}"),
         *(f"mqtt {LONG} --broker x", f"service install --root {LONG}", f"decode {LONG}"),
     ],
 )
@@ -198,7 +198,7 @@ def test_a_name_that_is_too_long_is_one_line(
 # --- CAN interface
 
 
-@pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.log --to can"])
+@pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.log --on can"])
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -162,7 +162,7 @@ def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> N
         ("x.toml", f'[can]\nchannel = "{EVIL[:3]}\n', ["check", "-c"]),
         ("x.toml", '"\\u001b]0;x" = 1\n', ["check", "-c"]),
         ("x.log", f"(1.0) can0 {EVIL}\n", ["convert", "--to", "csv", "--quiet"]),
-        ("x.kcap", EVIL, ["replay", "--to", "log"]),
+        ("x.kcap", EVIL, ["replay", "--on", "pty"]),
         ("\x1b]0;x\x07.bin", "", ["decode"]),
     ],
 )

@@ -126,8 +126,6 @@ def steps_of(folder: Path, truth: Any) -> list[Step]:
         words = ["convert", str(folder / f"hour.{form}"), "OUT"]
         compare = f"pandas against {by_can}", compare_table_of_log, form
         step(f"convert {form} to csv", words, f"of_{form}.csv", *compare)
-    words = ["replay", capture, "--to", "log", "-o", "OUT"]
-    step("replay to log", words, "replayed.log", by_can, compare_log)
     for index in range(len(truth.escs)):
         name = f"esc{index + 1}"
         words = convert if one_esc else [*convert, "--esc", name]

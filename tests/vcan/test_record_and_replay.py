@@ -98,7 +98,7 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
         assert len(on_bus) > 500
         # through the core, as a log
         log = tmp_path / "again.log"
-        done = program("replay", folder, "--to", "log", "-o", log)
+        done = program("convert", folder, log)
         assert done.returncode == 0, done.stderr
         with can.LogReader(log) as reader:
             logged = [(m.arbitration_id, bytes(m.data)) for m in reader]
@@ -109,7 +109,7 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
         # on another bus, in real time times three; and the log itself likewise
         for source, marked in ((folder, False), (log, False), (folder, True)):
             with Candump(second_vcan) as replayed:
-                words = f"--to can --channel {second_vcan} --speed 3".split()
+                words = f"--on can --channel {second_vcan} --speed 3".split()
                 done = program("replay", source, *words, *([] if marked else ["--unmarked"]))
                 assert done.returncode == 0, done.stderr
                 assert f"{len(logged)} frames to {second_vcan}" in done.stderr
@@ -141,7 +141,7 @@ def test_a_replay_keeps_away_from_a_bus_with_a_gateway(
     with bench(EscOptions()) as run:
         gateway = recorded_run(run, start_gateway, tmp_path / "c", 1.5, vcan)
         [file] = (tmp_path / "c").glob("*.kcap")
-        done = program("replay", file, "--to", "can", "--channel", vcan)
+        done = program("replay", file, "--on", "can", "--channel", vcan)
         assert (done.returncode, done.stdout) == (1, "")
         assert done.stderr.count("\n") == 1
         assert "another gateway on this machine sends the messages" in done.stderr

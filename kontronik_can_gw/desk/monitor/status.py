@@ -188,7 +188,8 @@ def _head(seen: Seen, document: Document) -> Iterator[Text]:
     memory = f"{process['rss_bytes'] // 1_000_000} MB"
     yield line((f"process {process['pid']}, {memory}, {document['configuration']}", "dim"))
     if "core" in gateway:  # 0.5.0 had but one
-        yield line((in_words(gateway["core"], gateway["core_reason"]), "dim"))
+        layout = f", layout {gateway['layout']}" if gateway.get("layout") else ""
+        yield line((f"{in_words(gateway['core'], gateway['core_reason'])}{layout}", "dim"))
 
 
 def _can_lines(document: Document) -> Iterator[Text]:

@@ -181,12 +181,13 @@ class CaptureInput(CaptureFiles):
         """Say in ``provenance`` what is known by now."""
         header, setup, program = self.header, self.setup, self.header.get("program", {})
         version, python = program.get("version", "?"), program.get("python", "?")
+        layout = f", layout {header['layout']}" if isinstance(header.get("layout"), str) else ""
         self.provenance |= {
             "program": f"kontronik-can-gw {version}, Python {python}",
             "machine": str(program.get("machine", "")),
             "run": f"{header.get('run', '')}, part {int(header.get('part', 0)) + 1}",
             "configuration": setup.file,
-            "DBC": setup.dbc[0] if setup.dbc else "",
+            "DBC": setup.dbc[0] + layout if setup.dbc else "",
         }
         for index, (esc, port) in enumerate(zip(setup.escs, setup.ports, strict=False)):
             device = self._devices[index] if index < len(self._devices) else None
