@@ -117,3 +117,11 @@ def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another
     assert run("dbc", "-c", own).out == text
     written(own.with_name("sent.dbc"), text.replace("(0.01,", "(0.02,", 1))
     assert fingerprint() != first
+
+
+def test_status_without_a_service_is_that_of_the_configuration_of_the_folder(
+    places: tuple[Path, Path],
+) -> None:
+    own, _ = places
+    written(own, f'{LEAST}[statistics]\nfile = "state.json"\n')
+    assert "state.json" in refused(3, "status")

@@ -1,6 +1,6 @@
-"""The table of faults in docs/faults.md, made from what the programme found.
+"""The table of faults in docs/fault-programme.md, made from what the programme found.
 
-    python tests/faults/table.py RESULTS.json... docs/faults.md  puts it between the markers
+    python tests/faults/table.py RESULTS.json... docs/fault-programme.md  puts it between the markers
     python tests/faults/table.py RESULTS.json...                prints it
 
 RESULTS.json are the files that programme.py and qemu_programme.py write. A row that is not good is not hidden: it shows its figures.

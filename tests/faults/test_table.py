@@ -1,11 +1,11 @@
-"""The table of faults in docs/faults.md is the programme's own: it names every fault there is, and shows no wrong and no lost value."""
+"""The table of faults in docs/fault-programme.md is the programme's own: it names every fault there is, and shows no wrong and no lost value."""
 
 from pathlib import Path
 
 from fault_report import FAULTS, Row, in_order
 from table import BEGIN, END, parse, put, table
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
 
 
 def test_the_page_names_exactly_the_faults_that_the_programme_has() -> None:

@@ -130,3 +130,9 @@ def test_a_wheel_carries_dbc_and_example_and_finds_them(tmp_path: Path) -> None:
     assert isinstance(original, cantools.database.Database)
     assert [m.name for m in loaded.messages] == [m.name for m in original.messages]
     assert "[[esc]]" in python("-I", "-c", command, "init", "-")
+
+
+def test_pages_by_hand_are_short() -> None:
+    for path, text in PAGES.items():
+        if path.parent == PROJECT / "docs":
+            assert text.count("\n") <= 130, path.name
