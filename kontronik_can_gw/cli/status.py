@@ -35,7 +35,8 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "Default: all gateways that run as a service; without any, that of gateway.toml in this folder. Live: watch kontronik-can-gw status. Exit code 0: running and healthy; "
+    "Default: all gateways that run as a service; without any, that of gateway.toml in this folder. "
+    "Live: watch kontronik-can-gw status. Exit code 0: running and healthy; "
     "1: running, but an ESC is not heard or nothing gets onto the CAN bus; 2: wrong usage; 3: not running, or no answer for 3 s."
 )
 

@@ -1,4 +1,4 @@
-"""The faults there are, and what came of injecting them: one row for each, kept as JSON, from which the table in docs/fault-programme.md is made."""
+"""The faults there are, and what came of injecting them: a row for each, kept as JSON; docs/fault-programme.md shows them."""
 
 import json
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""The table of faults in docs/fault-programme.md is the programme's own: it names every fault there is, and shows no wrong and no lost value."""
+"""The table in docs/fault-programme.md is the programme's own: it names every fault there is, and shows no wrong and no lost value."""
 
 from pathlib import Path
 
