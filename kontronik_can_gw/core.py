@@ -130,22 +130,23 @@ class PythonCore:
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
-        self._expire_before(esc, now)
-        for events in self.escs[esc].receive_each(data, now, since):
+        state = self._expired(esc, now)
+        for events in state.receive_each(data, now, since):
             self._report(esc, events, now)
 
     def accept(self, esc: int, reading: Reading, now: int) -> None:
         """A reading that came at ``now``; its ESC's decoder has counted it."""
-        self._expire_before(esc, now)
-        if events := self.escs[esc].accept(reading, now, now):
+        if events := self._expired(esc, now).accept(reading, now, now):
             self._report(esc, events, now)
 
-    def _expire_before(self, esc: int, now: int) -> None:
-        """What is too old by now goes, before an ESC brings something."""
+    def _expired(self, esc: int, now: int) -> EscStream:
+        """An ESC that is about to bring something, after what is too old by now went. IndexError where there is none, and nothing went."""
+        state = self.escs[esc]
         if now >= self._next_expiry:
             self.expire(now, but=esc)  # a message may hold values of several ESCs
-            if events := self.escs[esc].expire(now):
+            if events := state.expire(now):
                 self._report(esc, events, now)
+        return state
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         state = self.escs[esc]
