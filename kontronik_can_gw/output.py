@@ -151,5 +151,8 @@ class OutputSetup(Protocol):
     def warnings(self, bitrate: int) -> list[str]:
         """What may not work as it is meant, on a bus with this bit rate."""
 
+    def summary(self) -> list[str]:
+        """What ``check`` shows, in short: lines of up to 78 characters that begin with the output's name in 10 columns."""
+
     def lines(self) -> list[str]:
-        """What ``check`` shows."""
+        """What ``check -v`` shows."""

@@ -21,7 +21,7 @@ class Bench:
         config.write_text(
             f'[can]\nchannel = "{CHANNEL}"\n[run]\nwait_for_devices = true\n[[esc]]\nport = "{self._port}"\npole_pairs = 7\n'
         )
-        self._start("run", "-c", config)
+        self.gateway = self._start("run", "-c", config)
 
     def plug_in(self, *options: str) -> None:
         """The ESC appears and sends. ``options``: of kontronik-can-gw simulate."""

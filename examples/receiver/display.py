@@ -30,7 +30,10 @@ class Display:
     def _receive(self) -> None:
         try:
             while (frame := self._bus.recv(timeout=0)) is not None:
-                message = self._database.get_message_by_frame_id(frame.arbitration_id)
+                try:
+                    message = self._database.get_message_by_frame_id(frame.arbitration_id)
+                except KeyError:
+                    continue  # of somebody else
                 for name, value in message.decode(frame.data).items():
                     self._seen[name] = value, time.monotonic()
         except can.CanError:

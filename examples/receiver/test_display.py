@@ -50,3 +50,10 @@ def test_a_bus_that_goes_down_shows_dashes_until_it_is_back(bench: Bench, displa
     until(lambda: display.shown("BatteryVoltage") is None)
     bench.bus("up")
     until(lambda: display.shown("BatteryVoltage") is not None)
+
+
+def test_a_gateway_that_is_gone_shows_dashes(bench: Bench, display: Display) -> None:
+    bench.plug_in()
+    until(lambda: display.shown("BatteryVoltage") is not None)
+    bench.gateway.kill()
+    until(lambda: display.shown("BatteryVoltage") is None)

@@ -122,7 +122,7 @@ JSON = option("--json", "one JSON document on standard output")
 OUTPUT = option("-o --output FILE", "where to (default: standard output)", default="-")
 LAYOUT = (
     option("-c --config FILE", "TOML configuration of the gateway whose frames they are", type=Path),
-    option("--dbc FILE", "DBC of the frames (default: the shipped one, for one ESC)", type=Path),
+    option("--dbc FILE", "DBC of the frames (default: on the bus that of gateway.toml; else the shipped one, one ESC)", type=Path),
 )
 # fmt: on
 
@@ -138,8 +138,19 @@ def config_file(given: Path | None) -> Path:
 
 
 def default_config() -> Path | None:
-    """The first of CONFIG_PLACES that exists."""
-    return next((place for place in CONFIG_PLACES if place.exists()), None)
+    """The first of CONFIG_PLACES that is there, whether it can be read or not."""
+    return next((place for place in CONFIG_PLACES if _is_there(place)), None)
+
+
+def _is_there(place: Path) -> bool:
+    """False where nothing has that name; a link that leads nowhere, and a closed folder, are something."""
+    try:
+        place.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:

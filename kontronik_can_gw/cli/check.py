@@ -89,7 +89,8 @@ def summary(path: Path, loaded: Loaded, warnings: int) -> Iterator[str]:
             )
             yield f"  CANopen   {each.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else sent}"
     for output in loaded.outputs:
-        yield f"  {output.title}"
+        for line in output.summary():
+            yield f"  {line}"
     if (folder := record_folder(config)) is not None:
         yield f"  captures  {in_words(config, folder)}"
     load, frames = _traffic(loaded)
@@ -148,5 +149,6 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
             }
             for message in layout.messages
         ],
+        "outputs": {output.name: output.lines() for output in loaded.outputs},
         "canopen_nodes": [None if node.node_id == UNCONFIGURED else node.node_id for node in nodes],
     }

@@ -13,6 +13,7 @@ from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
 from kontronik_can_gw.cli.arguments import default_config
 from kontronik_can_gw.config.assemble import Loaded, load_configuration
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,10 +31,15 @@ def load_all(path: Path, store: "Callable[[Path], ParameterStore] | None" = None
     return loaded
 
 
-def announced_config() -> Path | None:
-    """The configuration to be used where an option might have named one, which a line on standard error says; None: there is none."""
-    if (found := default_config()) is not None:
-        say(f"by {found}")
+def announced_config(with_nodes: bool = False) -> Path | None:
+    """The configuration to be used where an option might have named one, which a line on standard error says; None: there is none.
+
+    ``with_nodes``: only one with CANopen nodes.
+    """
+    found = default_config()
+    if found is None or (with_nodes and not load(found).canopen.enabled):
+        return None
+    say(f"by {found}")
     return found
 
 

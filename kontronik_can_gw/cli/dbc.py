@@ -69,7 +69,7 @@ EPILOG = (
 def main(args: argparse.Namespace) -> int:
     options = ("config", "from", "esc", "name", "base_id", "id_step", "node")
     if all(vars(args)[option] is None for option in options):
-        args.config = announced_config()
+        args.config = announced_config(with_nodes=args.canopen)
     text = dbc_text(_canopen(args) if args.canopen else _database(args))
     encoding = "cp1252"  # what tools assume; usually the text is ASCII
     try:

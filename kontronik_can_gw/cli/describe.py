@@ -27,7 +27,8 @@ OPTIONS = (
 # fmt: on
 EPILOG = """\
 Messages and signals of the DBC in use, the CANopen nodes with their objects and emergencies, values, error bits and states with
-meaning and remedy. With -c as that configuration sends them. Otherwise of the shipped DBC and EDS, node-IDs from 1.
+meaning and remedy. With -c, or where there is a gateway.toml, as that
+configuration sends them. Otherwise, and with --dbc, of the shipped EDS, node-IDs from 1, and that DBC or the shipped one.
 
 md is for a repository or wiki, json for programs (its keys only change with "version").
 

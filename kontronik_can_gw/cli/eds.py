@@ -11,12 +11,11 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.storage import VERIFY
-from kontronik_can_gw.cli.arguments import OUTPUT, default_config, number_from, option
-from kontronik_can_gw.cli.common import canopen_of, load_all, say
+from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
+from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.nodes import shipped_canopen
-from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
@@ -57,11 +56,8 @@ def _loaded(args: argparse.Namespace) -> Loaded | None:
     """The configuration that is named, else that of this folder or machine if it has nodes."""
     if args.config is not None:
         return load_all(args.config)
-    path = default_config()
-    if path is None or not load(path).canopen.enabled:
-        return None
-    say(f"by {path}")
-    return load_all(path)
+    path = announced_config(with_nodes=True)
+    return None if path is None else load_all(path)
 
 
 def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, name: str) -> str:

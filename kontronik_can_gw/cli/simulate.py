@@ -49,6 +49,10 @@ def _time_ns(text: str) -> int:
 
 def _dropout(text: str) -> Dropout:
     duration, _, interval = text.partition("/")
+    if not interval:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: the interval is missing. Give for example 2s/10s"
+        )
     dropout = Dropout(_time_ns(duration), _time_ns(interval))
     if dropout.duration_ns >= dropout.interval_ns:
         raise argparse.ArgumentTypeError(
@@ -64,6 +68,10 @@ def _error(text: str) -> ErrorWindow:
     if key not in _BITS:
         near = did_you_mean(key, _BITS, or_known=True)
         raise argparse.ArgumentTypeError(f"{name!r} is not an error bit.{near}")
+    if not start:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: the time is missing. Give for example undervoltage@5s+2s"
+        )
     return ErrorWindow(_BITS[key], _time_ns(start), _time_ns(duration) if plus else None)
 
 

@@ -94,6 +94,14 @@ class DronecanSetup:
             )
         return found
 
+    def summary(self) -> list[str]:
+        first = self.given.table.first_index
+        return [
+            f"DroneCAN  {f'node {node.node_id}' if node.node_id else 'node-ID by an allocator'}, {node.name}: esc_index "
+            + " to ".join(dict.fromkeys(str(first + n) for n in (node.escs[0], node.escs[-1])))
+            for node in self.nodes
+        ]
+
     def lines(self) -> list[str]:
         table, escs, found = self.given.table, self.escs, []
         for node in self.nodes:

@@ -23,4 +23,4 @@ def test_the_example_passes(vcan: str) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout
-    assert "4 passed" in done.stdout
+    assert "5 passed" in done.stdout
