@@ -27,7 +27,7 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
     ("service", "--print"):
         "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
-    ("service", "--force"): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
+    ("service", "--force"): "Leave it out: every file is written anew, and one that was another is kept as .bak.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
     ("status", "--interval"): "Type watch -n S kontronik-can-gw status.",
     ("mqtt", "--remove-discovery"):

@@ -28,6 +28,7 @@ from kontronik_can_gw.cli.service_files import (
     planned,
     put,
     remove,
+    take_away,
     unit,
 )
 from kontronik_can_gw.config.parse import load, parse
@@ -179,7 +180,9 @@ def _enable(args: argparse.Namespace, root: Path, own: Path, companions: list[st
             _call("systemctl", "enable", name)
             if args.now:
                 _call("systemctl", "restart", name)
-        say(f"{name} is enabled{' and runs' if args.now else ''}. See: systemctl status {name}")
+        say(
+            f"{name} is enabled{' and runs' if args.now and not args.root else ''}. See: systemctl status {name}"
+        )
 
 
 def _not_ready(own: Path) -> list[str]:
@@ -265,23 +268,30 @@ def _uninstall(args: argparse.Namespace) -> int:
     found = [path for path in links if any(map(path.match, _units(args.instance)))]
     data: list[Path] = []
     if not args.instance:
-        places = [*(place for place, _ in planned("", COMPANIONS, "*", 1)), *OBSOLETE]
-        found += [path for place in places for path in root.glob(place)]
+        files = list(planned("", COMPANIONS, "*", 1))
+        texts = {path: text for place, text in files for path in root.glob(place)}
+        found += [*texts, *(path for place in OBSOLETE for path in root.glob(place))]
         folders = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*")
-        data = [path for place in folders for path in root.glob(place)]
+        for path, text in () if args.purge else texts.items():
+            take_away(path, text)
+        data = [
+            path
+            for place in (*folders, *(f"{place}.bak*" for place, _ in files))
+            for path in root.glob(place)
+        ]
         if args.purge:
-            data += [path for place in places for path in root.glob(f"{place}.bak")]
             found, data = [*found, *data], []
     for path in found:
         remove(path)
     for folder in root.glob(f"{UNITS}/{NAME}*.service.d"):
         with contextlib.suppress(OSError):  # it holds drop-ins of others
             folder.rmdir()
+    held = Path("/proc/locks").read_text()
+    names = [f"{NAME}-{args.instance}"] if args.instance else [NAME, f"{NAME}-*"]
+    for folder in (path for name in names for path in root.glob(f"run/{name}")):
+        if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
+            remove(folder)
     if args.root is None and not args.instance:
-        held = Path("/proc/locks").read_text()
-        for folder in (path for name in (NAME, f"{NAME}-*") for path in Path("/run").glob(name)):
-            if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
-                remove(folder)
         _call("systemctl", "daemon-reload")
         if args.purge:
             _run("userdel", NAME)

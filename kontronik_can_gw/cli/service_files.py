@@ -1,5 +1,8 @@
 """The files that ``service`` installs: copies of those in the package's folder ``service``, with the path of the program in the units."""
 
+import itertools
+import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -52,17 +55,40 @@ def _plain(name: str) -> str:
 
 
 def put(path: Path, text: str) -> None:
-    """Write a file that all may read; another one of that name is kept as .bak."""
+    """Write a file that all may read; another one of that name is kept beside it, and named."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
     done = "new"
     if path.exists() or path.is_symlink():
         if path.is_file() and path.read_text(encoding="utf-8", errors="replace") == text:
             return
-        path.replace(f"{path}.bak")
-        done = f"replaced, the one before is {path.name}.bak"
+        kept = _set_aside(path)
+        done = f"replaced, the one before is {kept}"
+        if path.suffix == ".rules":  # 0.5.0's asked for names of ports in it
+            done += f". Your lines are in {kept}: put them into 71-esc.rules"
     path.write_text(text, encoding="utf-8")
     path.chmod(0o644)
     say(f"{path}: {done}")
+
+
+def take_away(path: Path, text: str) -> None:
+    """Remove a file whose text ``planned`` gives, with any program, interface and bit rate; keep another one aside, and name it."""
+    found = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
+    if _without_choices(found) == _without_choices(text):
+        remove(path)
+    else:
+        say(f"{path}: was changed, kept as {_set_aside(path)}")
+
+
+def _set_aside(path: Path) -> str:
+    """Rename a file to the first free name of .bak, .bak2 and so on; the name."""
+    names = (f"{path.name}.bak{number if number > 1 else ''}" for number in itertools.count(1))
+    name = next(name for name in names if not os.path.lexists(path.with_name(name)))
+    path.rename(path.with_name(name))
+    return name
+
+
+def _without_choices(text: str) -> str:
+    return re.sub(r"(?m)^(ExecStart|Name|OriginalName|BitRate)=\S*", r"\1=", text)
 
 
 def remove(path: Path) -> None:

@@ -143,11 +143,11 @@ def root(request: pytest.FixtureRequest, work: Path) -> Iterator[Root]:
 both_releases = pytest.mark.parametrize("root", RELEASES, indirect=True)
 
 
-def purge(root: Root, before: dict[str, str]) -> None:
+def purge(root: Root, before: dict[str, str], *left: str) -> None:
     root.run("apt-get", "purge", "-y", "kontronik-can-gw")
     after = root.files()
     assert {name: after.get(name) for name in before} == before
-    assert sorted(set(after) - set(before)) == []
+    assert sorted(set(after) - set(before)) == sorted(left)
 
 
 def test_lintian_has_nothing_to_say(packages: dict[str, Path]) -> None:
@@ -286,7 +286,10 @@ def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
     assert root.text(CONFIGURATION) == configuration
     assert not (root.path / "usr/lib/kontronik-can-gw").exists()
     shutil.rmtree(root.path / "opt/kontronik-can-gw")
-    purge(root, before)
+    network = (
+        f"etc/systemd/network/50-kontronik-can-gw-can0.{kind}" for kind in ("link", "network")
+    )
+    purge(root, before, *network)
 
 
 @both_releases
@@ -313,13 +316,15 @@ def test_a_running_gateway_goes_on_after_an_upgrade_and_ends_with_the_package(
 
 
 def newer(package: Path, folder: Path) -> Path:
-    """The same as version 99, as newer.deb of a folder."""
+    """The same as version 99 with other units, as newer.deb of a folder."""
     folder.mkdir(exist_ok=True)
     made = folder / "newer.deb"
     with tempfile.TemporaryDirectory(dir=folder) as tree:
         subprocess.run(["dpkg-deb", "-R", package, f"{tree}/x"], check=True)
         control = Path(tree, "x/DEBIAN/control")
         control.write_text(re.sub("(?m)^Version: .*", "Version: 99", control.read_text()))
+        for unit in Path(tree, "x/usr/lib/systemd/system").glob("*.service"):
+            unit.write_text(unit.read_text() + "# newer\n")
         command = ["dpkg-deb", "--root-owner-group", "-Zgzip", "-b", f"{tree}/x", str(made)]
         subprocess.run(command, check=True)
     return made

@@ -7,6 +7,7 @@ That they can be installed, upgraded and removed, and that the gateway runs from
 import gzip
 import importlib.metadata
 import io
+import os
 import re
 import shutil
 import subprocess
@@ -20,6 +21,8 @@ import make_deb
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from kontronik_can_gw.cli.service_files import COMPANIONS, planned
 
 PROJECT = make_deb.PROJECT
 LEFT_OUT = {"wrapt", "markdown-it-py", "pygments", "argparse-addons", "crccheck"}
@@ -147,6 +150,84 @@ def test_maintainer_scripts_are_shell(name: str) -> None:
     script = make_deb.HERE / name
     assert script.read_text().startswith("#!/bin/sh\n")
     subprocess.run(["sh", "-n", script], check=True)
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Path:
+    """A root with the package's files of the service, the scripts moved into it, and stand-ins for the tools they call."""
+    make_deb.put_service(tmp_path)
+    for name in ("take-over", *make_deb.SCRIPTS):
+        script = (make_deb.HERE / name).read_text()
+        script, count = re.subn(r"/(etc|usr/lib|var|run)(?=/|\s)", rf"{tmp_path}/\1", script)
+        assert count
+        make_deb.put(tmp_path / "usr/lib/kontronik-can-gw" / name, script, 0o755)
+    for name in ("py3clean", "getent", "userdel", "systemctl"):
+        make_deb.put(tmp_path / "bin" / name, f'#!/bin/sh\necho {name} "$@"\n', 0o755)
+    return tmp_path
+
+
+def script(board: Path, name: str, *words: str) -> str:
+    """What a script of the package prints in the root."""
+    path = board / "usr/lib/kontronik-can-gw" / name
+    environment = os.environ | {"PATH": f"{board}/bin:{os.environ['PATH']}"}
+    done = subprocess.run(
+        [path, *words], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def installed(board: Path) -> list[Path]:
+    """What `service install` of a program in /opt writes."""
+    files = planned("/opt/x/bin/kontronik-can-gw", COMPANIONS, "can0", 500_000)
+    for place, content in files:
+        make_deb.put(board / place, content)
+    return sorted(path for path in (board / "etc").rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("words", [("take-over",), ("prerm", "upgrade", "99"), ("prerm", "remove")])
+def test_the_package_takes_over_what_service_install_wrote(
+    board: Path, words: tuple[str, ...]
+) -> None:
+    """And before another version's files take the place of those to compare with."""
+    installed(board)
+    link = board / "etc/systemd/system/multi-user.target.wants/kontronik-can-gw@left.service"
+    link.parent.mkdir()
+    link.symlink_to(board / "etc/systemd/system/kontronik-can-gw@.service")
+    assert "changed by hand" not in script(board, *words)
+    left = {str(path.relative_to(board / "etc")) for path in (board / "etc").rglob("*")}
+    network = "systemd/network/50-kontronik-can-gw-can0"
+    folders = ["sysusers.d", "systemd", "systemd/network", "systemd/system", "tmpfiles.d"]
+    assert left == {
+        *(*folders, "udev", "udev/rules.d", f"{network}.link", f"{network}.network"),
+        *(str(path.relative_to(board / "etc")) for path in (link.parent, link)),
+    }
+    assert link.readlink() == board / "usr/lib/systemd/system/kontronik-can-gw@.service"
+
+
+def test_what_was_changed_by_hand_stays_and_is_named(board: Path) -> None:
+    files = installed(board)
+    for path in files:
+        path.write_text(path.read_text() + "# mine\n")
+    said = script(board, "take-over").splitlines()
+    suffix = ": was changed by hand, kept in place of the package's"
+    named = {f"{path}{suffix}" for path in files if path.parent.name != "network"}
+    assert set(said) == named
+    assert all(path.exists() for path in files)
+
+
+def test_a_purge_leaves_network_files_and_what_another_installation_needs(board: Path) -> None:
+    kept = [board / "etc/kontronik-can-gw/gateway.toml", board / "var/lib/kontronik-can-gw/esc1"]
+    for path in kept:
+        make_deb.put(path, "x")
+    installed(board)
+    said = script(board, "postrm", "purge")
+    assert ".service: is not the package's; configurations" in said and "userdel" not in said
+    assert all(path.exists() for path in kept)
+    script(board, "take-over")
+    assert "userdel kontronik-can-gw" in script(board, "postrm", "purge")
+    left = [path.name for name in ("etc", "var") for path in (board / name).rglob("*kontronik*")]
+    assert sorted(left) == [f"50-kontronik-can-gw-can0.{kind}" for kind in ("link", "network")]
 
 
 def test_every_library_is_pinned_or_left_out_by_name() -> None:

@@ -114,7 +114,7 @@ def test_an_edited_configuration_is_kept_and_its_services_are_enabled(
         name: f"/etc/systemd/system/{name}"
         for name in ("kontronik-can-gw.service", "kontronik-can-gw-metrics.service")
     }
-    assert install(root).code == 0
+    assert "runs" not in install(root, "--now").err  # below a folder nothing does
 
 
 def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
@@ -162,7 +162,10 @@ def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path, wants:
         f"kontronik-can-gw@{name}.service": template for name in ("left", "right")
     }
     assert not (root / CONFIGURATION).exists()
+    for name in ("left", "right"):
+        (root / f"run/kontronik-can-gw-{name}").mkdir(parents=True)
     uninstall(root, "--instance", "left")
+    assert [path.name for path in (root / "run").iterdir()] == ["kontronik-can-gw-right"]
     assert [link.name for link in wants.iterdir()] == ["kontronik-can-gw@right.service"]
     assert (root / template.lstrip("/")).exists()
     uninstall(root)
@@ -195,9 +198,26 @@ def test_installing_twice_changes_nothing_and_what_was_another_is_kept_aside(roo
     rules = root / RULES
     before = rules.read_text()
     rules.write_text(before + "# mine\n")
-    assert f"{rules}: replaced, the one before is {rules.name}.bak\n" in install(root).err
+    said = f"{rules}: replaced, the one before is {rules.name}.bak. Your lines are in {rules.name}.bak: put them into 71-esc.rules\n"
+    assert said in install(root).err
     assert rules.read_text() == before
+    rules.write_text(before + "# mine, again\n")
+    assert f"replaced, the one before is {rules.name}.bak2" in install(root).err
     assert rules.with_name(f"{rules.name}.bak").read_text() == before + "# mine\n"
+    assert rules.with_name(f"{rules.name}.bak2").read_text() == before + "# mine, again\n"
+    uninstall(root, "--purge")
+    assert tree(root) == []
+
+
+@pytest.mark.parametrize("name", [UNIT, RULES, f"{NETWORK}.network"])
+def test_uninstall_keeps_what_was_changed_and_names_it(root: Path, name: str) -> None:
+    install(root, "--network", 250_000)
+    path = root / name
+    path.write_text(path.read_text() + "# mine\n")
+    said = uninstall(root)
+    assert f"{path}: was changed, kept as {path.name}.bak\n" in said
+    assert tree(root) == sorted([CONFIGURATION, f"{name}.bak"])
+    assert (root / f"{name}.bak").read_text().endswith("# mine\n")
     uninstall(root, "--purge")
     assert tree(root) == []
 
