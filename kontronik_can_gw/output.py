@@ -48,10 +48,11 @@ class Output:
         """What is to be logged of such a change; the owner empties it."""
 
     @property
-    def marks(self) -> tuple[int, ...]:
+    def marks(self) -> tuple[object, ...]:
         """Others where something has changed that the runtime follows, but for ``frames``."""
-        ids, changes = id(self.receive_ids), self.state_changes
-        return ids, changes, len(self.saves), len(self.rejected_parameters)
+        ids, changes = self.receive_ids, self.state_changes
+        # ids of the same content may be others; as long as they are held, nothing else has their address
+        return id(ids), changes, len(self.saves), len(self.rejected_parameters), ids
 
     def own_ids(self) -> Mapping[int, Owner]:
         """The ids, and blocks of ids, that only this output sends with, and what for."""

@@ -6,7 +6,7 @@ from textwrap import wrap
 
 from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.esc.decoder import Data, ErrorBit, Severity
-from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry
+from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
 from kontronik_can_gw.esc.values import Kind, Value, scaled, steps_of, values_of
 
 SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
@@ -65,11 +65,17 @@ class EscReport:
             return types.ERROR
         return types.WARNING if any(word >> bit & 1 for bit in self._bits) else types.OK
 
-    def follow(self) -> None:
-        """Count errors that begin; not those of the link's return, which may be old."""
+    def follow(self, events: int) -> None:
+        """Count errors that begin; not those of the link's return, which may be old. ``events``: bits of Event."""
         word = self.word
-        self._onsets += (word & ~self._before & self._errors).bit_count()
+        if not events & Event.LINK:
+            self._onsets += (word & ~self._before & self._errors).bit_count()
         self._before = word
+
+    def log_anew(self) -> None:
+        """Log what is on once more, at once."""
+        self._logged = 0
+        self._quiet_until.clear()
 
     def status(self) -> bytes | None:
         """esc.Status; None without fresh telemetry: its speed has no value for that, so silence it is."""

@@ -82,7 +82,12 @@ class Dronecan(Output):
             node.say_status(self._status_of(node, now, types.OFFLINE))
 
     def can_returned(self, now: int) -> None:
+        self._log_anew()
         self._all_due(now)
+
+    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
+        if before is CanState.BUS_OFF and state not in (CanState.BUS_OFF, CanState.DOWN):
+            self._log_anew()
 
     def make_anew(self, now: int) -> None:
         self._all_due(now)
@@ -91,7 +96,7 @@ class Dronecan(Output):
         return self._due
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        self._reports[esc].follow()
+        self._reports[esc].follow(events)
 
     def collision(self, esc: int, present: bool, now: int) -> None:
         self._nodes[esc].is_duplicate = present
@@ -194,6 +199,11 @@ class Dronecan(Output):
             for report in node.reports:
                 for message in report.log(now):
                     node.send(types.LOG_MESSAGE, message, queued=True)
+
+    def _log_anew(self) -> None:
+        """What was logged may never have reached the bus."""
+        for report in self._reports:
+            report.log_anew()
 
     def _status_of(self, node: Node, now: int, mode: int = types.OPERATIONAL) -> bytes:
         bus_is_well = self._gateway.can_state not in (CanState.ERROR_PASSIVE, CanState.BUS_OFF)

@@ -101,6 +101,8 @@ class Turns:
         count = state.unsent + len(frames)
         if state.unsent != state.spoken or count > _MADE or not all(map(_is_plain, frames)):
             return False
+        if not state.unsent:  # nothing waits: when the bus was full before says nothing of these
+            state.full_since = state.now
         at = _Turns.frames.offset + state.unsent * _FRAME_SIZE
         for can_id, data, extended, *_ in frames:
             number = can_id | EXTENDED if extended else can_id

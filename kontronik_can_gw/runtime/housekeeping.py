@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Sequence
+from copy import copy
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -106,7 +107,7 @@ class Housekeeping:
                 can=_can_facts(self._can, self._conditions),
                 store=self._saver.facts(),
                 log_lines=list(self._conditions.recent),
-                recorder=None if self._recorder is None else self._recorder.facts,
+                recorder=None if self._recorder is None else copy(self._recorder.facts),
             )
             statistics.publish(now, make)
         self._log(statistics.reports(now), now)

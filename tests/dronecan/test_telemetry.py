@@ -111,6 +111,16 @@ def test_error_count_is_that_of_errors_since_the_motor_was_started() -> None:
     assert counts == [0, 1, 1, 0, 1, 1, 3, 3, 3, 0]
 
 
+def test_errors_that_telemetry_comes_back_with_are_not_counted_and_those_after_it_are() -> None:
+    bench = Bench()
+    counts = []
+    for errors in (1 << HOT, 0, None, 1 << HOT, 1 << HOT | 1, 0, 1 << HOT):
+        bench.live[0] = None if errors is None else LIVE._replace(operating_errors=errors)
+        bench.run(1)
+        counts.append(bench.of("Status")[-1].payload.error_count)
+    assert counts == [0, 0, 0, 0, 1, 1, 2]
+
+
 @pytest.mark.parametrize("health", ["gateway", "esc"])
 def test_errors_of_an_esc_count_in_health_by_choice_only(health: str) -> None:
     bench = Bench(2, per_esc_nodes=True, health=health).run(0.5)
@@ -223,6 +233,28 @@ def test_a_can_interface_that_returns_is_greeted() -> None:
     bench.gateway.advance(bench.now)
     bench.take()
     assert bench.read[0].name == "NodeStatus"
+
+
+@pytest.mark.parametrize("is_bus_off", [False, True])
+def test_errors_that_began_while_nothing_reached_the_bus_are_logged_when_it_returns(
+    is_bus_off: bool,
+) -> None:
+    bench = Bench().run(0.5)
+    if is_bus_off:
+        bench.gateway.set_can_state(CanState.BUS_OFF, bench.now)
+    bench.passes = lambda _frame: False
+    bench.live[0] = LIVE._replace(operating_errors=1 << WARM)
+    bench.run(3)
+    bench.passes = lambda _frame: True
+    bench.run(15)
+    assert not bench.of("LogMessage")
+    if is_bus_off:
+        bench.gateway.set_can_state(CanState.ERROR_ACTIVE, bench.now)
+    else:
+        bench.gateway.can_returned(bench.now)
+    bench.run(1)
+    texts = [bytes(each.payload.text.to_bytes()).decode() for each in bench.of("LogMessage")]
+    assert " ".join(texts) == f"e0: {WARM.meaning}. {WARM.remedy}"
 
 
 def test_what_is_no_frame_of_dronecan_is_nothing_to_it() -> None:

@@ -9,7 +9,7 @@ from kontronik_can_gw.esc.values import VALUES, steps
 from kontronik_can_gw.frames import EXTENDED, CanFrame, id_block
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.output import Output, Owner
+from kontronik_can_gw.output import NO_IDS, Output, Owner
 from kontronik_can_gw.signals.plan import Layout
 
 FIRST_ID, COMMAND_ID = 0x1234500, 0x12
@@ -49,6 +49,16 @@ class Voltages(Output):
         value = steps(VALUES["battery_voltage"], self._escs[esc], self._gateway, now)
         data = (0xFFFF if value is None else value).to_bytes(2, "little")
         self.frames.append(CanFrame(FIRST_ID + esc, data, extended=True))
+
+
+def test_other_receive_ids_are_noticed_whatever_their_content_and_address() -> None:
+    output = Output()
+    for number in range(100):
+        before, again = output.marks, output.marks
+        assert before == again
+        output.receive_ids = NO_IDS  # the memory of the old ones may be used again
+        output.receive_ids = frozenset((number // 2,))
+        assert output.marks != before
 
 
 def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:

@@ -36,6 +36,8 @@ from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.native_poller import NativePoller
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
+from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.transmit_queue import Sent
 
 _HEAD = struct.Struct("=IBBBB")
 
@@ -233,6 +235,38 @@ def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], 
         return method(*arguments)
 
     patch.setattr(of, name, noted)
+
+
+def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_is_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That the bus took nothing counts from then on: it is no stall, and nothing is lost."""
+    monkeypatch.setenv(load.PURE, "0")
+    world = wire_world.World()
+    escs = (EscSettings("esc1"),)
+    nothing = Layout("", "", ())
+    loop = wire_world.loop_in(world, monkeypatch, escs, nothing, canopen=_nodes(escs, True))
+    loop.open()
+    loop.begin()
+    wire, begun = world.wires[0], world.now
+    for n in range(600):
+        frame = encode(LiveData(operating_errors=(n >= 530) << 20), WireLayout.V4)
+        wire.put(frame, [begun + n * 10 * MS] * len(frame))
+    wire_world.run(loop, world, begun + SECOND)
+    assert 0x181 in dict(world.bus.take())
+    world.bus.came(0, b"\x80\x01")  # pre-operational: heartbeats and emergencies remain
+    wire_world.run(loop, world, begun + 5295 * MS)  # between two heartbeats
+    world.bus.frame_ns = 30 * MS
+    while world.bus.send(CanFrame(0x700, b"")) is Sent.OK:
+        pass
+    wire_world.run(loop, world, begun + 6 * SECOND)
+    status, transmitter = loop.can._gateway.status, loop.can.transmitter
+    assert (transmitter.is_stalled, status.dropped_frames) == (False, 0)
+    (at,) = [
+        at for at, f in world.bus.sent if f.can_id == EMERGENCY + 1 and at > begun + 4 * SECOND
+    ]
+    assert at < begun + 5600 * MS
+    loop.close()
 
 
 @pytest.mark.parametrize("seed", range(2))

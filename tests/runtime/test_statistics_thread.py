@@ -10,14 +10,17 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from wire_world import World, loop_in
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime import statistics as statistics_module
 from kontronik_can_gw.runtime.locks import Locks
+from kontronik_can_gw.runtime.recorder import RecorderFacts
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 from kontronik_can_gw.runtime.statistics import PERIOD_NS, Statistics
 from kontronik_can_gw.runtime.worker import Report
@@ -254,3 +257,24 @@ def test_all_signals_are_blocked_in_the_thread_and_in_no_other(file: Path) -> No
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
         assert blocked >> number - 1 & 1
     statistics.close()
+
+
+def test_a_document_has_the_recorder_as_it_was_when_it_was_published(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The recorder's thread goes on while the statistics' thread makes it."""
+    loop = loop_in(World(), monkeypatch)
+    made: list[Callable[[], dict[str, Any]]] = []
+    facts = RecorderFacts("one.kcap", 1000)
+    keeping = loop._housekeeping
+    monkeypatch.setattr(keeping, "_recorder", SimpleNamespace(facts=facts))
+    statistics = SimpleNamespace(
+        wanted=lambda _now: True,
+        publish=lambda _now, make: made.append(make),
+        reports=lambda _now: [],
+    )
+    monkeypatch.setattr(keeping, "_statistics", statistics)
+    keeping.publish(7 * SECOND)
+    before = dict(vars(facts))
+    facts.file, facts.bytes, facts.problem = "", 2000, "the disk is full"
+    assert made[0]()["recording"] == before
