@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from wire_world import CAN_FD, Bus, World
@@ -14,12 +15,19 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime import can_controller, can_link
+from kontronik_can_gw.runtime import can_controller, can_link, locks
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.transmit_queue import Sent
+
+
+@pytest.fixture(autouse=True)
+def locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or a test of this file that runs at the same time in another process is another gateway with the same node."""
+    monkeypatch.setattr(locks, "lock_folder", lambda: tmp_path / "lock")
+
 
 ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))
 OFF = ACTIVE._replace(state=CanState.BUS_OFF)
