@@ -369,10 +369,8 @@ def check_log(path: Path, truth: Truth, decoded: Decoded) -> tuple[Verdict, Fram
     if len(got.times) != len(times):
         verdict.say(1, f"{path.name}: has {len(got.times)} frames, must have {len(times)}")
         return verdict, got
-    # a converted log goes on with the clock as it began, a replayed one has the time of day as it was told then
+    # a converted log goes on with the clock as it began
     wall = truth.recording.wall_ns(times[:1])[0] + times - times[0]
-    if path.stem == "replayed":
-        wall = np.maximum.accumulate(truth.recording.wall_ns(times))
     # its own microsecond, and half of what a float of Unix seconds can tell apart
     verdict.times("time", got.times, wall, 500 + 250 + (600 if path.suffix == ".trc" else 0))
     for what, mine, theirs in (("id", got.ids, ids), ("data", got.data, data)):

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.extended
 NAMES = (
     *(f"convert to {form}" for form in (*hour_check.TABLES, *hour_check.LOGS)),
     *(f"convert {form} to csv" for form in hour_check.LOGS),
-    *("replay to log", "convert to bin", "decode the bin", "report", "monitor --once"),
+    *("convert to bin", "decode the bin", "report", "monitor --once"),
 )
 
 

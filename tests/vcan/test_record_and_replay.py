@@ -157,7 +157,7 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
         assert gateway.end() == 0
         sent = {live.battery_voltage for live in run.live(0)}
     link = tmp_path / "played"
-    words = f"replay {folder} --to pty --link {link} --delay 4".split()
+    words = f"replay {folder} --on pty --link {link} --delay 4".split()
     quiet = subprocess.DEVNULL
     with (
         subprocess.Popen([*PROGRAM, *words], stdout=quiet, stderr=quiet) as player,
