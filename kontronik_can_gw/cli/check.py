@@ -1,10 +1,11 @@
 """``check``: says in short whether a configuration can be used and what it sends, without opening anything."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.traffic import bits_per_second, frames_per_second
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file, option
 from kontronik_can_gw.cli.check_details import can_id, details, lost, source, timing
@@ -40,16 +41,17 @@ def main(args: argparse.Namespace) -> int:
         print(printable_json({"file": str(path), "mistakes": list(error.problems)}, indent=2))
         return error.exit_code
     warnings = [*loaded.layout.warnings, *loaded.warnings, *_examples(loaded)]
+    nodes = [] if loaded.canopen is None else loaded.canopen.nodes(loaded.escs).nodes
     if args.json:
-        print(printable_json(document(path, loaded, warnings), indent=2))
+        print(printable_json(document(path, loaded, nodes, warnings), indent=2))
         return 0
     for warning in warnings:
         say(f"warning: {warning}")
-    for line in summary(path, loaded, len(warnings)):
+    for line in summary(path, loaded, nodes, len(warnings)):
         show(line)
     if args.verbose:
         show()
-        for line in details(loaded):
+        for line in details(loaded, nodes):
             show(line)
     return 0
 
@@ -64,7 +66,7 @@ def _examples(loaded: Loaded) -> Iterator[str]:
             )
 
 
-def summary(path: Path, loaded: Loaded, warnings: int) -> Iterator[str]:
+def summary(path: Path, loaded: Loaded, nodes: Sequence[Node], warnings: int) -> Iterator[str]:
     """What the gateway reads and sends, in a few lines that fit 80 columns."""
     config, layout = loaded.config, loaded.layout
     found = _counted(warnings, "warning") if warnings else "no warnings"
@@ -82,18 +84,15 @@ def summary(path: Path, loaded: Loaded, warnings: int) -> Iterator[str]:
         span = f", {' to '.join(dict.fromkeys((ids[0], ids[-1])))}" if ids else ""
         yield f"  DBC       {_counted(len(layout.messages), 'message')}{span}, layout {layout.fingerprint}"
         yield f"            {layout.file}"
-    if loaded.canopen is not None:
-        for node, each in zip(loaded.canopen.nodes(loaded.escs).nodes, loaded.escs, strict=True):
-            sent = (
-                f"node {node.node_id}, {_counted(sum(tpdo.valid for tpdo in node.tpdos), 'TPDO')}"
-            )
-            yield f"  CANopen   {each.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else sent}"
+    for node, each in zip(nodes, loaded.escs, strict=False):  # none, or one for each
+        sent = f"node {node.node_id}, {_counted(sum(tpdo.valid for tpdo in node.tpdos), 'TPDO')}"
+        yield f"  CANopen   {each.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else sent}"
     for output in loaded.outputs:
         for line in output.summary():
             yield f"  {line}"
     if (folder := record_folder(config)) is not None:
         yield f"  captures  {in_words(config, folder)}"
-    load, frames = _traffic(loaded)
+    load, frames = _traffic(loaded, nodes)
     yield f"  bus load  {load:.1%}, {frames:.0f} frames/s: ESCs at 100 Hz, worst stuffing, no SDO"
 
 
@@ -101,15 +100,11 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def _traffic(loaded: Loaded) -> tuple[float, float]:
+def _traffic(loaded: Loaded, nodes: Sequence[Node]) -> tuple[float, float]:
     """Share of the bus and frames a second. What is sent on change is counted by its cycle."""
     can, layout = loaded.config.can, loaded.layout
-    load = layout.bus_load(can.bitrate, can.data_bitrate)
-    frames = sum(message.rate_hz for message in layout.messages)
-    if loaded.canopen is not None:
-        nodes = loaded.canopen.nodes(loaded.escs).nodes
-        load += bits_per_second(nodes) / can.bitrate
-        frames += frames_per_second(nodes)
+    load = layout.bus_load(can.bitrate, can.data_bitrate) + bits_per_second(nodes) / can.bitrate
+    frames = sum(message.rate_hz for message in layout.messages) + frames_per_second(nodes)
     for output in loaded.outputs:
         more, bits = output.traffic()
         load += bits / can.bitrate
@@ -117,12 +112,13 @@ def _traffic(loaded: Loaded) -> tuple[float, float]:
     return load, frames
 
 
-def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
+def document(
+    path: Path, loaded: Loaded, nodes: Sequence[Node], warnings: list[str]
+) -> dict[str, Any]:
     """The same as JSON, with every message and signal."""
     config, layout = loaded.config, loaded.layout
     names = [esc.name for esc in loaded.escs]
-    load, frames = _traffic(loaded)
-    nodes = [] if loaded.canopen is None else loaded.canopen.nodes(loaded.escs).nodes
+    load, frames = _traffic(loaded, nodes)
     return {
         "file": str(path),
         "mistakes": [],

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Iterator, Sequence
 
 from kontronik_can_gw.canopen.cob_ids import all_ids
-from kontronik_can_gw.canopen.nodes import Nodes
+from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
 from kontronik_can_gw.config.assemble import Loaded
@@ -16,7 +16,7 @@ from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 
-def details(loaded: Loaded) -> Iterator[str]:
+def details(loaded: Loaded, nodes: Sequence[Node]) -> Iterator[str]:
     """The effective configuration, each message and signal with its source, what is lost, and each node with its COB-IDs."""
     config, layout = loaded.config, loaded.layout
     yield f"# effective configuration of {config.file}"
@@ -28,7 +28,7 @@ def details(loaded: Loaded) -> Iterator[str]:
         yield from unbound(layout)
     if loaded.canopen is not None:
         yield f"# CANopen nodes by {loaded.canopen.eds.name}"
-        yield from node_table(loaded.canopen.nodes(loaded.escs), loaded)
+        yield from node_table(nodes, loaded)
         yield ""
     for output in loaded.outputs:
         yield f"# {output.title}"
@@ -36,10 +36,10 @@ def details(loaded: Loaded) -> Iterator[str]:
         yield ""
 
 
-def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
+def node_table(nodes: Sequence[Node], loaded: Loaded) -> list[str]:
     """Each node's COB-IDs and PDOs in columns."""
     rows: list[tuple[str, ...]] = [("node", "COB-ID", "what", "sent", "objects")]
-    for node, esc in zip(nodes.nodes, loaded.escs, strict=True):
+    for node, esc in zip(nodes, loaded.escs, strict=True):
         if node.node_id == UNCONFIGURED:
             serial = f"serial number {node.identity.identity[3]}"
             rows.append((f"{esc.name}: waits for LSS", "7E5h", "LSS", "", serial))

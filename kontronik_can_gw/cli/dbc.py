@@ -61,7 +61,7 @@ OPTIONS = (
 # fmt: on
 EPILOG = (
     "Prints a DBC that every tool reads; warnings go to standard error. With -c its VERSION ends with the layout's fingerprint, "
-    "which check, status, captures and report show too: so an old file can be told. "
+    "which check, status, captures and report show too: an old file is recognized by it. "
     "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or DBC."
 )
 
