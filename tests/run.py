@@ -39,6 +39,8 @@ PATH = os.pathsep.join(
     [str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"]
 )
 NOT_JUDGED = "not judged"
+MESSAGE = 2000
+"""Characters of a failed test's message that the summary repeats, for who sees no more than the end of the output."""
 
 PYTEST = "python -m pytest -q --junitxml={report}"
 ON_VCAN = f"KCG_VCAN=1 HYPOTHESIS_STORAGE_DIRECTORY={{scratch}} python tests/vm/vm_run.py --timeout=1500 --rw={{scratch}} -- {PYTEST} "
@@ -125,6 +127,8 @@ class Result:
     passed: int = 0
     failed: int = 0
     skipped: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    """Name and message of each failed test of a JUnit report."""
     note: str = ""
     enable: str = ""
 
@@ -136,15 +140,16 @@ class Result:
 def read_report(report: Path, result: Result) -> None:
     """Add the counts of a JUnit report."""
     for case in ET.parse(report).getroot().iter("testcase"):
+        name = f"{case.get('classname', '')}.{case.get('name', '')}"
         skipped = case.find("skipped")
-        if case.find("failure") is not None or case.find("error") is not None:
+        failures = [*case.findall("failure"), *case.findall("error")]
+        if failures:
             result.failed += 1
+            result.failures += [f"{name}: {each.get('message', '')}" for each in failures]
         elif skipped is None or skipped.get("type") == "pytest.xfail":
             result.passed += 1
         else:
-            result.skipped.append(
-                f"{case.get('classname', '')}.{case.get('name', '')}: {skipped.get('message', '')}"
-            )
+            result.skipped.append(f"{name}: {skipped.get('message', '')}")
 
 
 def missing(step: str) -> str:
@@ -241,6 +246,8 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
         print(f"not run: {result.step}: {result.note}\n    to enable it:  {result.enable}")
     for each in skipped:
         print(f"skipped: {each}")
+    for failure in (each for result in results for each in result.failures):
+        print(f"failed: {failure[:MESSAGE]}")
     avoidable = [each for each in skipped if NOT_JUDGED not in each]
     if strict and (unrun or avoidable):
         print("CI=true: what was not run is a failure")

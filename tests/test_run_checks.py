@@ -108,6 +108,23 @@ def test_the_last_line_has_the_totals(
     assert checks.summarize(results, strict=True) == strict_code
 
 
+def test_what_failed_is_named_with_its_message_before_the_totals(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "report.xml"
+    report.write_text(
+        '<testsuites><testsuite><testcase classname="faults.UML" name="CAN: down">'
+        '<failure message="recovered only after 7.00 s">trace</failure></testcase>'
+        '<testcase classname="tests.a" name="good"/></testsuite></testsuites>'
+    )
+    result = checks.Result("faults")
+    checks.read_report(report, result)
+    assert checks.summarize([result], strict=False) == 1
+    *_, failed, totals = capsys.readouterr().out.splitlines()
+    assert failed == "failed: faults.UML.CAN: down: recovered only after 7.00 s"
+    assert totals == "1 passed, 1 failed, 0 skipped"
+
+
 def test_every_step_is_in_one_tier_and_a_test_of_each_marker_is_run_somewhere() -> None:
     steps = [step for lanes in checks.TIERS.values() for lane in lanes for step in lane]
     assert sorted(steps) == sorted(checks.STEPS)
