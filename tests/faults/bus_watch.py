@@ -114,7 +114,7 @@ class Judge:
         self.emergencies: list[Emergency] = []
         self.fresh: list[deque[Fresh]] = [deque(maxlen=5_000) for _ in escs]
         """The EscSpeed frames that were right."""
-        self._longest_silence_ns = [0 for _ in escs]
+        self._silences: list[list[tuple[int, int]]] = [[] for _ in escs]
         self.last_ns = 0
         self._silent_since_ns = 0
         self._shown = [-1 for _ in escs]
@@ -230,23 +230,23 @@ class Judge:
         return len(old)
 
     def reset_silence(self) -> None:
-        """Measure the longest silence anew."""
+        """Note silences anew."""
         self._silent_since_ns = time.monotonic_ns()
-        self._longest_silence_ns = [0 for _ in self.escs]
+        self._silences = [[] for _ in self.escs]
 
-    def silence_ns(self, esc: int) -> int:
-        """How long at most, since ``reset_silence``, an ESC had sent something newer than the last right values on the bus.
+    def silences(self, esc: int, now_ns: int) -> list[tuple[int, int]]:
+        """Begin and end of each time since ``reset_silence`` in which an ESC had sent something newer than what was on the bus.
 
         (While it sends nothing, because it is off or its feeder is held up, the gateway cannot be silent.)
         """
-        return max(
-            self._longest_silence_ns[esc],
-            self._silence(esc, len(self.escs[esc].sent) - 1, time.monotonic_ns()),
-        )
+        return [*self._silences[esc], *self._silence(esc, len(self.escs[esc].sent) - 1, now_ns)]
 
-    def _silence(self, esc: int, n: int, at_ns: int) -> int:
+    def _silence(self, esc: int, n: int, at_ns: int) -> list[tuple[int, int]]:
         first = self._shown[esc] + 1
-        return at_ns - max(self.escs[esc].left(first), self._silent_since_ns) if first <= n else 0
+        if first > n:
+            return []
+        begin_ns = max(self.escs[esc].left(first), self._silent_since_ns)
+        return [(begin_ns, at_ns)] if at_ns > begin_ns else []
 
     # --- judging
 
@@ -270,8 +270,7 @@ class Judge:
             esc.seen[n] |= follows
             if follows == SPEED:
                 self.fresh[said.esc].append(Fresh(at_ns, n))
-                longest = self._longest_silence_ns
-                longest[said.esc] = max(longest[said.esc], self._silence(said.esc, n, at_ns))
+                self._silences[said.esc] += self._silence(said.esc, n, at_ns)
                 self._shown[said.esc] = n
 
     def _origin(self, said: Said, older: int, newest: int) -> Wrong:

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import benches
-from bus_watch import SECOND
 from fault_report import Report
 from harness import Bench, Injection, injected
 from process_faults import RESTART_LIMIT_S, TIMEOUT_OBJECT, start_and_wait
@@ -109,7 +108,7 @@ def slow(bench: Bench, injection: Injection, _n: int) -> None:
         master.store(1, 1)
     bench.wait_log("parameters stored", said, 40)
     took = time.monotonic() - begin
-    silence = max(map(bench.watch.silence_ns, range(len(bench.fed)))) / SECOND
+    silence = bench.longest_silence_s(range(len(bench.fed)))
     injection.row.peak("s to save", round(took, 1))
     injection.row.peak("longest silence in s", round(silence, 3))
     switch.unlink()

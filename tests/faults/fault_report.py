@@ -77,7 +77,7 @@ class Row:
     transmitted: int = 0
     """Bytes that the gateway sent to an ESC."""
     taken: float = 0.0
-    """The largest share of processor time that was taken from the virtual machine, over five seconds, while the fault ran."""
+    """The largest share of processor time that was taken from the virtual machine, over one second, while the fault ran."""
     notes: list[str] = field(default_factory=list)
     """What went wrong, for people."""
     figures: dict[str, float] = field(default_factory=dict)

@@ -388,6 +388,16 @@ class Bench:
         time.sleep(0.02)
         return (end_ns - begin_ns - self.metronome.stood_still(begin_ns, end_ns)) / SECOND
 
+    def longest_silence_s(self, escs: Iterable[int]) -> float:
+        """How long at most the gateway was silent of one of these ESCs since ``watch.reset_silence`` though the machine ran."""
+        self.watch.catch_up()
+        time.sleep(0.05)  # until the metronome has told of the last standstill
+        now = time.monotonic_ns()
+        silences = [each for esc in escs for each in self.watch.silences(esc, now)]
+        stood_still = self.metronome.stood_still
+        longest = [end - begin - stood_still(begin, end) for begin, end in silences]
+        return max(longest, default=0) / SECOND
+
     # --- accounts
 
     def leave_out(self, escs: Sequence[int] | range, begin_ns: int, end_ns: int) -> None:

@@ -22,8 +22,9 @@ from fault_report import FAILED, MAX_TAKEN, NOT_JUDGED, Fault, Report, line
 PROJECT = Path(__file__).resolve().parents[2]
 BEGIN, END = ">>>", "<<<"
 """What the programme prints in there, followed by area and name, around each fault."""
-WINDOW_S = 5.0
-QUIET_WITHIN_S = 60.0
+WINDOW_S = 1.0
+"""A tenth of it is what the shortest limits of the programme leave to a gateway."""
+QUIET_S, QUIET_WITHIN_S = 5.0, 60.0
 
 
 class Sample(NamedTuple):
@@ -48,7 +49,7 @@ def sample(text: str, at_s: float, waited_s: float = 0.0) -> Sample:
 
 
 def worst_share(samples: Sequence[Sample], begin_s: float, end_s: float) -> float:
-    """The largest share that was taken away over five seconds, or over the whole time if that is shorter."""
+    """The largest share that was taken away over ``WINDOW_S``, or over the whole time if that is shorter."""
     before = [each for each in samples if each.at_s <= begin_s][-1:]
     inside = before + [each for each in samples if begin_s < each.at_s <= end_s]
     worst = 0.0
@@ -115,7 +116,7 @@ class Load:
         while time.monotonic() < end:
             self.take()
             before = self.samples[-1]
-            time.sleep(WINDOW_S)
+            time.sleep(QUIET_S)
             self.take()
             after = self.samples[-1]
             free = (after.idle - before.idle) / (after.total - before.total)

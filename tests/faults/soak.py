@@ -35,19 +35,19 @@ def run(bench: Bench, report: Report, generator: random.Random, end: float) -> N
         if f.bench == "two" and not any(text in f.name for text in NEW_PROCESS)
     ]
     escs = range(len(bench.fed))
-    quiet_ns, longest_ns, injected = 0, 0, 0
+    quiet_s, longest_s, injected = 0.0, 0.0, 0
     before = bench.gateway.figures()
     while time.monotonic() < end:
         fault = generator.choice(faults)
         bench.watch.reset_silence()
         time.sleep(generator.uniform(0.5, 3))
-        quiet_ns = max(quiet_ns, *map(bench.watch.silence_ns, escs))
+        quiet_s = max(quiet_s, bench.longest_silence_s(escs))
         if injected == 5:
             before = bench.gateway.figures()
         injected += 1
         bench.watch.reset_silence()
         programme.run_one(bench, fault, report, 1)
-        longest_ns = max(longest_ns, *map(bench.watch.silence_ns, escs))
+        longest_s = max(longest_s, bench.longest_silence_s(escs))
     row = report.row(GROWTH)
     row.figures = {
         "faults": injected,
@@ -55,8 +55,8 @@ def run(bench: Bench, report: Report, generator: random.Random, end: float) -> N
         "wrong values": bench.watch.wrong_count,
         "values late because the machine stood still": bench.watch.late_count,
         "values lost": sum(each.lost for each in report.rows),
-        "longest silence of an ESC in s": round(longest_ns / SECOND, 3),
-        "longest silence of an ESC between faults in s": round(quiet_ns / SECOND, 3),
+        "longest silence of an ESC in s": round(longest_s, 3),
+        "longest silence of an ESC between faults in s": round(quiet_s, 3),
         "s that the machine stood still": round(
             sum(e - b for b, e in bench.metronome.stalls) / SECOND, 2
         ),

@@ -174,8 +174,11 @@ def test_a_silence_begins_with_the_first_frame_that_is_not_shown(
     del escs[0].sent[20:]  # then the ESC itself is silent, until frame 20
     for n, at in list(enumerate(times()))[:20]:
         judge.take(SPEED_ID, of_live(judge, SPEED_ID, n), at + MS)
-    assert judge._longest_silence_ns == [MS, 0]
+    shown = [(at, at + MS) for at in list(times())[:20]]
+    assert judge.silences(0, START + 40 * PERIOD) == shown
     sent = START + 45 * PERIOD
     escs[0].sent.extend([sent, sent + PERIOD])
-    judge.take(SPEED_ID, of_live(judge, SPEED_ID, 21), sent + PERIOD + 3 * MS)
-    assert judge._longest_silence_ns == [PERIOD + 3 * MS, 0]
+    assert judge.silences(0, sent + 2 * MS) == [*shown, (sent, sent + 2 * MS)]
+    silence = sent, sent + PERIOD + 3 * MS
+    judge.take(SPEED_ID, of_live(judge, SPEED_ID, 21), silence[1])
+    assert judge.silences(0, silence[1] + SECOND) == [*shown, silence]

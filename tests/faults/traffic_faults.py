@@ -82,6 +82,7 @@ def conflict(
                 vandal.send(can_id + node, bytes.fromhex(data))
             time.sleep(0.01)
     injection.wait_emergency(node, CONFLICT)
+    bench.wait_log("somebody else", lines)
     said = len(gateway.lines) - lines
     injection.row.peak("lines in the log", said)
     injection.expect(1 <= said <= 2 * len(frames), f"{said} lines in the log for one condition")
