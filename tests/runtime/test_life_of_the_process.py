@@ -165,32 +165,6 @@ def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(
     assert not (manager.path.parent / "status.json").exists()
 
 
-def test_a_hang_up_of_a_service_is_answered_with_what_to_do(manager: Manager, esc: PtyEsc) -> None:
-    manager.process.send_signal(signal.SIGHUP)
-    manager.logged(
-        "SIGHUP is ignored: the configuration is read at the start only. Restart for another one."
-    )
-    with talking(esc):
-        manager.logged("esc1: telemetry ok")
-
-
-def test_a_gateway_that_was_killed_leaves_nothing_in_the_way_of_the_next(
-    tmp_path: Path, esc: PtyEsc
-) -> None:
-    """Neither port, nor node-ID, nor store."""
-    config = tmp_path / "gateway.toml"
-    more = f'[canopen]\nenabled = true\nstore = "{tmp_path}"'
-    config.write_text(configuration(esc.path, f"killed-{os.getpid()}", more))
-    command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)]
-    for _ in range(2):
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-            assert process.stderr is not None
-            lines = iter(process.stderr)
-            with talking(esc):
-                assert any("telemetry ok" in line for line in lines)
-            process.kill()
-
-
 def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text("nonsense")
