@@ -269,18 +269,6 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
     assert len(bench.times()) == 1 + lives
 
 
-def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
-    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("CellCount", 0, 8)]), EVENT, 0, 0)])
-    bench.now = 50 * MS
-    bench.live()
-    bench.forget()
-    bench.live(InfoData(cell_count=6))
-    assert bench.raws(8) == [6]
-    bench.until(100 * MS)
-    bench.live()
-    assert bench.raws(8) == [6]
-
-
 def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> None:
     cycles = {EVENT: 0, ON_CHANGE: 0, CYCLIC_AND_EVENT: 40, CYCLIC_AND_ON_CHANGE: 30, CYCLIC: 50}
     for kind, cycle in cycles.items():
@@ -384,16 +372,6 @@ def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() ->
             assert get(link[-1][1].data, 8, 8, True) == 1
             # without a cycle: on the loss, and then each second, for age and counters
             assert len(link) >= 2250 // cycle - 1 if cycle else len(link) == 3
-
-
-def test_silent_says_nothing_before_the_first_frame_but_for_the_link() -> None:
-    bench = Bench(
-        [(Msg("EscPower", 0x100, 8, [VOLTAGE]), CYCLIC, 10, 0), (escs_message(0), CYCLIC, 100, 0)],
-        silent=True,
-        start=True,
-    )
-    bench.until(SECOND)
-    assert {frame.can_id for _, frame in bench.sent} == {0x200}
 
 
 def test_silent_lets_a_message_of_several_escs_go_on_as_long_as_one_is_up() -> None:
@@ -671,13 +649,6 @@ def test_the_last_word_is_every_page_that_changed_without_regard_to_the_minimum_
     sent = [(when // MS, frame.data[0], frame.data[1]) for when, frame in bench.sent]
     assert sent[:3] == [(0, 1, 1), (400, 2, 0), (800, 3, 1)]
     assert sorted(sent[3:]) == [(1150, 1, 2), (1150, 2, 4)]
-
-
-def test_messages_without_a_cycle_are_sent_once_at_the_start() -> None:
-    kinds = [(CYCLIC, 50), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50)]
-    messages = [Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]) for n in range(4)]
-    bench = Bench([(m, *kind, 0) for m, kind in zip(messages, kinds, strict=True)], start=True)
-    assert [frame.can_id for _, frame in bench.sent] == [0x101, 0x102]
 
 
 # --- any run ----------------------------------------------------------------------------------------------------------
