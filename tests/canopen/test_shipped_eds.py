@@ -26,7 +26,7 @@ SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
 DATA = SHIPPED.read_bytes()
 TEXT = DATA.decode("ascii")
 LINES = TEXT.split("\r\n")
-U8, U16, U32, I32, TEXT_TYPE = 0x05, 0x06, 0x07, 0x04, 0x09
+U8, U16, U32 = 0x05, 0x06, 0x07
 TYPE_OF_WIRE = {"I": U32, "H": U16, "B": U8, "h": 0x03, "b": 0x02}
 # CiA 303-2: prefix as a power of ten, numerator, denominator
 UNIT_CODES = {

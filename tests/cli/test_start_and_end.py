@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
 LIMITED = 'ulimit -n "$0" && exec "$@"'
 INTERRUPTED = """
 import os, runpy, signal, sys

@@ -21,14 +21,12 @@ from kontronik_can_gw.esc.kontronik import (
 )
 
 from . import sheet
-from .reference import certain_at, counters_of, frames_of, random_frame
+from .reference import certain_at, counters_of, frames_of
 from .sheet import FORM_ROWS
 from .streams import Uart, random_chunks, random_stream, seeds, streams
 
 PROPERTY = settings(deadline=None, max_examples=100, database=None)
-LIVE_LEGACY, INFO_LEGACY, LIVE_V4, INFO_V4 = FORM_ROWS
 
-form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
 
 SILENCE = "no bytes: "
 FAILED_CRC = "headers but no valid CRC: "
@@ -123,9 +121,6 @@ def test_long_damaged_streams_give_what_brute_force_finds_however_they_are_cut(s
         check_against_the_reference(stream, one_by_one(stream))
         check_against_the_reference(stream, random_chunks(stream, source))
     assert found > 250, "streams without frames would prove little"
-
-
-FRAMES = [random_frame(row, random.Random(5)) for row in FORM_ROWS]
 
 
 # ---- when a frame comes out

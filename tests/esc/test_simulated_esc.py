@@ -47,10 +47,6 @@ def lives(frames: list[Sent]) -> list[LiveData]:
     return [sent.data for sent in frames if isinstance(sent.data, LiveData)]
 
 
-def infos(frames: list[Sent]) -> list[InfoData]:
-    return [sent.data for sent in frames if isinstance(sent.data, InfoData)]
-
-
 phases = st.builds(
     Phase,
     st.just("any"),

@@ -3,27 +3,19 @@
 One gateway serves most tests; each begins with its nodes reset.
 """
 
-import contextlib
 import struct
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 
 import pytest
-from canopen import SdoAbortedError
 from encoding import Identity
-from vcan_tools import EDS, SERIAL, Chain, Master, Recorded, canopen_table, chain, wait_for
+from vcan_tools import SERIAL, Chain, Master, Recorded, canopen_table, chain, wait_for
 
-from kontronik_can_gw.canopen.eds import load as load_eds
 from kontronik_can_gw.esc.kontronik.codec import Layout
-from kontronik_can_gw.esc.kontronik.fields import InfoData
 
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 COMMANDS = {OPERATIONAL: "OPERATIONAL", STOPPED: "STOPPED", PRE_OPERATIONAL: "PRE-OPERATIONAL"}
 TPDO1, TPDO2, TPDO3, TPDO4 = 0x180, 0x280, 0x380, 0x480
 PDOS = (TPDO1, TPDO2, TPDO3, TPDO4)
-STATUS_LOST, DEVICE_STATE = 4, 0x08000022
-WRITE_ONLY, NO_DATA, IN_USE = 0x06010001, 0x08000024, 0x06040043
-RTR_OFF, INVALID = 1 << 30, 1 << 31
 TIMEOUT = 0x2100, 4
 
 
@@ -107,62 +99,6 @@ def test_heartbeats_and_nmt_commands(nodes: Nodes) -> None:
         wait_for(lambda begin=begin: BOOT_UP in nodes.states(1)[begin:], command)  # type: ignore[misc]
         assert (master.number(1, 0x1017), master.number(1, *TIMEOUT)) == (1000, kept), command
     assert BOOT_UP not in nodes.states(2), "the other node has not noticed"
-
-
-def answered(act: Callable[[], object]) -> bool:
-    with contextlib.suppress(SdoAbortedError):
-        act()
-        return True
-    return False
-
-
-def test_every_object_of_the_eds_is_what_the_esc_sent(nodes: Nodes) -> None:
-    run, master = nodes.run, nodes.master
-    run.feed(1, times=12)  # an info frame among them
-    fed = run.escs[1]
-    sent, extremes = fed.live(len(fed.sent) - 1), fed.info(len(fed.info_sent) - 1)
-    wait_for(
-        lambda: answered(lambda: master.upload(2, 0x2020, 0x0B)),
-        "the frame rate, known after a second",
-    )
-    sizes = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
-    read = {}
-    for entry in load_eds(EDS.read_bytes(), str(EDS)).entries:
-        where = entry.index, entry.sub
-        if entry.access == "wo":
-            assert master.refusal(partial(master.upload, 2, *where)) == WRITE_ONLY, entry
-        elif entry.index == 0x1003 and entry.sub:
-            assert master.refusal(partial(master.upload, 2, *where)) == NO_DATA, entry
-        elif entry.index != 0x1021:
-            read[where] = master.upload(2, *where)
-            assert len(read[where]) == sizes.get(entry.data_type, len(read[where])), entry
-    assert len(read) > 200
-
-    def number(index: int, sub: int, signed: bool = False) -> int:
-        return int.from_bytes(read[index, sub], "little", signed=signed)
-
-    for sub, (name, wanted) in enumerate(sent._asdict().items(), 1):
-        assert number(0x2000, sub, signed=wanted < 0) == wanted, name
-    for sub, (name, wanted) in enumerate(
-        list(extremes._asdict().items())[InfoData._fields.index("max_electrical_speed") :], 1
-    ):
-        assert number(0x2011, sub, signed=wanted < 0) == wanted, name
-    derived = {
-        1: sent.electrical_speed / 7,
-        2: sent.electrical_speed / 7 / 9.8,
-        3: sent.battery_voltage * sent.battery_current / 100,
-        5: sent.battery_voltage * 10 / extremes.cell_count,
-    }
-    for sub, value in derived.items():
-        assert abs(number(0x2001, sub, signed=value < 0) - value) <= 0.5, sub
-    assert number(0x2020, 5) == len(fed.sent)
-    assert number(0x2020, 6) == len(fed.info_sent)
-    assert (number(0x606C, 0), number(0x6079, 0)) == (number(0x2001, 1), sent.battery_voltage * 10)
-    assert number(0x1018, 4) == SERIAL + 1
-    assert read[0x1008, 0] == b"KONTRONIK ESC gateway"
-    with master.node(2).sdo.open(0x1021, 0, "rb", block_transfer=True) as stream:
-        assert stream.read() == EDS.read_bytes()
-    assert not nodes.of(0x82)
 
 
 @pytest.mark.parametrize("at_sync", [False, True])

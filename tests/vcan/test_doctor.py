@@ -5,18 +5,16 @@ import io
 import json
 import os
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from slcan_adapters import Adapter, Bus
-from vcan_tools import Candump, GatewayProcess, configuration, ip, wait_for
+from vcan_tools import Candump, configuration, ip, wait_for
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.pty import PtyEsc
-
-Start = Callable[..., GatewayProcess]
 
 
 @pytest.fixture
