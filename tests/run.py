@@ -6,9 +6,8 @@ test      lint (ruff), types (mypy), unit (pytest on this machine), vcan (pytest
 test-all  what `test` leaves out: faults (the fault programme in User Mode Linux) and, by the marker "extended", tools (the service
           under a real systemd, a browser, a broker ...) and masters (CANopen masters of others, and more, on a vcan)
 release   by hand, on a quiet machine: qemu (the fault programme on emulated hardware), soak (random faults), hour (recorded),
-          mutants (share of a sample that the tests kill, not below that of 0.5.0), put-in (a list of faults that they must see),
-          machines (the exported core on other machines), fuzz (the core in C under fuzzers, ten minutes each),
-          deb (the Debian packages in fresh roots of both releases)
+          put-in (a list of faults that the tests must see), machines (the exported core on other machines),
+          fuzz (the core in C under fuzzers, ten minutes each), wheels, deb (the Debian packages in fresh roots of both releases)
 
 The lanes of a tier run side by side. A step runs once, and what it prints appears when it ends. Exit code 0: all that ran has
 passed. What could not be run is listed with the line that enables it; with CI=true that and each skipped test is a failure. The
@@ -57,7 +56,6 @@ STEPS = {
     "qemu": FAULTS.format("qemu_programme.py", "qemu"),
     "soak": FAULTS.format("soak.py", "soak") + " --minutes=60",
     "hour": "python tests/hour/hour_programme.py",
-    "mutants": "python tests/mutants/mutants.py --compare tests/mutants/version_0_5_0.json",
     "put-in": "python tests/mutants/put_in_faults.py",
     "wheels": "python tests/native/wheels.py {scratch}",
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
@@ -66,11 +64,9 @@ STEPS = {
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
-    # faults last: what a busy machine left undecided is run again once the other lane has ended
+    # faults last: the machine is quieter when the other lane has ended
     "test-all": (("masters", "faults"), ("tools",)),
-    "release": (
-        ("qemu", "soak", "hour", "mutants", "put-in", "machines", "fuzz", "wheels", "deb"),
-    ),
+    "release": (("qemu", "soak", "hour", "put-in", "machines", "fuzz", "wheels", "deb"),),
 }
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
 """Of one step: the two that CI runs end within its 90 minutes whatever happens."""

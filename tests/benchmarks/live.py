@@ -1,4 +1,4 @@
-"""The three programs by turns: that they send the same frames, and the CPU time each takes for a live frame."""
+"""The three programs by turns: that they send the same frames, the CPU time each takes for a live frame, and the delay."""
 
 import os
 import random
@@ -188,12 +188,6 @@ def cpu(context: Context) -> list[Figure]:
     return figures + beside(context, 8, "<= 1.25", ">= 6") + beside(context, 64, "<= 1.2", "")
 
 
-@benchmark("cpu-bytewise", "the same where the bytes come one by one")
-def bytewise(context: Context) -> list[Figure]:
-    """Bytes one by one as the wire brings them, in place of whole frames."""
-    return [figure for escs in (1, 8) for figure in beside(context, escs, "", "", "--bytewise")]
-
-
 @benchmark("cpu-canopen", "CPU time with CANopen nodes and default PDOs, beside that without")
 def canopen(context: Context) -> list[Figure]:
     """Ours at 8 ESCs with nodes and default PDOs, and without, by turns."""
@@ -240,3 +234,58 @@ def many(context: Context) -> list[Figure]:
             Figure(f"{what}: share of a core", run.cpu_share * 100, "%"),
         ]
     return figures
+
+
+# --- delay
+
+
+def of_runs(runs: list[Measured], key: str) -> float:
+    """A figure of the delay, the median of the rounds."""
+    return median([run.delay[key] for run in runs])
+
+
+@benchmark("delay", "from the last byte to the fifth CAN frame: C, ours, the obvious program")
+def delay(context: Context) -> list[Figure]:
+    """One ESC, the three programs by turns."""
+    found = compare(context, 1)
+    figures = []
+    for program, runs in found.items():
+        note = f"99 %: {of_runs(runs, 'p99'):.0f}, longest {of_runs(runs, 'max'):.0f}"
+        figures.append(Figure(f"{program}, median", of_runs(runs, "p50"), "us", note=note))
+    value = median(
+        [a.delay["p50"] / b.delay["p50"] for a, b in zip(found["ours"], found["c"], strict=True)]
+    )
+    figures.append(judged("ours / c, median", value, "x", "<= 1.1"))
+    figures.append(judged("ours, 99 %", of_runs(found["ours"], "p99"), "us", "<= 2000"))
+    return figures
+
+
+EVERYTHING = f"""{CANOPEN}[record]
+directory = "captures"
+[statistics]
+file = "status.json"
+"""
+"""Recorder, status file, nodes."""
+
+
+@benchmark("delay-full", "the same with 8 ESCs, recorder, statistics, CANopen and a polling master")
+def full(context: Context) -> list[Figure]:
+    """8 ESCs with recorder, status file, CANopen nodes and a master that asks 200 times a second for one of 20 objects."""
+    runs = [once(context, "ours", 8, "--sdo", config=EVERYTHING) for _ in range(context.rounds)]
+    context.data["runs"] = [run.result for run in runs]
+    asked = sum(run.result["sdo_sent"] for run in runs)
+    answered = sum(run.result["sdo_answers"] for run in runs)
+    lost = max(0, asked - answered - len(runs))  # the last of each run may be on its way
+    answer = median([run.result["sdo_us"]["p99"] for run in runs])
+    if not answered:
+        raise RuntimeError("the nodes answered no SDO request")
+    longest = f"longest {of_runs(runs, 'max'):.0f}"
+    return [
+        Figure("8 ESCs and all, median", of_runs(runs, "p50"), "us"),
+        judged("8 ESCs and all, 99 %", of_runs(runs, "p99"), "us", "<= 1000", longest),
+        Figure("SDO answers, 99 %", answer, "us"),
+        Figure("SDO requests not answered", lost, f"of {asked}", "0", lost == 0),
+        Figure(
+            "CPU, all of it", median([run.cpu_us for run in runs]), "us/frame", note=losses(runs)
+        ),
+    ]

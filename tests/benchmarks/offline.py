@@ -1,7 +1,6 @@
-"""Conversion of UART bytes: candump logs and tables, beside the obvious program, over growing files, and of a damaged file.
+"""Conversion of captures and of UART bytes to candump logs and tables, by the core in C and by the one in Python.
 
-The bytes are a simulated flight of four minutes, over and over; for the damaged file one byte of one frame in a hundred is another one.
-The obvious program says how many frames a file has.
+The bytes are a simulated flight of four minutes, over and over.
 
     python offline.py FORM IN OUT [--dbc FILE] [--live]     one conversion: what came of it as JSON
 """
@@ -16,14 +15,12 @@ import sys
 import time
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 from programs import FIVE, median
-from registry import HERE, Context, Figure, NotEqual, benchmark, judged
+from registry import Context, Figure, benchmark, judged
 
-FLIGHT_S = 240
-SEED = 6
+FLIGHT_S, SEED = 240, 6
 _MB = 1_000_000
 
 
@@ -43,35 +40,13 @@ def flight(context: Context) -> bytes:
     return file.read_bytes()
 
 
-def recording(context: Context, megabytes: float, damaged: bool = False) -> Path:
-    """A file of that size, of whole frames where nothing is damaged."""
-    file = context.folder / f"{'damaged' if damaged else 'clean'}-{megabytes:g}.bin"
-    if file.exists():
-        return file
-    size, once = int(megabytes * _MB), flight(context)
-    with file.with_suffix(".new").open("wb") as out:
-        for written in range(0, size, len(once)):
-            rest = size - written
-            data = once if rest >= len(once) else once[: once.rindex(b"KOD", 0, max(rest, 100))]
-            out.write(spoilt(data, written) if damaged else data)
-    file.with_suffix(".new").rename(file)
+def recording(context: Context, megabytes: int) -> Path:
+    """A file of about that size."""
+    file = context.folder / f"bytes-{megabytes}.bin"
+    if not file.exists():
+        once = flight(context)
+        file.write_bytes(once * (megabytes * _MB // len(once) + 1))
     return file
-
-
-def spoilt(data: bytes, seed: int) -> bytes:
-    """With one byte of one frame in a hundred another one."""
-    chance = random.Random(seed)
-    found = bytearray(data)
-    for at in chance.sample(range(len(data)), len(data) // 40 // 100):
-        found[at] ^= chance.randrange(1, 256)
-    return bytes(found)
-
-
-def sizes(context: Context) -> list[float]:
-    """In MB."""
-    if context.quick:
-        return [0.2, 0.5]
-    return [1, 10, 100] if context.long else [1, 4, 16]
 
 
 # --- one run
@@ -149,56 +124,7 @@ def convert_here(arguments: list[str]) -> Run:
     return Run(cpu, wall, int(peak[1]) / 1024 if peak else 0.0, f"{told}")
 
 
-def of_obvious(context: Context, source: Path) -> tuple[float, int, Path]:
-    """CPU seconds and live frames of the obvious program, and its log."""
-    target = context.folder / "obvious.log"
-    command = [sys.executable, HERE / "peers" / "obvious.py", FIVE, "--log", source, target]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
-    return found["cpu_s"], found["live"], target
-
-
 # --- benchmarks
-
-
-@benchmark("offline-candump", "UART bytes to a candump log, beside the obvious program")
-def candump(context: Context) -> list[Figure]:
-    """The log of the obvious program is the same."""
-    source = recording(context, 0.5 if context.quick else 1)
-    ratios, micros = [], []
-    for _ in range(context.rounds):
-        obvious_s, lives, log = of_obvious(context, source)
-        ours = convert(context, "candump", source, "--dbc", FIVE)
-        if ours.count != 5 * lives:
-            raise NotEqual(f"candump: {ours.count} frames of {lives} live frames")
-        if converted(context, "candump").read_bytes() != log.read_bytes():
-            raise NotEqual("candump: the obvious program's log is another one")
-        micros.append(ours.cpu_s / lives * 1e6)
-        ratios.append(obvious_s / ours.cpu_s)
-    shipped = best(context, "candump", source)
-    micros_shipped, note = shipped.cpu_s / lives * 1e6, "five CAN frames a live frame"
-    return [
-        Figure("candump, the obvious program / ours", median(ratios), "x", note=note),
-        Figure("candump, CPU a live frame", min(micros), "us", note="five CAN frames"),
-        Figure("candump, CPU a live frame, shipped DBC", micros_shipped, "us", note=shipped.told),
-        judged("candump, peak memory", shipped.peak_mb, "MB", "<= 100"),
-    ]
-
-
-@benchmark("offline-tables", "UART bytes to CSV, JSON lines and Parquet")
-def tables(context: Context) -> list[Figure]:
-    """Rows a CPU second, with the sixteen values of a live frame and with all values."""
-    figures = []
-    source = recording(context, 0.5 if context.quick else 2)
-    lives = of_obvious(context, source)[1]
-    for form in ("csv", "jsonl", "parquet"):
-        for what, options in (("16 live values", ("--live",)), ("all values", ())):
-            run = best(context, form, source, *options)
-            if run.count != lives:
-                raise NotEqual(f"{form}: {run.count} rows of {lives} live frames")
-            note = f"a CPU second; {run.count / run.wall_s:.0f} by the clock, {run.peak_mb:.0f} MB of memory"
-            figures.append(Figure(f"{form}, {what}", run.count / run.cpu_s, "rows/s", note=note))
-    return figures
 
 
 def capture(context: Context, seconds: int, noise: bool = False) -> Path:
@@ -222,7 +148,8 @@ def capture(context: Context, seconds: int, noise: bool = False) -> Path:
         for number in range(at, at + 50):
             now, wire = start + number * period, frames[number % len(frames)]
             if noise and chance.random() < 0.05:
-                wire = spoilt(wire * 100, number)[: len(wire)] + chance.randbytes(3)
+                at = chance.randrange(len(wire))
+                wire = wire[:at] + bytes([wire[at] ^ 0x55]) + wire[at + 1 :] + chance.randbytes(3)
             entries.append((now, Kind.BYTES, 0, wire, 0, now - 4_000_000))
             entries.append((now, Kind.ADVANCE, 0, b"", 0, None))
         blocks.append((b"D", data_payload(entries)))
@@ -277,6 +204,7 @@ def plain_bytes(context: Context) -> list[Figure]:
     for form, (options, aim) in aims.items():
         run = best(context, form, source, *options)
         figures.append(judged(f"{form}, bytes", size / run.cpu_s, "MB/s", aim, run.told))
+        figures.append(judged(f"{form}, peak memory", run.peak_mb, "MB", "<= 250"))
     return figures
 
 
@@ -295,53 +223,6 @@ def scan(source: Path) -> float:
     for at in range(0, len(data), 16384):
         core.receive(0, data[at : at + 16384], 0, 0)
     return time.process_time() - begun
-
-
-_FORMS = {"candump": (), "parquet": ("--live",), "csv": ("--live",)}
-
-
-@benchmark("offline-growth", "time and memory over the size of the file")
-def growth(context: Context) -> list[Figure]:
-    """Time and memory of each conversion over growing files."""
-    figures = []
-    for form, options in _FORMS.items():
-        rows = context.data[form] = []
-        for megabytes in sizes(context):
-            source = recording(context, megabytes)
-            run = convert(context, form, source, *options)
-            lives = source.read_bytes().count(b"KODL")
-            if form != "candump" and run.count != lives:
-                raise NotEqual(f"{form}: {run.count} rows of {lives} live frames")
-            rows.append({"mb": source.stat().st_size / _MB, **vars(run)})
-            context.say(f"{form}, {megabytes:g} MB: {run.cpu_s:.2f} s, {run.peak_mb:.0f} MB")
-        peak, largest = max(row["peak_mb"] for row in rows), rows[-1]["mb"]
-        paces = [row["cpu_s"] / row["mb"] for row in rows]
-        worst = max(after / before for before, after in pairwise(paces))
-        pace = ", ".join(f"{1000 * one:.0f}" for one in paces) + " ms of CPU a MB"
-        figures += [
-            judged(f"{form}, peak memory up to {largest:.0f} MB", peak, "MB", "<= 250"),
-            judged(f"{form}, ms a MB: next size / size", worst, "x", "<= 1.3", pace),
-        ]
-    return figures
-
-
-@benchmark("offline-damage", "a damaged file beside a clean one")
-def damage(context: Context) -> list[Figure]:
-    """One frame in a hundred is damaged."""
-    figures = []
-    megabytes = 0.5 if context.quick else 1
-    clean, damaged = recording(context, megabytes), recording(context, megabytes, damaged=True)
-    lives = of_obvious(context, damaged)[1]
-    for form, options in _FORMS.items():
-        ratios = []
-        for _ in range(context.rounds):
-            first, second = (convert(context, form, each, *options) for each in (clean, damaged))
-            if form != "candump" and second.count != lives:
-                raise NotEqual(f"{form}: {second.count} rows of {lives} live frames")
-            ratios.append(second.cpu_s / first.cpu_s)
-        pace = f"{damaged.stat().st_size / _MB / second.cpu_s:.1f} MB a CPU second"
-        figures.append(Figure(f"{form}, 1 % damaged / clean", median(ratios), "x", note=pace))
-    return figures
 
 
 if __name__ == "__main__":

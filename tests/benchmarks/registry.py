@@ -68,8 +68,6 @@ class Context:
     """As short as it can be: for trying the benchmarks themselves. Figures mean little."""
     vcan: str = ""
     """A vcan interface to use in place of the local socket that stands for the bus."""
-    long: bool = False
-    """Take what takes minutes, and gigabytes of disk, too."""
     data: dict[str, Any] = field(default_factory=dict)
     """What else goes into the JSON, under the benchmark's name: tables, series."""
 
@@ -107,7 +105,7 @@ class Benchmark:
 
 
 BENCHMARKS: list[Benchmark] = []
-"""Filled by importing the modules that have them, in that order: what must be equal comes first."""
+"""Filled by importing the modules that have them."""
 
 
 def benchmark(

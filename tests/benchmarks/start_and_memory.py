@@ -84,14 +84,10 @@ def start_up(context: Context) -> list[Figure]:
 
 
 def memory_of(pid: int) -> dict[str, float]:
-    """Of a process now, in MB: resident, its fair share of what is shared, and what is its own."""
+    """Of a process now, in MB: resident, and with its fair share of what is shared."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text()
     kb = {key: int(value) for key, value in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE)}
-    return {
-        "RSS": kb["Rss"] / 1024,
-        "PSS": kb["Pss"] / 1024,
-        "USS": (kb["Private_Clean"] + kb["Private_Dirty"]) / 1024,
-    }
+    return {"RSS": kb["Rss"] / 1024, "PSS": kb["Pss"] / 1024}
 
 
 def many_escs_dbc(folder: Path) -> Path:
@@ -107,7 +103,7 @@ def many_escs_dbc(folder: Path) -> Path:
     return file
 
 
-@benchmark("memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder")
+@benchmark("memory", "RSS and PSS with 1 to 64 ESCs, CANopen, recorder")
 def memory(context: Context) -> list[Figure]:
     """After some seconds of traffic."""
     cases = {
@@ -136,7 +132,7 @@ def memory(context: Context) -> list[Figure]:
     further_nodes = (rss["8 ESCs, CANopen"] - rss["1 ESC, CANopen"]) / 7
     figures = []
     for case, kinds in found.items():
-        note = f"PSS {kinds['PSS']:.1f}, USS {kinds['USS']:.1f}"
+        note = f"PSS {kinds['PSS']:.1f}"
         limited = (judged, "<= 24") if case == "1 ESC" else (Figure, "")
         figures.append(limited[0](f"RSS, {case}", kinds["RSS"], "MB", limited[1], note=note))
     return [

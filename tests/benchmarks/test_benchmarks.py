@@ -16,27 +16,13 @@ def build(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "build"
 
 
-def test_every_benchmark_is_listed_and_has_a_name_of_its_own(
+def test_the_benchmarks_are_listed_and_an_unknown_name_is_reported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert bench.main(["--list"]) == 0
-    listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
-    names = [name for name, _ in listed]
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     assert len(set(names)) == len(names)
     assert names[0] == "equal", "figures of programs that do not agree say nothing"
-    assert {
-        "cpu",
-        "cpu-canopen",
-        "many",
-        "delay",
-        "delay-full",
-        "delay-realtime",
-        "instructions",
-        "start",
-    } <= set(names)
-
-
-def test_an_unknown_name_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert bench.main(["--only", "cqu"]) == 2
     assert capsys.readouterr().err == "bench: there is no benchmark cqu. See --list.\n"
 
@@ -60,8 +46,8 @@ def test_a_short_run_gives_a_table_and_json(
 @pytest.mark.parametrize(
     ("outcome", "code", "said"),
     [
-        ([registry.judged("a", 3.3, "x", "<= 2.2")], 0, "MISSED by 50%"),
-        ([registry.judged("a", 3, "x", ">= 4")], 0, "MISSED by 25%"),
+        ([registry.judged("a", 3.3, "x", "<= 2.2")], 0, "MISSED"),
+        ([registry.judged("a", 3, "x", ">= 4")], 0, "MISSED"),
         ([registry.judged("a", 5, "x", ">= 4")], 0, "reached"),
         ([registry.judged("a", 5, "x", ">= 4", fair=False)], 0, "MISSED\n"),
         ([Figure("a", 2, "of 10", "0", False)], 0, "MISSED\n"),

@@ -1,6 +1,5 @@
 """The DBC of the CANopen side: what it decodes from the nodes' own frames is what the telemetry says, in every tool."""
 
-import re
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -16,14 +15,12 @@ from eds_text import variable, with_object
 from packer_oracle import pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
-from kontronik_can_gw.canopen import dbc_names
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
@@ -247,21 +244,6 @@ def test_enumerations_name_every_value_that_can_be_sent() -> None:
     }
 
 
-def test_names_are_those_of_the_shipped_dbc_where_both_show_a_value() -> None:
-    """A logger that is set up for one finds the same names in the other."""
-    ours = {signal.name: signal for signal in parse(SHIPPED.read_bytes()).signals}
-    others = {
-        signal.name: signal
-        for signal in parse(shipped("dbc/kontronik_esc.dbc").read_bytes()).signals
-    }
-    common = set(ours) & set(others)
-    own = {"Replay", "InfoValid", "LiveCounter", "NodeState"}
-    assert {
-        name for name in set(ours) - common if not name.startswith(("Emergency", "ErrorRegister"))
-    } == own
-    assert all(ours[name].unit == others[name].unit for name in common)
-
-
 def emergencies(bench: Bench) -> list[tuple[str, str, int]]:
     names = ("EmergencyCode", "EmergencySource", "EmergencyWord")
     return [(v[names[0]], v[names[1]], v[names[2]]) for v in bench.seen["EscEmergency"]]
@@ -390,18 +372,6 @@ def test_a_value_in_two_pdos_has_two_names() -> None:
     assert comment.endswith("While the word is not available all its bits are set.")
 
 
-def test_a_word_that_ends_in_bits_without_a_name_keeps_its_length() -> None:
-    bench = Bench()
-    assert bench.write(0x1803, 1, 0xC0000481, size=4) is None
-    remap(bench, 4, 0x501, [0x20000F08, 0x20000E20])
-    bench.describe_anew()
-    assert bench.database.get_message_by_name("EscTpdo5").length == 5
-    assert not any(message.name == "EscTpdo4" for message in bench.database.messages)
-    bench.start()
-    bench.run(SECOND)
-    assert bench.seen["EscTpdo5"][-1]["ProgrammingAllowed"] in (0, 1)
-
-
 def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
     bench = Bench()
     remap(bench, 0, 0x181, [0x20000120], kind=3)
@@ -476,19 +446,6 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
     assert "VAL_ 641" not in text
 
 
-def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
-    escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
-    text = written(escs)
-    db = parse(text.encode())
-    for rule in ("names_are_unique", "everything_has_one_comment", "every_line_is_understood"):
-        assert list(RULES[rule](db)) == []
-    read(text)
-    names = [message.name for message in db.messages] + [signal.name for signal in db.signals]
-    assert max(map(len, names)) == 32
-    assert all(re.fullmatch("PortOuter[12][A-Z][A-Za-z0-9]*", name) for name in names)
-    assert "PortOuter1LimitBatteryVoltageMin" in names
-
-
 def test_one_cob_id_for_two_messages_is_refused_by_name() -> None:
     eds = reader.load(EDS_TEXT.replace("$NODEID+0x80\r", "0xA0\r").encode(), "mine.eds")
     said = r"RightREmergency and LeftEmergency have the same COB-ID 0A0h\. Give one of them another"
@@ -496,48 +453,4 @@ def test_one_cob_id_for_two_messages_is_refused_by_name() -> None:
         written(PAIR, eds=eds)
 
 
-def test_the_file_of_many_nodes_keeps_the_rules_and_can_be_written_again() -> None:
-    escs = [EscSettings(f"esc{number}") for number in range(1, 9)]
-    text = written(escs)
-    db = parse(text.encode())
-    for rule in set(RULES) - OF_THE_OTHER_FILE:
-        assert [f for f in RULES[rule](db) if not f.endswith("is longer than 28")] == [], rule
-    assert len({message.id for message in db.messages}) == 6 * 8
-    assert dbc_text(read(text)) == text
-
-
-def test_a_name_in_any_spelling_becomes_pascal_case() -> None:
-    for pascal_case, spellings in (
-        ("BecVoltage", ("bec_voltage", "BEC voltage", "BecVoltage")),
-        ("RpmControl", ("RPMControl",)),
-        ("KontrolX", ("KONTROL-X",)),
-        ("SyncStandBy", ("Sync_StandBy",)),
-        ("X1", ("x1",)),
-    ):
-        assert {dbc_names.pascal_case(name) for name in spellings} == {pascal_case}
-
-
 # --- the command ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "gateway.toml"
-    file.write_text(
-        '[can]\ninterface = "virtual"\n[dbc]\nenabled = false\n[canopen]\nenabled = true\n'
-        '[[esc]]\nname = "left"\nport = "/dev/ttyUSB0"\n'
-        '[[esc]]\nname = "right_r"\nport = "/dev/ttyUSB1"\nnode_id = 255\n'
-    )
-    assert main(["dbc", "--canopen", "-c", str(file)]) == 0
-    text, said = capsys.readouterr()
-    assert (
-        said
-        == "kontronik-can-gw: warning: right_r: no node-ID yet (LSS gives one), so no frames to describe\n"
-    )
-    db = parse(text.encode())
-    assert {message.name for message in db.messages} == {
-        f"Left{stem}" for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat", "Emergency")
-    }
-    assert "Waiting for a node-ID by LSS, so without frames: right_r." in dict(db.comments)[("",)]
-    assert read(written(node_ids=(255,))).messages == []

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from kontronik_can_gw.canopen import data_types, dcf
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.check import check_eds
-from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -32,12 +31,6 @@ def problems(text: str | bytes) -> tuple[str, ...]:
     except UserError as error:
         return error.problems
     return ()
-
-
-def entry_of(text: str, index: int = 0x2200, sub: int = 0) -> Entry:
-    """One entry of an EDS that is accepted."""
-    eds = reader.load(text.encode("ascii"), "mine.eds")
-    return next(entry for entry in eds.entries if (entry.index, entry.sub) == (index, sub))
 
 
 def changed(section: str, old: str, new: str) -> str:
@@ -145,10 +138,6 @@ def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject)
     )
 
 
-def test_the_width_of_1022h_is_not_agreed_on_and_both_are_taken() -> None:
-    assert problems(changed("1022", "DataType=0x0005", "DataType=0x0006")) == ()
-
-
 @pytest.mark.parametrize(
     ("dropped", "named", "partner"), [(0x1A03, "1803", "1A03"), (0x1803, "1A03", "1803")]
 )
@@ -156,14 +145,6 @@ def test_half_a_pdo_is_refused(dropped: int, named: str, partner: str) -> None:
     assert problems(dcf.without(SHIPPED.encode(), {dropped})) == (
         f"mine.eds: [{named}] [{partner}] of the same PDO is not there. Add it or remove this object.",
     )
-
-
-def test_dropping_an_object_that_a_pdo_carries_is_told() -> None:
-    found = problems(dcf.without(SHIPPED.encode(), {0x2020}))
-    assert [problem.split("] ")[0] for problem in found] == [
-        "mine.eds: [1A03sub4",
-        "mine.eds: [1A03sub5",
-    ]
 
 
 # --- what is allowed ------------------------------------------------------------------------------------------------
@@ -183,20 +164,6 @@ def test_any_case_lf_comments_and_unknown_sections_are_taken() -> None:
     assert ours.entries == reader.load(SHIPPED.encode(), "kontronik_esc.eds").entries
 
 
-def test_keys_without_a_value_are_not_there_as_editors_write_them() -> None:
-    entry = entry_of(
-        with_object(variable(0x06, LowLimit="", HighLimit="", DefaultValue="", PDOMapping=""))
-    )
-    assert (entry.low, entry.high, entry.default, entry.mappable) == (None, None, None, False)
-
-
-def test_a_missing_object_type_is_a_variable() -> None:
-    assert (
-        entry_of(with_object(variable(0x06).replace("ObjectType=0x7\r\n", ""))).object_type
-        == data_types.VAR
-    )
-
-
 @pytest.mark.parametrize(("data_type", "text", "read", "written"), list(rows_of("values.txt")))
 def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
     data_type: str, text: str, read: str, written: str
@@ -209,13 +176,6 @@ def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
     assert entry.default is not None
     text = dcf.dcf(eds, 1, 500_000, {(0x2200, 0): entry.default}, "left", "left.dcf")
     assert re.findall("(?m)^ParameterValue=(.*)\r$", text) == ([written] if written != "-" else [])
-
-
-def test_signed_limits_in_twos_complement() -> None:
-    entry = entry_of(
-        with_object(variable(0x02, LowLimit="0x9C", HighLimit="0x64", DefaultValue="-100"))
-    )
-    assert (entry.low, entry.high, entry.default) == (-100, 100, -100)
 
 
 COMPACT = "ParameterName=Cell\r\nObjectType=0x8\r\nDataType=0x0006\r\nAccessType=rw\r\nDefaultValue=0x10\r\nLowLimit=1\r\n"
@@ -234,20 +194,6 @@ def test_compact_sub_objects_with_their_names() -> None:
         (3, "Last", 0x06, "rw", 0x10, 1),
     ]
     assert {each.object_type for each in found} == {data_types.ARRAY}
-
-
-def test_a_compact_error_history_begins_empty() -> None:
-    text = dcf.without(SHIPPED.encode(), {0x1003}).decode()
-    count = int(text.split("[OptionalObjects]\r\nSupportedObjects=")[1].split("\r\n")[0])
-    text = text.replace(
-        f"[OptionalObjects]\r\nSupportedObjects={count}",
-        f"[OptionalObjects]\r\nSupportedObjects={count + 1}\r\n{count + 1}=0x1003",
-    )
-    text += f"\r\n[1003]\r\n{variable(0x07, 'ro')}CompactSubObj=4\r\n".replace(
-        "ObjectType=0x7", "ObjectType=0x8"
-    )
-    assert (entry_of(text, 0x1003, 0).default, entry_of(text, 0x1003, 0).access) == (0, "rw")
-    assert entry_of(text, 0x1003, 4).access == "ro"
 
 
 # --- the DCF --------------------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from eds_text import SHIPPED, with_key
 
 from kontronik_can_gw.canopen.check import check_eds, without_objects
 from kontronik_can_gw.canopen.dcf import without
-from kontronik_can_gw.canopen.dictionary import _IF_ABSENT, key
 from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -83,13 +82,6 @@ def whole(dropped: frozenset[int] = frozenset()) -> list[str]:
     return behaviour(dropped)
 
 
-def test_the_session_hears_every_service() -> None:
-    heard = {line.split()[1] for line in whole()}
-    assert heard == {"701", "081", "181", "281", "381", "481", "7E4"}
-    codes = {line.split()[2][:4] for line in whole() if line.split()[1] == "081"}
-    assert codes == {"0000", "2032", "4081", "4082", "1075"}
-
-
 @pytest.mark.parametrize("index", OPTIONAL, ids=lambda index: f"{index:04X}h")
 def test_a_dropped_object_leaves_the_behaviour_of_the_shipped_default(index: int) -> None:
     pdos = pdos_with(index)
@@ -102,25 +94,6 @@ def test_all_dropped_at_once_leave_it_too() -> None:
     assert behaviour(frozenset(OPTIONAL) | pdos, self_start=True) == behaviour(
         pdos, self_start=True
     )
-
-
-def test_the_behaviour_without_an_object_is_that_of_the_shipped_file() -> None:
-    shipped_numbers = {
-        key(entry.index, entry.sub): entry.default for entry in shipped_eds().entries
-    }
-    assert {number: shipped_numbers[number] for number in _IF_ABSENT} == _IF_ABSENT
-    services = {
-        entry.index
-        for entry in shipped_eds().entries
-        if entry.index < 0x2000 and entry.index not in PDOS
-    }
-    for number, default in shipped_numbers.items():
-        if (
-            number & 0xFF
-            and number >> 8 in services - {0x1010, 0x1011, 0x1200}
-            and isinstance(default, int)
-        ):
-            assert _IF_ABSENT.get(number, 0) == default, f"{number:06X}"
 
 
 @pytest.mark.parametrize("number", range(6))
@@ -159,11 +132,6 @@ def test_a_default_pdo_that_maps_nothing_is_named() -> None:
 
 def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
     check_eds(shipped_eds(), EscSettings(), range(1, 128))
-
-
-def test_a_default_cob_id_without_bit_30_is_that_of_a_pdo() -> None:
-    source = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x180")
-    check_eds(load(source.encode(), "my.eds"), EscSettings(), [5])
 
 
 def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:

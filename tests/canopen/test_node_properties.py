@@ -5,11 +5,10 @@ Equal input gives equal output.
 
 from typing import Any
 
-from dialogue import NO_HEARTBEAT, Bench, default, info, live, shipped_eds
+from dialogue import NO_HEARTBEAT, Bench, default, info, live
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
 
@@ -123,58 +122,6 @@ def test_nothing_raises_equal_input_gives_equal_output_and_every_frame_is_one_th
         assert 0 <= frame.can_id <= 0x7FF
         assert len(frame.data) <= 8
         assert not (frame.extended or frame.fd or frame.remote)
-
-
-MAPPABLE = [
-    e.index << 16 | e.sub << 8 | 8 * size
-    for e in shipped_eds().entries
-    if e.mappable and (size := Variable(e).size) is not None
-]
-pdo_writes = st.one_of(
-    st.tuples(
-        st.just(1),
-        st.sampled_from([0x40000181, 0x181, 0xC0000181, 0x40000333, 0x40000281]),
-        st.just(4),
-    ),
-    st.tuples(st.just(2), st.sampled_from([0, 1, 2, 240, 254, 255]), st.just(1)),
-    st.tuples(st.just(3), st.sampled_from([0, 100, 5000]), st.just(2)),
-    st.tuples(st.just(5), st.sampled_from([0, 7, 100]), st.just(2)),
-    st.tuples(st.just(6), st.sampled_from([0, 3]), st.just(1)),
-)
-mapping_writes = st.one_of(
-    st.tuples(st.just(0), st.integers(0, 8), st.just(1)),
-    st.tuples(st.integers(1, 8), st.sampled_from([0, *MAPPABLE]), st.just(4)),
-)
-configuring = st.one_of(
-    st.tuples(st.just(0x1800), pdo_writes),
-    st.tuples(st.just(0x1A00), mapping_writes),
-    st.tuples(st.just(0x2100), st.tuples(st.just(1), st.integers(1, 100), st.just(1))),
-    happenings.filter(lambda what: what[0] in ("uart", "wait", "lost", "opened")),
-    st.just(("frame", CanFrame(0x80, b""))),
-    st.just(("frame", CanFrame(0, b"\x01\x00"))),
-)
-
-
-@given(st.lists(configuring, max_size=60))
-@FEW
-def test_a_pdo_is_what_its_objects_say_whatever_was_configured(story: list[Any]) -> None:
-    bench = Bench(NODES, changes=NO_HEARTBEAT)
-    bench.start()
-    for step in story:
-        if isinstance(step[0], int):
-            index, (sub, value, size) = step
-            bench.write(index, sub, value, size=size)
-        else:
-            happen(bench, step)
-        count = bench.number(0x1A00)
-        entries = [bench.number(0x1A00, sub) for sub in range(1, count + 1)]
-        bits = sum(entry & 0xFF for entry in entries)
-        cob_id = bench.number(0x1800, 1)
-        assert bits <= 64
-        for frame in bench.take():
-            if frame.can_id in (0x181, 0x333) and step[0] != "wait":
-                assert cob_id & ~0x40000000 == frame.can_id
-                assert 8 * len(frame.data) == bits
 
 
 # --- SDO

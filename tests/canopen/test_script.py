@@ -1,10 +1,8 @@
 """The reader and player of dialogues: tables, texts, parts, and that nothing passes that is not as written."""
 
-from pathlib import Path
-
 import pytest
 from dialogue import bench_of
-from script import play_lines, read_dialogues
+from script import play_lines
 
 RIGHT = """
     0 <- 601 40 00 10 00 00*
@@ -32,16 +30,3 @@ def test_what_is_not_as_written_is_named_by_its_place(old: str, new: str, said: 
         with pytest.raises(AssertionError) as caught:
             play_lines(bench_of(["heartbeat"]), lines)
         assert said in str(caught.value)
-
-
-def test_rows_texts_and_parts_are_worked_in(tmp_path: Path) -> None:
-    file = tmp_path / "b.txt"
-    file.write_text(
-        "; about\nlet x = 01 02\npart both\n 0 <- {x}\n 1 -> {y}\n\n== first ; why\nwith nodes {n}\n"
-        "each | n | y\n     | 2 | 05\n     | 3 | \nuse both\n{y}\n\n== second\n2 -\n"
-    )
-    first, again, second = read_dialogues(file)
-    assert (first.name, first.options) == ("b: first [2, 05]", ["nodes 2"])
-    assert first.lines == [("b.txt:4", "0 <- 01 02"), ("b.txt:5", "1 -> 05"), ("b.txt:13", "05")]
-    assert (again.options, again.lines[1:]) == (["nodes 3"], [("b.txt:5", "1 -> ")])
-    assert (second.name, second.options, second.lines) == ("b: second", [], [("b.txt:16", "2 -")])

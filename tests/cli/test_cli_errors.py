@@ -1,7 +1,6 @@
 """The command line as a process: bad input gives one clear line with the remedy, the right exit code and nothing else."""
 
 import contextlib
-import json
 import os
 import re
 import shutil
@@ -10,14 +9,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import jsonschema
 import pytest
 from command_line import refused, run
 
 from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
-from kontronik_can_gw.config.export import schema
 from kontronik_can_gw.config.keys import REMOVED_KEYS
-from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -62,11 +58,6 @@ def test_a_removed_option_is_one_line_with_what_to_type_instead(
 def test_the_beginning_of_an_option_is_none(words: str) -> None:
     """A script that abbreviates would mean another option after an update."""
     assert f"unrecognized arguments: {words.split()[-2]}" in refused(2, *words.split())
-
-
-def test_a_file_may_have_the_name_of_a_removed_option(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(REMOVED_OPTIONS, ("decode", "--tape"), "Type -o x.")
-    assert "No such file" in refused(1, "decode", "--", "--tape")
 
 
 def test_no_removed_option_is_in_use() -> None:
@@ -170,10 +161,6 @@ def test_one_device_by_two_names_is_refused(tmp_path: Path, terminal: PtyEsc) ->
         )
 
 
-def test_a_folder_is_no_configuration_and_is_not_answered_with_init(tmp_path: Path) -> None:
-    assert "init" not in refused(2, "check", "-c", tmp_path)
-
-
 LONG = "x" * 300
 
 
@@ -226,28 +213,6 @@ def test_socketcan_that_is_not_there_is_reported_with_the_command_that_makes_it(
 
 
 # --- init, check, schema
-
-
-def test_init_writes_the_example_once_and_replaces_it_only_when_forced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run("init").code == 0
-    file = tmp_path / "gateway.toml"
-    assert load(file).esc[0].pole_pairs == 7
-    file.write_text("mine")
-    refused(2, "init")
-    assert file.read_text() == "mine"
-    assert run("init", "--force").code == 0
-    assert run("init", "-").out == file.read_text() != "mine"
-    assert os.listdir(tmp_path) == ["gateway.toml"]
-
-
-def test_schema_is_the_json_schema_of_the_configuration() -> None:
-    done = run("schema")
-    assert (done.code, done.err) == (0, "")
-    assert json.loads(done.out) == schema()
-    jsonschema.Draft202012Validator.check_schema(json.loads(done.out))
 
 
 # --- dbc

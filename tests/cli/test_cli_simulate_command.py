@@ -14,7 +14,6 @@ from kontronik_can_gw.esc.kontronik import (
     Device,
     Frame,
     InfoData,
-    Layout,
     LiveData,
     OperatingError,
 )
@@ -43,14 +42,6 @@ def test_the_bytes_of_a_file_and_of_standard_output_are_those_of_the_simulator(
     assert run(*words, "-").data == (tmp_path / "out.bin").read_bytes()
 
 
-def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None:
-    words = ["--esc", "3", "--layout", "mixed", "--seconds", "2s", "--out"]
-    assert run("simulate", *words, tmp_path / "esc{n}.bin").code == 0
-    files = [tmp_path / f"esc{n}.bin" for n in (1, 2, 3)]
-    layouts = [{frame.layout for frame in frames_of(file.read_bytes())} for file in files]
-    assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
-
-
 def test_error_bits_and_the_device_are_as_asked(tmp_path: Path) -> None:
     words = "--error undervoltage@1s+500ms --error BEC-overcurrent@2 --device kontrol-x"
     frames = written(tmp_path, f"{words} --seconds 6")
@@ -61,24 +52,6 @@ def test_error_bits_and_the_device_are_as_asked(tmp_path: Path) -> None:
     infos = [frame.data for frame in frames if isinstance(frame.data, InfoData)]
     assert [info.device for info in infos] == [Device.KONTROL_X] * 6
     assert (infos[0].variant, infos[0].firmware, infos[0].cell_count) == (120, "4.17", 6)
-
-
-def test_what_is_lost_and_disturbed_is_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:
-    assert 150 < len(written(tmp_path, "--seconds 3 --flip-bits 3e-4 --dropout 500ms/2s")) < 253
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--seconds soon", "'soon' is not a time. Give for example 5s, 200ms or 2min"),
-        ("--dropout 9s/2s", "'9s/2s': the silence must be shorter than the interval, as 2s/10s"),
-        ("--error undervoltag@5", "'undervoltag' is not an error bit. Did you mean undervoltage?"),
-        ("--esc 2 --link /tmp/x", "--link /tmp/x: needs {n} in the path"),
-        ("--out x", "--out x: has no end. Give --seconds."),
-    ],
-)
-def test_a_wrong_use_is_reported_in_one_line(words: str, said: str) -> None:
-    assert said in refused(2, "simulate", *words.split())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

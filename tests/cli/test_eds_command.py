@@ -1,7 +1,6 @@
 """``eds``: the EDS byte for byte, and DCFs that read back with the values of the node."""
 
 import io
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -65,15 +64,6 @@ def dcf_values(*words: object) -> dict[Key, int | bytes]:
 
 
 # --- the EDS
-
-
-def test_without_a_node_id_the_shipped_eds_is_written_byte_for_byte(tmp_path: Path) -> None:
-    out = tmp_path / "out.eds"
-    assert command("-o", out) == (0, "", f"kontronik-can-gw: {out} written\n")
-    assert out.read_bytes() == EDS.read_bytes()
-    assert os.listdir(tmp_path) == ["out.eds"]
-    code, text, said = command()
-    assert (code, text.encode(), said) == (0, EDS.read_bytes(), "")
 
 
 def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:

@@ -2,14 +2,12 @@
 
 import os
 import re
-import select
 import subprocess
 import sys
 import termios
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, Self
 
 import can
@@ -103,37 +101,6 @@ def test_a_terminal_that_echoes_gets_no_echo_from_the_gateway() -> None:
     finally:
         os.close(slave)
         os.close(master)
-
-
-def descriptors() -> int:
-    return len(os.listdir("/proc/self/fd"))
-
-
-def test_file_descriptors_do_not_grow_with_a_port_that_comes_and_goes(tmp_path: Path) -> None:
-    link = tmp_path / "esc"
-    esc = PtyEsc(link)
-    count = sys.maxsize
-    with Bench(str(link)) as running:
-        telemetry = running.gateway.escs[0]
-        for cycle in range(8):
-            esc.close()
-            esc = PtyEsc(link)
-            frame = encode(LIVE._replace(electrical_speed=cycle + 1), Layout.V4)
-            end = time.monotonic() + 60
-            while telemetry.live is None or telemetry.live.electrical_speed != cycle + 1:
-                assert time.monotonic() < end, "not open again"
-                esc.write(frame)
-                select.select([], [], [], 0.002)
-            assert esc.check() == 0
-            while running.bus.recv(0) is not None:
-                pass
-            if cycle <= 2:
-                count = descriptors()
-            end = time.monotonic() + 60
-            while descriptors() > count:  # the loop has one more open now and then
-                assert time.monotonic() < end, f"{descriptors()} after {count}"
-                select.select([], [], [], 0.002)
-        esc.close()
 
 
 def test_stopping_a_loop_that_has_ended_writes_to_nobody(esc: PtyEsc) -> None:

@@ -4,14 +4,11 @@ import os
 import signal
 import subprocess
 import sys
-import tomllib
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
 LIMITED = 'ulimit -n "$0" && exec "$@"'
 INTERRUPTED = """
 import os, runpy, signal, sys
@@ -75,13 +72,6 @@ def test_who_has_ctrl_c_ignored_is_not_ended_by_it(folder: Path) -> None:
     code = code.format(module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[])
     done = run(sys.executable, "-c", code, folder=folder)
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_the_installed_program_begins_where_this_is_seen_to() -> None:
-    (program,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"].values()
-    module, _, name = program.partition(":")
-    assert callable(getattr(import_module(module), name))
-    assert module == "kontronik_can_gw.__main__"
 
 
 @pytest.mark.parametrize(

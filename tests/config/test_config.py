@@ -263,14 +263,6 @@ def rows_of(table: dict[str, Any]) -> str:
     return "".join(f"{key} = {json.dumps(value)}\n" for key, value in table.items())
 
 
-@pytest.mark.parametrize(
-    "names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")]
-)
-def test_names_that_begin_alike_but_can_be_distinguished_are_taken(names: tuple[str, ...]) -> None:
-    config = parse(named(*names), "a.toml")
-    assert [esc.name for esc in config.escs] == list(names)
-
-
 # --- keys of earlier versions
 
 
@@ -316,12 +308,6 @@ def test_no_removed_key_is_in_use_and_each_says_what_to_do_instead() -> None:
 # --- files
 
 
-def test_a_byte_order_mark_and_windows_line_ends_do_not_matter(tmp_path: Path) -> None:
-    file = tmp_path / "a.toml"
-    file.write_bytes(b'\xef\xbb\xbf[[esc]]\r\nport = "COM3"\r\n')
-    assert load(file).esc[0].port == "COM3"
-
-
 def test_the_dbc_file_is_relative_to_the_configuration(tmp_path: Path) -> None:
     folder = tmp_path / "deep"
     for name in ("my.dbc", "../my.dbc", "/etc/my.dbc"):
@@ -361,16 +347,6 @@ def test_the_shipped_example_has_every_key_of_every_table() -> None:
         given = made["esc"] if table == "esc" else [made[table]]
         assert {key for entry in given for key in entry} == set(keys)
     assert set(properties) == set(TABLES) == set(made)
-
-
-def test_what_the_example_shows_as_default_is_the_default() -> None:
-    made = tomllib.loads(uncommented())
-    made["esc"] = made["esc"][0]
-    examples = {("can", "options"), ("esc", "port"), ("esc", "pole_pairs")}
-    for table in TABLES:
-        for key, value in made[table].items():
-            if (table, key) not in examples and DEFAULTS[table][key] not in (None, {}, ()):
-                assert value == DEFAULTS[table][key], f"{table}.{key}"
 
 
 # --- the schema against the parser

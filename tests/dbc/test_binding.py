@@ -12,14 +12,13 @@ from dbc_bench import compiled, gateway_with, packed
 from e2e import p01
 from hypothesis import given
 from hypothesis import strategies as st
-from packer_oracle import Msg, Sig, dbc_text, get, pascal
+from packer_oracle import Msg, Sig, dbc_text, get
 
 from kontronik_can_gw.dbc.binding import Binder
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.plan import Layout, Role
@@ -71,23 +70,6 @@ def test_a_name_is_found_whatever_its_case_underscores_prefix_and_percent(
 ) -> None:
     for name in names.split():
         assert raw_of(replace(signal, name=name)) == raw
-
-
-@pytest.mark.parametrize("source", sorted(VALUES))
-def test_every_source_is_found_by_its_pascal_case_name_with_and_without_prefix(source: str) -> None:
-    one = Binder([EscSettings("left")], {})
-    two = Binder([EscSettings("left"), EscSettings("right_rear")], {})
-    for binder, name, esc in (
-        (one, pascal(source), 0),
-        (one, "Left" + pascal(source), 0),
-        (two, "RightRear" + pascal(source), 1),
-        (two, f"right_rear.{source}", 1),
-        (two, pascal(source), None),
-    ):
-        found = binder.by_name(name)
-        assert found is not None, name
-        assert found[0].name == source
-        assert found[1] == (None if found[0].group.value == "gateway" else esc)
 
 
 def test_of_two_prefixes_the_longer_wins_and_a_source_before_a_prefix() -> None:

@@ -5,7 +5,6 @@ from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.dbc.prepare import check_load
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.signals.plan import Layout
 
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
@@ -76,20 +75,6 @@ def test_a_message_is_counted_with_what_a_uart_at_100_hz_brings(
 ) -> None:
     layout = layout_of(message_of(*names), kind, cycle, delay)
     assert layout.bus_load(1_000_000) == pytest.approx(frames_a_second * 135e-6, rel=1e-12)
-
-
-def test_half_of_the_bus_is_no_warning_and_all_of_it_no_error() -> None:
-    layout = layout_of(message_of("LeftBatteryVoltage"))  # 100 frames a second of 135 bits
-    assert check_load(layout, 27_000) is None
-    assert check_load(layout, 26_999)
-    assert "75% of 18 kbit/s" in str(check_load(layout, 18_000))
-    assert "100% of 13 kbit/s" in str(check_load(layout, 13_500))
-    with pytest.raises(UserError, match=r"my_car\.dbc: .* 100% of 13 kbit/s"):
-        check_load(layout, 13_499)
-    fd = layout_of(message_of("LeftBatteryVoltage", length=64), frame_format=FD)
-    assert check_load(fd, 250_000, 2_000_000) is None
-    with pytest.raises(UserError):
-        check_load(fd, 250_000, 67_900)
 
 
 def test_the_bits_of_canopen_nodes_count_too() -> None:

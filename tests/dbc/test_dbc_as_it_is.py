@@ -11,7 +11,6 @@ from dbc_bench import compiled, gateway_with, packed, refused
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check_details as check
 from kontronik_can_gw.dbc.loss import unreported
-from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.timing import SEND_TYPES
@@ -57,14 +56,6 @@ def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> Non
         parse_database((STATE + text).encode(), "my.dbc")
 
 
-@pytest.mark.parametrize("end", [" ", "\n"])
-def test_a_value_table_may_be_named_although_ns_lists_its_keyword(end: str) -> None:
-    table = f'VAL_TABLE_ States{end}21 "Forward"{end}12 "MotorOff"{end};'
-    text = f"{STATE}VAL_TABLE_ Empty ;\n{table}\nVAL_ 256 OperatingState States ;\n"
-    (plan,) = compiled(text).messages
-    assert plan.signals[0].numbers == {21: 21, 12: 12}
-
-
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
@@ -86,16 +77,6 @@ def test_an_entry_for_what_is_not_in_the_file_is_ignored_with_a_warning(
     (line,) = warnings
     assert line.startswith("my.dbc: ignored") and line.endswith(words)
     assert message.signals[0].choices is None and message.signals[0].comment == comment
-
-
-def test_many_entries_for_nothing_are_one_warning_and_a_mistake_keeps_its_line() -> None:
-    warnings: list[str] = []
-    text = STATE + "".join(f'VAL_ {n} X 1 "x" ;\n' for n in range(1000, 1100))
-    parse_database(text.encode(), "my.dbc", warnings)
-    (line,) = warnings
-    assert line.endswith("VAL_ 1005 X and 94 more")
-    with pytest.raises(UserError, match=f"line {text.count(chr(10)) + 1}"):
-        parse_database(f"{text}VAL_ x y z;\n".encode(), "my.dbc")
 
 
 # --- units --------------------------------------------------------------------------------------------------------------
@@ -289,12 +270,6 @@ def test_a_start_value_may_be_every_number_that_the_signal_holds(
         assert "Power.Foo" in line and f"GenSigStartValue {number}" in line
 
 
-def test_a_wrong_binding_is_refused_whatever_becomes_of_signals_without_one() -> None:
-    bind = {"Motor_11X": "batery_voltage"}
-    (line,) = refused(ECU, messages=["Motor_11"], bind=bind, **GATEWAYS)
-    assert "bound by dbc.bind to 'batery_voltage'" in line and "battery_voltage" in line
-
-
 # --- send types ---------------------------------------------------------------------------------------------------------
 
 SPELLINGS = {
@@ -372,11 +347,6 @@ def test_what_may_count_something_else_is_refused_with_the_way_to_say_that_it_co
     (line,) = refused(MESSAGE + signal(name))
     assert "no such source" in line and 'bind = "alive"' in line
     assert role(name, **{name: "alive"}) is Role.ALIVE
-
-
-@pytest.mark.parametrize("name", ["ABZ", "Jazz", "Brebz", "Kompass", "Physics", "Gas_CSX"])
-def test_a_word_that_only_ends_alike_is_neither(name: str) -> None:
-    assert protection(name) is None
 
 
 @pytest.mark.parametrize(
@@ -495,21 +465,6 @@ def test_check_names_the_signal_that_reports_the_loss_and_warns_where_there_is_n
     assert len(warned) == (reporter is None)
     assert all('on_loss = "silent"' in line and "Undervoltage" in line for line in warned)
     assert not unreported(layout, silent=True)
-
-
-def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_that_advice() -> (
-    None
-):
-    layout = compiled(FLAG + signal("CrcErrors", "8|8@1+"))
-    for silent in (False, True):
-        (line,) = unreported(layout, silent)
-        assert "on_loss" not in line and "link_state" in line
-
-
-def test_a_flag_with_room_for_a_code_hides_no_loss() -> None:
-    layout = compiled(FLAG.replace("0|1@1+", "0|2@1+"))
-    assert not unreported(layout, silent=False)
-    assert not any("reports the loss" in line for line in check.table(layout, ["esc1"]))
 
 
 def test_of_two_escs_each_flag_needs_a_signal_of_its_own_esc() -> None:

@@ -45,13 +45,6 @@ def error(message: Message) -> dict[str, int]:
 # --- cantools -------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def cantools_database() -> Any:
-    import cantools
-
-    return cantools.database.load_file(SHIPPED, database_format="dbc", strict=True)
-
-
 @BOTH
 @pytest.mark.filterwarnings("error")
 def test_cantools_loads_the_file_strictly_and_silently(
@@ -62,26 +55,6 @@ def test_cantools_loads_the_file_strictly_and_silently(
     with caplog.at_level(logging.INFO):
         cantools.database.load_file(file, database_format="dbc", encoding="ascii", strict=True)
     assert caplog.records == []
-
-
-@pytest.mark.parametrize(("text", "raw_of"), [("NotAvailable", not_available), ("Error", error)])
-def test_cantools_names_the_two_codes(cantools_database: Any, text: str, raw_of: Any) -> None:
-    for message in layout().messages:
-        decoded = cantools_database.decode_message(message.id, frame(message, raw_of(message)))
-        for signal in message.signals:
-            expected = text if signal.has_codes else 0
-            assert decoded[signal.name] == expected, signal.name
-
-
-def test_cantools_starts_every_signal_not_available(cantools_database: Any) -> None:
-    """The start value is raw: an initial value of 655.35 V would be a number, not a missing one."""
-    for message in layout().messages:
-        seen = cantools_database.get_message_by_frame_id(message.id)
-        assert {signal.name: signal.raw_initial for signal in seen.signals} == not_available(
-            message
-        )
-        initial = {signal.name: signal.initial for signal in seen.signals}
-        assert seen.encode(initial, strict=False) == frame(message, not_available(message))
 
 
 # --- canmatrix ------------------------------------------------------------------------------------------------------
@@ -141,20 +114,6 @@ def test_opendbc_reads_every_signal_from_the_path_of_the_file(file: Path) -> Non
         for signal in message.signals:
             its = signals[signal.name]
             assert (its.factor, its.offset, its.type) == (float(signal.factor), 0.0, 0)
-
-
-@BOTH
-def test_opendbc_reads_every_value_text(file: Path) -> None:
-    """It splits texts at blanks and shouts: `Bus Off` would raise, `Ok` and `OK` would meet."""
-    from opendbc.can import CANDefine  # type: ignore[import-untyped]
-
-    db = layout(file)
-    names = {message.id: message.name for message in db.messages}
-    defined = CANDefine(str(file)).dv
-    for (message_id, name), table in db.tables.items():
-        assert defined[names[message_id]][name] == {
-            number: text.upper() for number, text in table.items()
-        }
 
 
 # --- the same bits for all ------------------------------------------------------------------------------------------

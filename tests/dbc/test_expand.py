@@ -1,7 +1,6 @@
 """The DBC of several ESCs from that of one, and of a configuration: loss-free, by the rules, and exactly what is sent."""
 
 import random
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,14 +8,12 @@ from typing import Any
 
 import pytest
 from cantools.database.can import Database, Message
-from dbc_rules import ENUMS, findings, parse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc import expand, writer
-from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.prepare import compile_layout, prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
@@ -93,18 +90,6 @@ def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
     assert writer.dbc_text(parse_database(SHIPPED.encode(), "x")) == SHIPPED
 
 
-def test_the_file_for_eight_escs_keeps_the_rules() -> None:
-    text = multiplied(SHIPPED, EIGHT, "KontronikGateway")[1].encode()
-    db = parse(text)
-    for line in findings(text):
-        assert line.startswith("enums_are_closed: ") or line.endswith("is longer than 28"), line
-    names = [m.name for m in db.messages] + [s.name for s in db.signals]
-    assert all(len(name) <= 32 for name in names)
-    assert len({message.id for message in db.messages}) == len(db.messages)
-    for signal in db.signals:
-        assert db.named(signal) == ENUMS.get(re.sub("^Esc[1-8]", "", signal.name), {}), signal.name
-
-
 def test_every_property_of_each_of_eight_escs_is_that_of_the_one() -> None:
     one, many = read(SHIPPED), multiplied(SHIPPED, EIGHT, "KontronikGateway")[0]
     assert len(many.messages) == 8 * (len(one.messages) - 2) + 2
@@ -116,13 +101,6 @@ def test_every_property_of_each_of_eight_escs_is_that_of_the_one() -> None:
             assert copy.frame_id == message.frame_id + index
             assert facts_of_message(copy, prefix) == facts_of_message(message)
     assert facts_of_database(many) == facts_of_database(one)
-
-
-def test_a_rich_dbc_is_written_for_one_esc_without_a_loss() -> None:
-    after, text = multiplied(RICH, ONE, "Gw")
-    assert all_facts(after) == all_facts(read(RICH))
-    assert relations(text) == relations(RICH)
-    assert writer.dbc_text(after) == text
 
 
 def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
@@ -149,34 +127,6 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
     assert writer.dbc_text(after) == text
     assert text.endswith(";\n") and "\r" not in text and "\n\nBO_ 256 LeftFlow" in text
     assert '"NS_DESC' not in text and "\nNS_ :\n" in text
-
-
-def test_the_database_that_is_multiplied_is_left_as_it_was() -> None:
-    database = read(RICH)
-    before = writer.dbc_text(database)
-    expand.expand(database, "Gw", PAIR, "my.dbc", None, 0x300)
-    assert writer.dbc_text(database) == before
-
-
-def test_extended_multiplexing_of_one_level_comes_through() -> None:
-    page, timing = Sig("Page", 0, 4, mux="M"), Sig("Timing", 32, 8, mux="m2")
-    text = dbc_text([Msg("EscX", 5, 8, [page, Sig("BatteryVoltage", 8, 16, mux="m0"), timing])])
-    text += "SG_MUL_VAL_ 5 BatteryVoltage Page 0-1, 3-3;\nSG_MUL_VAL_ 5 Timing Page 2-2;\n"
-    after, _ = multiplied(text, PAIR)
-    voltage = after.get_message_by_name("RightX").get_signal_by_name("RightBatteryVoltage")
-    assert voltage.multiplexer_ids == [0, 1, 3]
-    assert voltage.multiplexer_signal == "RightPage"
-
-
-def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_they_were() -> None:
-    more = (
-        'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_DEF_ "SystemSignalLongSymbol" "";\n'
-        'BA_ "SystemSignalLongSymbol" SG_ 5 U "BatteryVoltage";'
-    )
-    after, text = multiplied(dbc_text([Msg("EscX", 5, 8, [Sig("U", 0, 16, unit="V")])], more), PAIR)
-    names = [signal.name for message in after.messages for signal in message.signals]
-    assert names == ["LeftBatteryVoltage", "RightBatteryVoltage"]
-    assert 'BA_ "SystemSignalLongSymbol"' not in text
 
 
 @settings(max_examples=40, deadline=None)
@@ -289,18 +239,6 @@ def test_names_of_more_than_32_characters_are_refused() -> None:
     assert multiplied(theirs, escs("a", "b"))[0].messages[-1].name == "T" * 40
 
 
-def test_two_messages_that_would_get_one_name_are_refused() -> None:
-    voltage = [Sig("BatteryVoltage", 0, 16)]
-    text = dbc_text(Msg(n, i, 8, voltage) for i, n in enumerate(("EscPower", "Power"), 0x100))
-    assert "LeftPower" in refused(text)
-
-
-def test_the_prefix_of_an_esc_is_its_name_in_pascal_case() -> None:
-    names = {"left": "Left", "left_front": "LeftFront", "esc1": "Esc1", "FR": "FR"}
-    for name, prefix in (names | {"a_b_1": "AB1", "x__y_": "XY"}).items():
-        assert esc_prefix(name) == prefix
-
-
 # --- what is written is what is sent ------------------------------------------------------------------------------------
 
 
@@ -310,25 +248,6 @@ def plain_plans(layout: Layout) -> list[MessagePlan]:
         replace(plan, signals=tuple(sorted(plan.signals, key=lambda signal: signal.name)))
         for plan in layout.messages
     ]
-
-
-@pytest.mark.parametrize(
-    ("text", "escs", "more"),
-    [
-        (SHIPPED, EIGHT[:1], {}),
-        (SHIPPED, EIGHT, {}),
-        (RICH, ONE, {"node": "Gw", "base_id": 0x10}),
-        (RICH, PAIR, {"node": "Gw", "base_id": 0x10}),
-    ],
-    ids=["shipped", "shipped for eight", "rich", "rich for two"],
-)
-def test_plans_from_the_written_file_are_those_of_the_gateway(
-    text: str, escs: list[EscSettings], more: dict[str, Any]
-) -> None:
-    database, layout = prepare(read(text), "x", escs, DbcSettings(**more), fd_allowed=True)
-    written = read(writer.dbc_text(database))
-    same = DbcSettings(node=more.get("node"))
-    assert plain_plans(prepare(written, "x", escs, same, fd_allowed=True)[1]) == plain_plans(layout)
 
 
 @pytest.mark.parametrize("seed", range(20))

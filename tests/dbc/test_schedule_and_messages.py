@@ -2,13 +2,11 @@
 
 import random
 import re
-import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import dialogue
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,7 +18,7 @@ from kontronik_can_gw.dbc.schedule import phases
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -269,18 +267,6 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
     assert len(bench.times()) == 1 + lives
 
 
-def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
-    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("CellCount", 0, 8)]), EVENT, 0, 0)])
-    bench.now = 50 * MS
-    bench.live()
-    bench.forget()
-    bench.live(InfoData(cell_count=6))
-    assert bench.raws(8) == [6]
-    bench.until(100 * MS)
-    bench.live()
-    assert bench.raws(8) == [6]
-
-
 def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> None:
     cycles = {EVENT: 0, ON_CHANGE: 0, CYCLIC_AND_EVENT: 40, CYCLIC_AND_ON_CHANGE: 30, CYCLIC: 50}
     for kind, cycle in cycles.items():
@@ -386,16 +372,6 @@ def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() ->
             assert len(link) >= 2250 // cycle - 1 if cycle else len(link) == 3
 
 
-def test_silent_says_nothing_before_the_first_frame_but_for_the_link() -> None:
-    bench = Bench(
-        [(Msg("EscPower", 0x100, 8, [VOLTAGE]), CYCLIC, 10, 0), (escs_message(0), CYCLIC, 100, 0)],
-        silent=True,
-        start=True,
-    )
-    bench.until(SECOND)
-    assert {frame.can_id for _, frame in bench.sent} == {0x200}
-
-
 def test_silent_lets_a_message_of_several_escs_go_on_as_long_as_one_is_up() -> None:
     signals = [Sig("LeftBatteryVoltage", 0, 16), Sig("RightBatteryVoltage", 16, 16)]
     bench = Bench([(Msg("Both", 0x100, 8, signals), CYCLIC, 50, 0)], ("left", "right"), silent=True)
@@ -404,19 +380,6 @@ def test_silent_lets_a_message_of_several_escs_go_on_as_long_as_one_is_up() -> N
     assert bench.raws(16, 16) == [65535] * 9
     bench.until(2 * SECOND)
     assert bench.times()[-1] == 650
-
-
-def test_values_are_back_with_the_first_frame_after_a_loss() -> None:
-    for silent in (False, True):
-        for kind in (EVENT, CYCLIC_AND_EVENT):
-            bench = lone(kind, 40 if kind == CYCLIC_AND_EVENT else 0, 0, silent=silent)
-            bench.feed(100 * MS)
-            bench.until(2 * SECOND + 5 * MS)
-            bench.forget()
-            bench.live(volts(77))
-            assert bench.times() == [2005] and bench.raws() == [77]
-            bench.until(2 * SECOND + 200 * MS)
-            assert set(bench.raws()) == {77}
 
 
 def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
@@ -446,34 +409,7 @@ def test_info_is_not_available_as_soon_as_it_is_too_old() -> None:
         assert get(frame.data, 0, 8, True) == (6 if known else 255), when
 
 
-def test_info_of_another_device_is_gone_with_the_telemetry() -> None:
-    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("DeviceRaw", 0, 8)]), EVENT, 0, 0)])
-    bench.now = 10 * MS
-    bench.live()
-    bench.live(InfoData(device_and_variant=device_and_variant(3, 120)))
-    bench.until(SECOND)
-    assert bench.raws(8) == [255, 3, 255] or bench.raws(8) == [3, 255]
-    assert bench.times()[-1] == 260
-
-
 # --- alive counter, pages ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("length", "maximum", "modulus"),
-    [(4, "0", 16), (4, "14", 15), (8, "0", 256), (2, "0", 4), (2, "2", 3), (3, "5", 6)],
-)
-def test_the_alive_counter_goes_up_by_one_with_each_frame_and_wraps(
-    length: int, maximum: str, modulus: int
-) -> None:
-    bench = lone(
-        CYCLIC_AND_EVENT, 33, 0, Sig("PowerAlive", 24, length, maximum=maximum), start=True
-    )
-    bench.feed(2 * SECOND)
-    bench.until(4 * SECOND)
-    bench.feed(7 * SECOND)
-    assert bench.raws(length, 24) == [n % modulus for n in range(len(bench.sent))]
-    assert len(bench.sent) > modulus
 
 
 def paged(kind: int, cycle: int, delay: int = 0, start: bool = False) -> Bench:
@@ -599,31 +535,6 @@ def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
 # --- settings that a master writes --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("kind", "cycle"), [(EVENT, 0), (CYCLIC, 10), (CYCLIC_AND_EVENT, 10)])
-def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame_on(
-    kind: int, cycle: int
-) -> None:
-    motor_speed = Sig("MotorSpeed", 0, 16, unit="1/min")
-    output_speed = Sig("OutputSpeed", 32, 32, unit="1/min", factor="0.5")
-    message = Msg("EscSpeed", 0x100, 8, [motor_speed, replace(VOLTAGE, start=16), output_speed])
-    bench = dialogue.Bench(changes=dialogue.QUIET, layout=Bench([(message, kind, cycle, 0)]).layout)
-    bench.wait(1000)
-    for writes, motor, output in (
-        ((), 21_000, 42_000),
-        (("2F 00 21 01 07 00 00 00",), 3_000, 6_000),
-        (("23 00 21 02 05 00 00 00", "23 00 21 03 02 00 00 00"), 3_000, 2_400),
-    ):
-        for request in writes:
-            bench.put(0x601, request)
-        assert [frame.data[0] for frame in bench.take() if frame.can_id == 0x581] == [0x60] * len(
-            writes
-        )
-        bench.uart(encode(LIVE._replace(electrical_speed=21_000), WireLayout.V4))
-        bench.wait(10)
-        data = [frame.data for frame in bench.take() if frame.can_id == 0x100][-1]
-        assert struct.unpack("<HHI", data) == (motor, 2442, output)
-
-
 # --- the gateway itself -------------------------------------------------------------------------------------------------
 
 
@@ -671,13 +582,6 @@ def test_the_last_word_is_every_page_that_changed_without_regard_to_the_minimum_
     sent = [(when // MS, frame.data[0], frame.data[1]) for when, frame in bench.sent]
     assert sent[:3] == [(0, 1, 1), (400, 2, 0), (800, 3, 1)]
     assert sorted(sent[3:]) == [(1150, 1, 2), (1150, 2, 4)]
-
-
-def test_messages_without_a_cycle_are_sent_once_at_the_start() -> None:
-    kinds = [(CYCLIC, 50), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50)]
-    messages = [Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]) for n in range(4)]
-    bench = Bench([(m, *kind, 0) for m, kind in zip(messages, kinds, strict=True)], start=True)
-    assert [frame.can_id for _, frame in bench.sent] == [0x101, 0x102]
 
 
 # --- any run ----------------------------------------------------------------------------------------------------------

@@ -109,12 +109,3 @@ def test_one_esc_loads_the_bus_below_ten_percent_and_eight_fit_on_it(
         each = {"Event": 100.0, "Cyclic": 1000 / (cycle or 1), "CyclicAndOnChange": 1000 / delay}
         hertz += each[db.send_type(message)] * (escs if message.name.startswith("Esc") else 1)
     assert least < hertz * 135 / 500_000 < most
-
-
-@pytest.mark.parametrize(
-    "name", ["Losses", "CrcErrors", "DroppedBytes", "SentFrames", "ReplacedFrames", "SendFailures"]
-)
-def test_the_comment_of_a_rolling_counter_shows_its_greatest_value(name: str) -> None:
-    db = parse(DATA)
-    found = next(signal for signal in db.signals if signal.name == name)
-    assert f"starts again at 0 after {found.maximum}." in dict(db.comments)[("SG_", *found.key)]

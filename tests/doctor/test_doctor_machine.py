@@ -69,13 +69,6 @@ def test_how_the_service_fares_is_reported(
     assert "machine.service_enabled" not in grave(service(tree))
 
 
-def test_a_service_that_does_not_start_with_the_machine_is_noted(tree: Tree) -> None:
-    tree.systemd(UnitFileState="disabled")
-    found = only(service(tree), "machine.service_enabled")
-    command = "sudo systemctl enable kontronik-can-gw.service"
-    assert (found.severity, found.command) == (NOTE, command)
-
-
 @pytest.mark.parametrize("mode", [None, 0o755])
 def test_a_service_that_cannot_lock_node_ids_is_warned_of(tree: Tree, mode: int | None) -> None:
     tree.systemd()
@@ -101,14 +94,6 @@ def test_without_a_service_we_must_be_able_to_write_where_parameters_go(tree: Tr
     tree.closed.add("/var/lib")
     tree.process(78, "python3", "-m", "kontronik_can_gw", "run")  # of another user
     assert folder(tree).severity is NOTE
-
-
-def test_the_services_own_folder_is_made_by_systemd(tree: Tree) -> None:
-    tree.systemd()
-    tree.folder("/var/lib")
-    tree.closed.add("/var/lib")
-    assert "systemd" in folder(tree).text
-    assert folder(tree, f"{STORE}-left", "/etc/kontronik-can-gw/left.toml").severity is OK
 
 
 def test_a_folder_of_ones_own_must_be_the_services_and_the_unit_must_let_it_write(

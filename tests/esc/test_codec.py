@@ -66,52 +66,6 @@ RECORDED_INFO_VALUES = {
     "max_bec_temperature": 33,
 }
 
-# Synthetic: no recording of the V4 layout or of a running motor is public. Made from the sheet, CRC by the bitwise reference.
-SYNTHETIC_V4_LIVE = LiveData(
-    electrical_speed=123_456,
-    battery_voltage=4_812,
-    battery_current=-123,
-    motor_current=987,
-    peak_current=1_650,
-    consumed_charge=2_345,
-    bec_current=1_234,
-    bec_voltage=7_999,
-    pwm_input=1_750,
-    throttle=-42,
-    output_opening=77,
-    power_stage_temperature=-13,
-    bec_temperature=-1,
-    operating_errors=0x00400001,
-    operating_state=21,
-    timing=9,
-)
-SYNTHETIC_V4_LIVE_FRAME = bytes.fromhex(
-    "4B4F444C 40E20100 CC12 85FF DB03 7206 2909 D204 3F1F D606 D6 4D F3 FF 01004000 15 09 0000"
-)
-SYNTHETIC_V4_INFO = InfoData(
-    device_and_variant=(1 << 10) | 5,
-    firmware_word=0x0411,
-    selftest_errors=0x00040001,
-    cell_count=12,
-    max_electrical_speed=234_567,
-    min_battery_voltage=4_000,
-    max_battery_voltage=5_040,
-    max_battery_current=-1,
-    max_motor_current=1_500,
-    max_peak_current=-10_000,
-    max_bec_current=20_000,
-    min_bec_voltage=5_001,
-    max_throttle=-100,
-    max_output_opening=100,
-    min_power_stage_temperature=-20,
-    max_power_stage_temperature=99,
-    min_bec_temperature=-128,
-    max_bec_temperature=127,
-)
-SYNTHETIC_V4_INFO_FRAME = bytes.fromhex(
-    "4B4F4449 0504 1104 01000400 0C 47940300 A00F B013 FFFF DC05 F0D8 204E 8913 9C 64 EC 63 80 7F 000000"
-)
-
 
 def fields_of(kind: str) -> list[Field]:
     return sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
@@ -175,18 +129,6 @@ def test_a_recorded_frame_is_that_of_the_stated_values(
         n: repr(value) for n, value in values.items()
     }
     assert encode(raw_values(data_type, values), Layout.LEGACY) == frame
-
-
-@pytest.mark.parametrize(
-    ("data", "frame_without_crc"),
-    [(SYNTHETIC_V4_LIVE, SYNTHETIC_V4_LIVE_FRAME), (SYNTHETIC_V4_INFO, SYNTHETIC_V4_INFO_FRAME)],
-    ids=["live", "info"],
-)
-def test_the_synthetic_v4_vectors_in_both_directions(data: Data, frame_without_crc: bytes) -> None:
-    frame = frame_without_crc + reference.crc32_of_bits(frame_without_crc).to_bytes(4, "little")
-    assert len(frame) in (40, 44)
-    assert encode(data, Layout.V4) == frame
-    assert decode(frame) == data
 
 
 @form_rows

@@ -21,14 +21,12 @@ from kontronik_can_gw.esc.kontronik import (
 )
 
 from . import sheet
-from .reference import certain_at, counters_of, frames_of, random_frame, seal
-from .sheet import FORM_ROWS, FormRow
+from .reference import certain_at, counters_of, frames_of
+from .sheet import FORM_ROWS
 from .streams import Uart, random_chunks, random_stream, seeds, streams
 
 PROPERTY = settings(deadline=None, max_examples=100, database=None)
-LIVE_LEGACY, INFO_LEGACY, LIVE_V4, INFO_V4 = FORM_ROWS
 
-form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
 
 SILENCE = "no bytes: "
 FAILED_CRC = "headers but no valid CRC: "
@@ -125,47 +123,7 @@ def test_long_damaged_streams_give_what_brute_force_finds_however_they_are_cut(s
     assert found > 250, "streams without frames would prove little"
 
 
-TAILS = [b"", b"K", b"KO", b"KOD", b"KKOD", b"KODX", b"KODXYZ", b"KODL", b"KODI\0", b"KODKO"]
-FRAMES = [random_frame(row, random.Random(5)) for row in FORM_ROWS]
-
-
-@pytest.mark.parametrize("fake", [b"KODL", b"KODI"])
-@pytest.mark.parametrize("gap", range(60))
-def test_what_comes_anywhere_behind_a_fake_header_is_accounted_as_stated(
-    fake: bytes, gap: int
-) -> None:
-    for tail in (*TAILS, *FRAMES):
-        stream = fake + bytes(gap) + tail
-        check_against_the_reference(stream, [stream])
-        check_against_the_reference(stream, one_by_one(stream))
-        assert [found.offset for found in run([stream])[0]] == ([4 + gap] if tail in FRAMES else [])
-
-
-@form_rows
-def test_a_header_that_straddles_the_end_of_a_frame_does_not_count(row: FormRow) -> None:
-    source = random.Random(8)
-    number = 0
-    while True:  # until the CRC's last byte is a K
-        frame = seal(row, number.to_bytes(4, "little") + source.randbytes(row.crc_at - 8))
-        if frame.endswith(b"K"):
-            break
-        number += 1
-    stream = frame + b"ODL" + bytes(60)
-    frames, deframer = run([stream])
-    assert len(frames) == 1
-    assert (deframer.counters.headers, deframer.counters.crc_errors) == (1, 0)
-
-
 # ---- when a frame comes out
-
-
-def test_the_recorded_frames_are_emitted_on_their_last_byte() -> None:
-    deframer = Deframer()
-    for frame, kind in ((sheet.RECORDED_LIVE, Kind.LIVE), (sheet.RECORDED_INFO, Kind.INFO)) * 3:
-        emitted = [deframer.feed(byte) for byte in one_by_one(frame)]
-        assert emitted[:-1] == [[]] * (len(frame) - 1)
-        assert [found.kind for found in emitted[-1]] == [kind]
-    assert deframer.counters.dropped_bytes == 0
 
 
 @PROPERTY
@@ -233,16 +191,6 @@ def test_after_a_flush_the_deframer_is_as_new(parts: list[bytes], seed: int) -> 
 # ---- counters
 
 
-def test_a_copy_of_the_counters_does_not_move() -> None:
-    deframer = Deframer()
-    deframer.feed(b"noise")
-    copy = deframer.counters.copy()
-    assert copy == deframer.counters
-    deframer.feed(sheet.RECORDED_INFO)
-    assert copy.as_dict() == Counters(bytes=5, dropped_noise=5).as_dict()
-    assert deframer.counters.as_dict()["info"] == deframer.counters.info == 1
-
-
 # ---- hostile input
 
 SIZE = 1 << 18
@@ -305,23 +253,6 @@ def test_the_work_on_hostile_input_is_linear(
     )
 
 
-@pytest.mark.parametrize("unit", HOSTILE.values(), ids=HOSTILE.keys())
-def test_hostile_input_gives_the_same_counters_and_bounded_pending_however_it_is_cut(
-    unit: bytes,
-) -> None:
-    stream = repeated(unit, 5_011)
-    source = random.Random(17)
-    for chunks in (whole(stream), one_by_one(stream), random_chunks(stream, source)):
-        frames, deframer = run(chunks)
-        assert frames == []
-        assert deframer.counters.as_dict() == counters_of(stream)
-
-
-def test_a_frame_is_still_found_behind_many_headers() -> None:
-    stream = b"KODLKODI" * (SIZE // 8) + sheet.RECORDED_LIVE + bytes(2)
-    assert [found.offset for found in run([stream])[0]] == [SIZE]
-
-
 # ---- diagnosis
 
 
@@ -362,12 +293,6 @@ def test_what_was_received_without_a_frame_has_a_diagnosis(
 
 def test_a_frame_that_never_came_whole_is_diagnosed_although_nothing_is_pending() -> None:
     assert diagnosis_of(sheet.RECORDED_LIVE[:30], flush=True) == PARTIAL
-
-
-def test_the_diagnoses_name_what_to_look_for() -> None:
-    assert "KOSMIK" in diagnosis_of(b"")
-    assert "parity" in diagnosis_of(b"?") and "8E1" in diagnosis_of(b"?")
-    assert "9600" in diagnosis_of(bytes(64)) and "old JIVE" in diagnosis_of(bytes(64))
 
 
 @pytest.mark.parametrize("resume_at_low_stop", [False, True])

@@ -16,7 +16,6 @@ from kontronik_can_gw.esc.kontronik import (
     OperatingError,
     OperatingState,
     SelfTestError,
-    flight_model,
 )
 from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,
@@ -46,10 +45,6 @@ def received(frames: list[Sent]) -> list[Frame]:
 
 def lives(frames: list[Sent]) -> list[LiveData]:
     return [sent.data for sent in frames if isinstance(sent.data, LiveData)]
-
-
-def infos(frames: list[Sent]) -> list[InfoData]:
-    return [sent.data for sent in frames if isinstance(sent.data, InfoData)]
 
 
 phases = st.builds(
@@ -101,15 +96,6 @@ def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(
     ).frames_until(20 * S)
 
 
-def test_live_frames_leave_each_period_and_the_info_frame_follows_the_hundredth() -> None:
-    frames = sends(2)
-    live_times = [sent.time_ns for sent in frames if isinstance(sent.data, LiveData)]
-    assert live_times == list(range(0, 2 * S, 10_000_000))
-    assert [at for at, sent in enumerate(frames) if isinstance(sent.data, InfoData)] == [100, 201]
-    # wire time of 40 bytes
-    assert frames[100].time_ns - frames[99].time_ns == pytest.approx(3_820_000, rel=0.01)
-
-
 @pytest.mark.parametrize("device", Device)
 def test_the_flight_is_physically_plausible(device: Device) -> None:
     frames = sends(101, EscOptions(device=device))
@@ -145,32 +131,6 @@ def test_the_flight_is_physically_plausible(device: Device) -> None:
     assert flight[4900].power_stage_temperature < hottest
 
 
-@pytest.mark.parametrize("device", Device)
-def test_the_log_in_info_frames_agrees_with_the_live_frames_before(
-    device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(flight_model, "_AMBIENT", -20.0)
-    seen: list[LiveData] = []
-    checked = 0
-    for sent in sends(60, EscOptions(device=device)):
-        if isinstance(sent.data, LiveData):
-            seen.append(sent.data)
-            continue
-        info = sent.data
-        column = {name: [getattr(live, name) for live in seen] for name in LiveData._fields}
-        run_at = next((at for at, live in enumerate(seen) if live.electrical_speed), len(seen))
-        for name in InfoData._fields[4:]:
-            extreme, what = name.split("_", 1)
-            values = column[what][run_at:] if name == "max_battery_voltage" else column[what]
-            floor = [] if "temperature" in name else [0]
-            expected = min(values) if extreme == "min" else max([*values, *floor])
-            assert getattr(info, name) == expected, name
-        checked += 1
-    assert checked == 60
-    assert info.max_battery_voltage > info.min_battery_voltage > 0
-    assert info.min_bec_temperature < 0
-
-
 @pytest.mark.parametrize("layout", Layout)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(
@@ -191,14 +151,6 @@ def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(
     assert len(intact) <= len(found) <= len(intact) + len(unprotected)
     rest = iter(found)
     assert all(data in rest for data in intact)  # in order
-
-
-def test_dropouts_silence_the_end_of_each_interval() -> None:
-    frames = sends(20, EscOptions(faults=Faults(dropout=Dropout(2 * S, 10 * S))))
-    seconds = {sent.time_ns // S for sent in frames}
-    assert seconds == set(range(20)) - {8, 9, 18, 19}
-    in_full = {sent.time_ns: sent.data for sent in sends(20)}
-    assert all(in_full[sent.time_ns] == sent.data for sent in frames)  # it goes on unheard
 
 
 def test_error_bits_are_set_when_asked_and_only_then() -> None:

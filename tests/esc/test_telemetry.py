@@ -122,13 +122,6 @@ def test_before_the_first_byte_nothing_was_ever_seen_and_nothing_is_available() 
     assert telemetry.frame_rate == 0
 
 
-def test_bytes_without_a_frame_are_a_search() -> None:
-    telemetry = esc()
-    assert read(telemetry, NOISE, 1) & Event.LINK
-    assert link_of(telemetry) is LinkState.SEARCHING
-    assert not read(telemetry, NOISE, 2) & Event.LINK
-
-
 @pytest.mark.parametrize("before", [b"", NOISE])
 @pytest.mark.parametrize("layout", list(Layout))
 def test_the_first_live_frame_makes_the_link_ok(before: bytes, layout: Layout) -> None:
@@ -142,13 +135,6 @@ def test_the_first_live_frame_makes_the_link_ok(before: bytes, layout: Layout) -
     assert telemetry.live is not None
     assert telemetry.live.electrical_speed == 7
     assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[layout]
-
-
-def test_info_frames_alone_do_not_make_the_link_ok() -> None:
-    telemetry = esc()
-    assert read(telemetry, info(), MS) & Event.INFO
-    assert link_of(telemetry) is LinkState.SEARCHING
-    assert telemetry.info is not None
 
 
 @pytest.mark.parametrize(("errors", "state"), [(4, LinkState.OK), (5, LinkState.DEGRADED)])
@@ -228,26 +214,6 @@ def test_a_frame_is_not_put_together_from_before_and_after_a_lost_port() -> None
 # --- freshness
 
 
-@pytest.mark.parametrize("timeout", [20 * MS, TIMEOUT, 60 * SECOND])
-def test_live_data_lasts_for_the_time_out_and_not_a_nanosecond_longer(timeout: int) -> None:
-    telemetry = esc(timeout_ns=timeout)
-    read(telemetry, live(), SECOND)
-    telemetry.advance(SECOND + timeout)
-    assert telemetry.live is not None
-    assert telemetry.up
-    telemetry.advance(SECOND + timeout + 1)
-    assert telemetry.live is None
-    assert not telemetry.up
-
-
-def test_the_age_is_told_in_milliseconds_also_after_the_loss() -> None:
-    telemetry = alive(SECOND)
-    assert [telemetry.age_ms(SECOND + age * MS) for age in (0, 1, 250)] == [0, 1, 250]
-    telemetry.advance(9 * SECOND)
-    assert telemetry.age_ms(9 * SECOND) == 8000
-    assert telemetry.age_ms(SECOND - 1) == 0
-
-
 @pytest.mark.parametrize(("gap", "taken"), [(TIMEOUT, True), (TIMEOUT + 1, False)])
 def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(
     gap: int, taken: bool
@@ -280,16 +246,6 @@ def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire(
     assert telemetry.live_ns == SECOND - 20 * NS_PER_BYTE
     assert telemetry.drawn.run_time == 2 * 40 * NS_PER_BYTE
     assert telemetry.drawn.energy_mw_ns == 2 * 40 * NS_PER_BYTE * 2400 * 100
-
-
-def test_times_never_run_backwards_when_reads_are_closer_than_the_wire_allows() -> None:
-    telemetry = alive(SECOND)
-    read(telemetry, live(), SECOND + 10 * MS)
-    before = telemetry.drawn.energy, telemetry.drawn.run_time
-    for data, now in ((live() + NOISE * 15, 11 * MS), (live(), 10 * MS), (live(), 0)):
-        assert read(telemetry, data, SECOND + now) & Event.LIVE
-        assert (telemetry.drawn.energy, telemetry.drawn.run_time) == before
-        assert telemetry.live_ns == SECOND + 10 * MS
 
 
 # --- arrival: what is known of when bytes came
@@ -420,14 +376,6 @@ def test_the_frame_rate_is_known_after_a_second_in_tenths_of_hertz(rate: int) ->
     assert telemetry.frame_rate == 0
 
 
-def test_the_frame_rate_is_right_when_time_was_let_pass_too_late() -> None:
-    telemetry = alive(SECOND)
-    for n in range(1, 151):
-        read(telemetry, live(), SECOND + n * 10 * MS)
-    telemetry.advance(SECOND + 1500 * MS)
-    assert telemetry.frame_rate == 1000
-
-
 # --- what the device supplies
 
 
@@ -494,39 +442,7 @@ def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_devi
     )
 
 
-def test_info_is_forgotten_with_the_loss_of_telemetry() -> None:
-    telemetry = alive()
-    read(telemetry, info(), SECOND + 10 * MS)
-    events = telemetry.advance(SECOND + TIMEOUT + 1)
-    assert events == Event.LIVE | Event.INFO | Event.LINK
-    assert (telemetry.info, telemetry.cells) == (None, 0)
-
-
-def test_info_without_news_is_forgotten_after_its_time_out_and_not_before() -> None:
-    telemetry = alive()
-    read(telemetry, info(), SECOND)
-    for n in range(1, 101):
-        read(telemetry, live(), SECOND + n * INFO_TIMEOUT_NS // 100)
-    assert telemetry.info is not None
-    assert telemetry.advance(SECOND + INFO_TIMEOUT_NS + 1) & Event.INFO
-    assert info_of(telemetry) is None
-    assert telemetry.live is not None
-
-
 # --- counters
-
-
-def test_the_counters_are_those_of_the_whole_stream() -> None:
-    telemetry = esc()
-    read(telemetry, NOISE + live() + BROKEN + live(layout=Layout.LEGACY) + info(), SECOND)
-    for layout in Layout:
-        read(telemetry, encode(LIVE._replace(operating_state=27), layout), SECOND + 10 * MS)
-    telemetry.advance(50 * SECOND)
-    counters = telemetry.decoder.counters
-    assert (counters.live_v4, counters.live_legacy, counters.info_v4) == (2, 2, 1)
-    assert (counters.crc_errors, counters.dropped_bytes) == (1, 60)
-    assert counters.bytes == 20 + 40 + 40 + 38 + 44 + 40 + 38
-    assert telemetry.suspect_frames == 1
 
 
 # --- deadlines

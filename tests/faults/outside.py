@@ -2,12 +2,11 @@
 
 Processor time that the virtual machine wants and does not get is taken by the host of this machine ("steal" in /proc/stat) or by other
 work on it (run queue, /proc/PID/schedstat); nobody inside can see that. Both are sampled while each fault runs. A fault that was late or
-lost values while much was taken is not judged, and is run once at a quieter moment if one comes soon. Nothing else is run twice.
+lost values while much was taken is not judged. Nothing is run twice.
 """
 
 import argparse
 import contextlib
-import os
 import subprocess
 import sys
 import tempfile
@@ -17,21 +16,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from fault_report import FAILED, MAX_TAKEN, NOT_JUDGED, Fault, Report, line
+from fault_report import FAILED, NOT_JUDGED, Fault, Report, line
 
 PROJECT = Path(__file__).resolve().parents[2]
 BEGIN, END = ">>>", "<<<"
 """What the programme prints in there, followed by area and name, around each fault."""
 WINDOW_S = 1.0
 """A tenth of it is what the shortest limits of the programme leave to a gateway."""
-QUIET_S, QUIET_WITHIN_S = 5.0, 60.0
 
 
 class Sample(NamedTuple):
     at_s: float
     stolen: int
     total: int
-    idle: int
     waited_s: float = 0.0
     """For a processor, by all that belongs to the virtual machine."""
 
@@ -45,7 +42,7 @@ class Sample(NamedTuple):
 def sample(text: str, at_s: float, waited_s: float = 0.0) -> Sample:
     """Of the first line of /proc/stat: user, nice, system, idle, iowait, irq, softirq, load."""
     ticks = [int(word) for word in text.split("\n", 1)[0].split()[1:9]]
-    return Sample(at_s, ticks[7], sum(ticks), ticks[3] + ticks[4], waited_s)
+    return Sample(at_s, ticks[7], sum(ticks), waited_s)
 
 
 def worst_share(samples: Sequence[Sample], begin_s: float, end_s: float) -> float:
@@ -108,21 +105,6 @@ class Load:
     def _run(self) -> None:
         while not self._stop.wait(0.5):
             self.take()
-
-    def quiet(self) -> bool:
-        """Wait for five seconds in which a processor was free and the host took nothing; False if they do not come soon."""
-        self.machine = None
-        end = time.monotonic() + QUIET_WITHIN_S
-        while time.monotonic() < end:
-            self.take()
-            before = self.samples[-1]
-            time.sleep(QUIET_S)
-            self.take()
-            after = self.samples[-1]
-            free = (after.idle - before.idle) / (after.total - before.total)
-            if after.share(before) < MAX_TAKEN / 2 and free > 0.8 / (os.cpu_count() or 1):
-                return True
-        return False
 
     def __enter__(self) -> Self:
         self.take()
@@ -187,21 +169,6 @@ def run_inside(
     return report
 
 
-def judge(run: Callable[[Sequence[str]], Report], quiet: Callable[[], bool]) -> Report:
-    """Run all; what was not judged once more, if there is a quiet moment. ``run`` gets the names of the faults, none for all."""
-    report = run(())
-    deferred = [row for row in report.rows if row.state == NOT_JUDGED]
-    if deferred and quiet():
-        print(f"deferred to a quieter moment: {len(deferred)}", flush=True)
-        later = {row.name: row for row in run([str(row) for row in deferred]).rows}
-        for row in deferred:
-            if row.name in later:
-                report.rows[report.rows.index(row)] = later[row.name]
-                note = f"deferred to a quieter moment: {row.taken:.0%} of the processor time was taken at first"
-                later[row.name].notes.insert(0, note)
-    return report
-
-
 def conclude(report: Report, out: Path | None, junit: Path | None) -> int:
     """Write it down, and say in the end what failed and what was not judged."""
     for path, write in ((out, report.write), (junit, report.write_junit)):
@@ -246,16 +213,11 @@ def main(
     words: Sequence[str] = (),
     prepare: Callable[[Path], None] = lambda _folder: None,
 ) -> int:
-    """Run these faults by a script of this folder in a virtual machine, and judge."""
+    """Run these faults by a script of this folder in a virtual machine; what came of them."""
     options = [*words, *(["--long"] if args.long else [])]
+    options += [f"--only={text}" for text in args.only]
     with Load() as load:
-
-        def run(names: Sequence[str]) -> Report:
-            only = [f"--only={text}" for text in names or args.only]
-            report = run_inside(load, script, [*options, *only], backend, timeout_s, prepare)
-            if not names:
-                for fault in faults:
-                    report.row(fault)  # one that was not reached has failed
-            return report
-
-        return conclude(judge(run, load.quiet), args.out, args.junit)
+        report = run_inside(load, script, options, backend, timeout_s, prepare)
+    for fault in faults:
+        report.row(fault)  # one that was not reached has failed
+    return conclude(report, args.out, args.junit)

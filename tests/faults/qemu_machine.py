@@ -1,6 +1,6 @@
-"""What the emulated machine of tests/vm offers besides a kernel: QEMU's monitor, the far ends of its serial ports, its CAN controllers.
+"""What the emulated machine of tests/vm offers besides a kernel: the far end of its serial port, its CAN controllers.
 
-All of it is reached from inside the machine, by virtio ports, /sys and ``ip``. See tests/vm/vm_run.py for what is plugged in.
+All of it is reached from inside the machine, by a virtio port, /sys and ``ip``. See tests/vm/vm_run.py for what is plugged in.
 """
 
 import contextlib
@@ -19,13 +19,6 @@ from typing import Any, NamedTuple
 
 VIRTIO_PORTS = Path("/dev/virtio-ports")
 KVASER = Path("/sys/bus/pci/drivers/kvaser_pci")
-USB_SERIAL: dict[str, Any] = {
-    "driver": "usb-serial",
-    "id": "usbser0",
-    "serial": "ESC0002",
-    "bus": "xhci.0",
-}
-USB_SERIAL |= {"port": "1", "chardev": "ftdis", "always-plugged": True}
 BITRATE = 1_000_000
 _TIOCGICOUNT = 0x545D
 
@@ -37,40 +30,6 @@ def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
         if time.monotonic() - begin > seconds:
             raise AssertionError(f"{what}: not within {seconds} s")
         time.sleep(0.01)
-
-
-class Monitor:
-    """QEMU's monitor (QMP)."""
-
-    def __init__(self) -> None:
-        self._stream = (VIRTIO_PORTS / "qmp").open("r+b", buffering=0)
-        self._buffer = b""
-        self.ask("qmp_capabilities")
-
-    def ask(self, command: str, **arguments: object) -> dict[str, Any]:
-        """The answer: with the key "return" or "error"."""
-        self._stream.write(
-            json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n"
-        )
-        while True:
-            while b"\n" not in self._buffer:
-                self._buffer += self._stream.read(4096) or b""
-            line, self._buffer = self._buffer.split(b"\n", 1)
-            answer: dict[str, Any] = json.loads(line)
-            if "return" in answer or "error" in answer:
-                return answer
-
-    def must(self, command: str, **arguments: object) -> None:
-        """AssertionError where it is refused."""
-        answer = self.ask(command, **arguments)
-        assert "return" in answer, answer
-
-    def plug_serial(self) -> None:
-        """QEMU takes its time to forget the device of an unplug: tried again until it has."""
-        wait_until(lambda: "return" in self.ask("device_add", **USB_SERIAL), 5, "device_add")
-
-    def close(self) -> None:
-        self._stream.close()
 
 
 class FarEnd:
@@ -172,31 +131,15 @@ def serial_ports() -> set[str]:
 # --- CAN interfaces
 
 
-def ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True)
-
-
-def can_up(name: str, bitrate: int = BITRATE, restart_ms: int = 100) -> None:
-    ip("link", "set", name, "down")
-    ip("link", "set", name, "txqueuelen", "100")
-    settings = f"type can bitrate {bitrate} restart-ms {restart_ms}"
-    ip("link", "set", name, "up", *settings.split())
-
-
-def _can_details(name: str) -> Any:
-    done = subprocess.run(
-        ["ip", "-d", "-s", "-j", "link", "show", name], check=True, capture_output=True, text=True
-    )
-    return json.loads(done.stdout)[0]
+def can_up(name: str) -> None:
+    for settings in ("down", "txqueuelen 100", f"up type can bitrate {BITRATE} restart-ms 100"):
+        subprocess.run(["ip", "link", "set", name, *settings.split()], check=True)
 
 
 def receive_overruns(name: str) -> int:
-    return int(_can_details(name)["stats64"]["rx"]["over_errors"])
-
-
-def controller_state(name: str) -> str:
-    """As ``ip`` names it: ERROR-ACTIVE, BUS-OFF ..."""
-    return str(_can_details(name)["linkinfo"]["info_data"]["state"])
+    command = ["ip", "-s", "-j", "link", "show", name]
+    shown = subprocess.run(command, check=True, capture_output=True).stdout
+    return int(json.loads(shown)[0]["stats64"]["rx"]["over_errors"])
 
 
 def pci_slot(interface: str) -> str:

@@ -1,4 +1,4 @@
-"""The ESCs of the emulated machine: on its 16550A, on QEMU's USB adapter, and on a played adapter whose wire has real bits."""
+"""The ESCs of the emulated machine: on its 16550A, and on a played adapter whose wire has real bits."""
 
 import os
 import random
@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from encoding import Identity
 from feeder import FedEsc
-from qemu_adapters import ESC_LINE, Line, SerialAdapter
-from qemu_machine import FarEnd, LineSetting, Monitor, line_setting, serial_ports, wait_until
+from qemu_adapter import ESC_LINE, Line, SerialAdapter
+from qemu_machine import FarEnd, LineSetting, line_setting, serial_ports, wait_until
 
 AS_SET = LineSetting(115_200, 8, "E", 1, False)
 """How the gateway sets a port: without echo. Until then the kernel echoes on one that was never used, as a USB port is at each plug-in."""
@@ -15,23 +15,8 @@ RATE_HZ = 10
 INFO_EVERY = 20
 
 
-def pull(how: Callable[[], None], device: str) -> None:
-    """Unplug an adapter; returns when its device file is gone."""
-    how()
-    wait_until(lambda: device not in serial_ports(), 5, f"{device} gone")
-
-
-def put_back(how: Callable[[], None]) -> str:
-    """Plug in an adapter; its device file, maybe another than before."""
-    before = serial_ports()
-    how()
-    wait_until(lambda: serial_ports() - before, 5, "the adapter's device file")
-    (device,) = serial_ports() - before
-    return device
-
-
 class FarPort:
-    """An ESC at the far end of one of QEMU's serial ports.
+    """An ESC at the far end of QEMU's serial port.
 
     QEMU keeps what comes while the port is closed, and delivers it at the next opening: no UART does. So this ESC is silent
     until the process that ``reader`` names has the port open.
@@ -81,29 +66,6 @@ class FarPort:
         self.far.close()
 
 
-class UsbPort(FarPort):
-    """QEMU's USB serial adapter, unplugged and plugged in by the monitor."""
-
-    def __init__(
-        self, identity: Identity, reader: Callable[[], int | None], monitor: Monitor
-    ) -> None:
-        if not serial_ports():
-            monitor.plug_serial()
-        wait_until(serial_ports, 5, "the adapter's device file")
-        (device,) = serial_ports()
-        super().__init__("ftdi", device, identity, reader)
-        self._monitor = monitor
-
-    def unplug(self) -> None:
-        self._known = None
-        self._is_set = False
-        before, self.device = self.device, ""
-        pull(lambda: self._monitor.must("device_del", id="usbser0"), before)
-
-    def plug(self) -> None:
-        self.device = put_back(self._monitor.plug_serial)
-
-
 class WirePort:
     """A played adapter. ``send`` is how a frame gets onto the wire; setting it to another of the methods is the fault."""
 
@@ -112,7 +74,9 @@ class WirePort:
         self.fed = FedEsc(self.write, identity, RATE_HZ, INFO_EVERY)
         self.send: Callable[[bytes], bool] = self.clean
         self._random = random.Random(1)
-        self.path = self.device = put_back(adapter.plug)
+        self.device = ""
+        self.plug()
+        self.path = self.device
 
     def write(self, data: bytes) -> bool:
         return self.send(data)
@@ -139,11 +103,17 @@ class WirePort:
         return send
 
     def unplug(self) -> None:
+        """Returns when its device file is gone."""
         before, self.device = self.device, ""
-        pull(self.adapter.unplug, before)
+        self.adapter.unplug()
+        wait_until(lambda: before not in serial_ports(), 5, f"{before} gone")
 
     def plug(self) -> None:
-        self.device = put_back(self.adapter.plug)
+        """Returns when its device file is there, maybe another than before."""
+        before = serial_ports()
+        self.adapter.plug()
+        wait_until(lambda: serial_ports() - before, 5, "the adapter's device file")
+        (self.device,) = serial_ports() - before
 
     @property
     def echoed(self) -> int:

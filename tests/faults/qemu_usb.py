@@ -60,9 +60,6 @@ class UsbDevice:
         self._asked: dict[int, deque[int]] = defaultdict(deque)
         # endpoint: packets that wait to be asked for
         self._ready: dict[int, deque[bytes]] = defaultdict(deque)
-        self._stalled = False
-        # (request, length) of what was not taken while stalled
-        self._held: list[tuple[int, int]] = []
 
     # --- what a hand does
 
@@ -85,7 +82,6 @@ class UsbDevice:
         with self._lock:
             self._asked.clear()
             self._ready.clear()
-            self._held.clear()
             self._ours = ours
         self._thread = threading.Thread(
             target=self._serve, args=(ours,), daemon=True, name=f"usb{self.port}"
@@ -98,11 +94,6 @@ class UsbDevice:
         if self._thread is not None:
             self._thread.join(5)
             self._thread = None
-
-    def fileno(self) -> int:
-        """The device is plugged in as long as any process holds this descriptor."""
-        assert self._ours is not None
-        return self._ours.fileno()
 
     # --- what a device does
 
@@ -135,14 +126,6 @@ class UsbDevice:
         """Drop them."""
         with self._lock:
             self._ready[endpoint].clear()
-
-    def stall(self, stalled: bool) -> None:
-        """Take nothing from the host any more, as a device whose firmware hangs; or go on: what it held is lost."""
-        with self._lock:
-            self._stalled = stalled
-            for number, length in self._held:
-                self._answer(number, taken=length)
-            self._held.clear()
 
     # --- USB/IP
 
@@ -197,11 +180,7 @@ class UsbDevice:
                 self._asked[endpoint].append(number)
 
     def _take(self, number: int, endpoint: int, data: bytes) -> None:
-        with self._lock:
-            if self._stalled:
-                self._held.append((number, len(data)))
-                return
-            self._answer(number, taken=len(data))
+        self._answer(number, taken=len(data))
         self.taken(endpoint, data)
 
     def _answer(self, number: int, data: bytes = b"", taken: int = 0, status: int = 0) -> None:
@@ -221,9 +200,6 @@ class UsbDevice:
                 if victim in asked:
                     asked.remove(victim)
                     status = _UNLINKED
-            if any(held == victim for held, _ in self._held):
-                self._held = [held for held in self._held if held[0] != victim]
-                status = _UNLINKED
             self._send(struct.pack(">5Ii24x", _RET_UNLINK, number, 0, 0, 0, status))
 
     def _send(self, packet: bytes) -> None:

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import programme  # noqa: F401  registers the faults of User Mode Linux
-import qemu_can_faults  # noqa: F401  and those of the emulated machine
-import qemu_serial_faults  # noqa: F401
+import qemu_faults  # noqa: F401  and those of the emulated machine
 from fault_report import WITH_PYTHON, Report, Row, in_order
 
 BEGIN, END = "<!-- faults begin -->", "<!-- faults end -->"

@@ -114,18 +114,6 @@ def test_energy_is_what_was_drawn_between_two_frames_and_nothing_that_was_fed_ba
     assert drawn / 1000 / 100 / 3600 > 8
 
 
-@pytest.mark.parametrize(("throttle", "raw"), [(99, 99), (100, 101), (101, 101), (102, 102)])
-def test_a_value_that_equals_the_code_for_not_available_is_sent_as_the_error_code(
-    throttle: int, raw: int
-) -> None:
-    bench = Bench(
-        ' SG_ PwmInput : 0|16@1+ (1,0) [0|65535] "us" Car\n',
-        'VAL_ 256 PwmInput 100 "NotAvailable" 101 "Error" ;\n',
-    )
-    assert [data[:2] for data in bench.first] == [b"\x64\0"], "before the first frame"
-    assert bench.live(pwm_input=throttle) & 0xFFFF == raw
-
-
 def test_after_an_outage_of_the_bus_what_has_no_cycle_is_sent_again() -> None:
     bench = Bench(SPEED)
     bench.live(electrical_speed=30_000)

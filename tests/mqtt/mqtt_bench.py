@@ -23,7 +23,6 @@ from harness import LoggedProcess
 from paho.mqtt.enums import CallbackAPIVersion
 
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/sbin")
-SECOND_NS = 1_000_000_000
 PATIENCE = 60.0
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "mqtt"]
 

@@ -1,26 +1,28 @@
-"""Puts each fault of faults.toml into the code and runs the tests that must see it, each in a process of its own (mutants.py).
+"""Puts each fault of faults.toml into a copy of the project and runs the tests there that must see it.
 
     python tests/mutants/put_in_faults.py [WORDS...]
 
-WORDS choose the faults whose text has one of them. The working tree is not touched. Exits with 0 if all faults were caught;
-with 1 and one line each for those that were not, or cannot be put in any more because the code is another one.
+WORDS choose the faults whose text has one of them. Exits with 0 if all faults were caught; with 1 and one line each for those that
+were not, or cannot be put in any more because the code is another one.
 """
 
 import argparse
-import functools
+import os
 import re
+import shutil
+import subprocess
 import sys
+import tempfile
 import textwrap
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-import mutants
-from mutants import PROJECT
-from mutations import Mutation
-
+PROJECT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("faults.toml")
-PACKAGE = PROJECT / "kontronik_can_gw"
+LIMIT_S = 1800
+FAILED = 1
+"""Of pytest: some test has failed. Everything else, as a collection that breaks off, judges nothing."""
 
 
 @dataclass(frozen=True)
@@ -30,18 +32,12 @@ class Fault:
     replace: str
     seen_by: tuple[str, ...]
 
-    @property
-    def pattern(self) -> re.Pattern[str]:
-        """The text with any white space."""
-        return re.compile(r"\s+".join(map(re.escape, self.search.split())))
-
-    def put_in(self) -> tuple[Path, str]:
+    def put_in(self, project: Path = PROJECT) -> tuple[Path, str]:
         """The file it is in and the text that this is to have. ValueError where it cannot be put in."""
-        found = [
-            (file, match)
-            for file in PACKAGE.rglob("*.py")
-            for match in self.pattern.finditer(file.read_text())
-        ]
+        # with any white space
+        pattern = re.compile(r"\s+".join(map(re.escape, self.search.split())))
+        files = (project / "kontronik_can_gw").rglob("*.py")
+        found = [(file, match) for file in files for match in pattern.finditer(file.read_text())]
         if len(found) != 1:
             raise ValueError(
                 f"its text stands in {len(found)} places instead of one: write it anew for the present code"
@@ -57,18 +53,34 @@ class Fault:
             raise ValueError(f"with it {file.name} is no Python: {error}") from None
         return file, changed
 
-    def problem(self) -> str:
-        """What is wrong with it; nothing if a test fails with it."""
+    def problem(self, copy: Path) -> str:
+        """What is wrong with it; nothing if a test fails with it, and with nothing else."""
         try:
-            file, changed = self.put_in()
+            file, changed = self.put_in(copy)
         except ValueError as error:
             return str(error)
-        mutant = Mutation.of_text(file.relative_to(PROJECT), changed)
-        seconds = unmutated(self.seen_by)["seconds"]
-        return "" if mutants.fails(mutant, self.seen_by, seconds) else "NOT CAUGHT"
+        whole = file.read_text()
+        try:
+            file.write_text(changed)
+            code = tested(copy, self.seen_by)
+        finally:
+            file.write_text(whole)
+        return "" if code == FAILED else f"NOT CAUGHT (pytest: {code})"
 
 
-unmutated = functools.cache(mutants.unmutated)
+def tested(copy: Path, tests: tuple[str, ...]) -> int | str:
+    """pytest's exit code in the copy; what is changed is Python, so the core is too."""
+    words = ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0", "--tb=no"]
+    command = [sys.executable, *words, "-m", "not extended", *tests]
+    environment = {**os.environ, "KONTRONIK_PURE": "1", "PYTHONPATH": str(copy)}
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"
+    try:
+        done = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, timeout=LIMIT_S
+        )
+    except subprocess.TimeoutExpired:
+        return FAILED  # the fault lets a test wait for ever
+    return done.returncode
 
 
 def faults(path: Path = LIST) -> list[Fault]:
@@ -88,13 +100,16 @@ def main() -> int:
     )
     parser.add_argument("words", nargs="*", metavar="WORDS")
     words = parser.parse_args().words
-    mutants.settle()
     chosen = [each for each in faults() if not words or any(word in each.what for word in words)]
     wrong = 0
-    for fault in chosen:
-        problem = fault.problem()
-        wrong += bool(problem)
-        print(f"{problem or 'caught'}: {fault.what}  [{' '.join(fault.seen_by)}]", flush=True)
+    with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
+        copy = Path(folder, "project")
+        left_out = shutil.ignore_patterns(".git", ".venv", ".cache", "__pycache__", "build")
+        shutil.copytree(PROJECT, copy, ignore=left_out)
+        for fault in chosen:
+            problem = fault.problem(copy)
+            wrong += bool(problem)
+            print(f"{problem or 'caught'}: {fault.what}  [{' '.join(fault.seen_by)}]", flush=True)
     print(f"{len(chosen) - wrong} of {len(chosen)} faults caught")
     return int(wrong > 0)
 

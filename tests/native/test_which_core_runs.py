@@ -114,19 +114,6 @@ def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_p
     assert found.startswith(said) and "\n" not in found and len(found) < 200
 
 
-def test_what_the_installation_said_is_why_there_is_no_object(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(load, "shared_object", lambda: tmp_path / "core-other.so")
-    monkeypatch.setattr(objects, "NOT_BUILT", tmp_path / "not_built.txt")
-    (tmp_path / "not_built.txt").write_text("there was no C compiler at the installation\n")
-    found = why()
-    assert (
-        load.in_words("Python", found)
-        == "core: Python (there was no C compiler at the installation)"
-    )
-
-
 @pytest.mark.parametrize(
     ("machine", "largest", "name"),
     [
@@ -212,17 +199,6 @@ def test_another_esc_protocol_runs_in_python(monkeypatch: pytest.MonkeyPatch) ->
 def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str) -> None:
     gateway = Gateway([EscSettings()], layout_of(signal, more), 0)
     assert isinstance(gateway.core, PythonCore) and gateway.why_python
-
-
-@pytest.mark.usefixtures("built")
-@pytest.mark.parametrize("bits", [64, 65, 300])
-def test_a_signal_of_more_than_64_bits_runs_in_python(bits: int) -> None:
-    signal = f'BatteryVoltage : 0|{bits}@1+ (0.01,0) [0|0] "V"'
-    text = HEAD.format(signal).replace("M: 8", "M: 64")
-    database = parse_database(text.encode(), "t.dbc")
-    layout = prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)[1]
-    found = Gateway([EscSettings()], layout, 0).why_python
-    assert found == ("" if bits == 64 else f"M.BatteryVoltage: {bits} bits")
 
 
 @pytest.mark.usefixtures("built")

@@ -175,12 +175,6 @@ def test_a_block_of_ids_is_one_filter_beside_as_many_ids_as_there_are(
     ]
 
 
-@pytest.mark.parametrize("wrong", [-1, 0x800, EXTENDED - 1, EXTENDED | 0x2000_0000, 1 << 32])
-def test_what_is_no_id_is_refused(port: CanPort, wrong: int) -> None:
-    with pytest.raises(ValueError, match="no identifiers"):
-        port.set_receive_ids([0x601, wrong])
-
-
 def test_only_data_frames_with_the_wanted_ids_are_handed_on(
     port: CanPort, fake: FakeSocket
 ) -> None:
@@ -586,32 +580,3 @@ def test_closing_ends_a_thread_that_waits_and_gives_back_every_descriptor() -> N
             port.close()
             assert readers() == []
     assert descriptors() == before
-
-
-def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    held = threading.Event()
-    with virtual() as (port, other):
-        other.send(message(1))
-        monkeypatch.setattr("kontronik_can_gw.runtime.driver_port._MAX_END_S", 0.01)
-        waiting = threading.Event()
-
-        def holding(timeout: float | None) -> can.Message:
-            waiting.set()
-            held.wait(600)
-            return message(1, b"late")
-
-        monkeypatch.setattr(port._bus, "recv", holding)
-        port.set_receive_ids({1})
-        assert waiting.wait(120)
-        port.close()
-        # one has the number that the thread's had
-        others = [os.eventfd(0, os.EFD_NONBLOCK) for _ in range(8)]
-        (left,) = readers()
-        held.set()
-        left.join(120)
-        for fd in others:
-            with pytest.raises(BlockingIOError):
-                os.eventfd_read(fd)
-            os.close(fd)

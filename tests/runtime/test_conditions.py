@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime.fault_log import FLAPPING, MINUTE, REMEMBERED, FaultLog, duration
+from kontronik_can_gw.runtime.fault_log import FLAPPING, MINUTE, FaultLog
 
 NAME = "kontronik_can_gw"
 
@@ -96,22 +96,6 @@ def test_events_are_said_one_by_one_and_then_summed_up(told: pytest.LogCaptureFi
     )
 
 
-def test_lines_can_be_held_back_and_the_last_ones_are_remembered(
-    told: pytest.LogCaptureFixture,
-) -> None:
-    conditions = FaultLog()
-    conditions.hold()
-    conditions.say(logging.INFO, "open")
-    assert told.messages == []
-    conditions.release()
-    assert told.messages == ["open"]
-    for n in range(50):
-        conditions.say(logging.INFO, str(n))
-    assert [line.split(" ", 2)[2] for line in conditions.recent] == [
-        str(n) for n in range(50 - REMEMBERED, 50)
-    ]
-
-
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
 def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, int]]) -> None:
     conditions, now, lines = FaultLog(), 0, 0
@@ -126,11 +110,3 @@ def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, in
     assert conditions._held is not None
     lines = len(conditions._held)
     assert lines <= 2 * (now // MINUTE + 1) * (2 * FLAPPING + 1)
-
-
-@pytest.mark.parametrize(
-    ("ns", "text"),
-    [(0, "0.0 s"), (99_940_000_000, "99.9 s"), (120 * SECOND, "2 min"), (7200 * SECOND, "2.0 h")],
-)
-def test_durations_read_well(ns: int, text: str) -> None:
-    assert duration(ns) == text

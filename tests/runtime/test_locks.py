@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import stat
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,6 @@ from kontronik_can_gw.runtime.locks import (
     Taken,
     file_name,
     lock_file,
-    lock_name,
     messages_lock,
     network_namespace,
     node_lock,
@@ -66,19 +64,6 @@ def test_what_one_has_another_cannot_have_until_it_is_given_back() -> None:
     assert second.hold([node_lock(CHANNEL, 5)]) == []
     second.close()
     assert list(locks.SYSTEM_FOLDER.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    "name", [NODE, node_lock("/dev/serial/by-id/usb-A%2F_1@115200", 127), f"{'x' * 300}/node/1"]
-)
-def test_a_file_name_stands_for_one_lock_in_one_network_namespace(name: str) -> None:
-    file = file_name(name, 4026531840)
-    assert "/" not in file
-    assert len(file) < 250
-    assert file != file_name(name + "0", 4026531840)
-    assert file != file_name(name, 4026531841)
-    assert lock_name(file, 4026531841) is None
-    assert len(name) > 255 or lock_name(file, 4026531840) == name
 
 
 @pytest.mark.parametrize("dbc", [True, False])
@@ -158,16 +143,6 @@ def test_only_what_is_roots_or_the_services_is_obeyed(
         assert mine.hold([NODE]) == ([NODE] if obeyed else [])
     mine.close()
     assert bool(said) is not obeyed
-
-
-@needs_root
-def test_the_service_can_lock_what_root_has_made(folder: Path) -> None:
-    folder.mkdir(parents=True)
-    os.chown(folder, SERVICE, SERVICE)
-    """And sees that it is root's: who is not the service obeys it."""
-    os.close(lock_file(str(folder / "x")))
-    made = (folder / "x").stat()
-    assert (made.st_uid, made.st_gid, stat.S_IMODE(made.st_mode)) == (0, SERVICE, 0o660)
 
 
 @needs_root

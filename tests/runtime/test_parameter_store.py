@@ -104,16 +104,6 @@ def test_files_are_the_owners_alone_and_a_folder_that_is_made_too(
     assert [(path.name, mode(path)) for path in folder.iterdir()] == [("esc1.params", 0o600)]
 
 
-@pytest.mark.parametrize(
-    "name", ["", "1esc", "_esc", "esc-1", "esc.1", "../esc", "a/b", "esc\n", "ä", "a" * 13]
-)
-def test_a_name_that_is_none_is_refused(store: ParameterStore, name: str) -> None:
-    with pytest.raises(ValueError, match="name"):
-        store.save(name, OLD)
-    with pytest.raises(ValueError, match="name"):
-        store.load(name)
-
-
 # --- queue and results
 
 
@@ -262,14 +252,6 @@ def test_a_left_over_temporary_file_is_never_read_and_hinders_no_saving(
 
 
 # --- disks that fail
-
-
-def test_a_file_in_place_of_the_folder_is_told(tmp_path: Path, store: ParameterStore) -> None:
-    (tmp_path / "params").write_bytes(b"")
-    problem = put(store, "esc1", NEW)
-    assert problem is not None
-    assert "params" in problem
-    assert (tmp_path / "params").read_bytes() == b""
 
 
 # --- loss of power
@@ -534,10 +516,3 @@ def test_a_node_belongs_to_one_gateway_until_that_closes(tmp_path: Path) -> None
     first.close(1)
     second.lock("esc1")
     second.close(1)
-
-
-def test_where_no_lock_can_be_made_the_gateway_runs_all_the_same(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    store = ParameterStore(tmp_path / "file" / "store")
-    store.lock("esc1")
-    store.close(1)

@@ -64,11 +64,6 @@ def test_a_thread_that_is_started_later_follows(
     assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 1)
 
 
-def test_without_it_nothing_is_changed(kernel: Scheduler, sleeper: threading.Thread) -> None:
-    assert start_beside_the_loop(sleeper)
-    assert kernel.of == {}
-
-
 @pytest.mark.parametrize(
     ("service", "remedy"), [(False, "prlimit --rtprio=20"), (True, "LimitRTPRIO=20")]
 )

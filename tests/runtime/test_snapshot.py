@@ -19,7 +19,6 @@ from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
 from kontronik_can_gw.runtime.process import ProcessFacts, process_facts, start_ticks
 from kontronik_can_gw.runtime.snapshot import LOG_LINES, snapshot
-from kontronik_can_gw.runtime.statistics import default_file
 
 
 def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> None:
@@ -175,12 +174,3 @@ def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> Non
     assert start_ticks(child) == -1  # ended, and nobody has asked for its exit code
     os.waitpid(child, 0)
     assert start_ticks(child) == 0
-
-
-def test_the_default_file_is_in_the_services_runtime_folder(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    assert default_file() is None
-    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/kontronik-can-gw:/run/other")
-    assert default_file() == Path("/run/kontronik-can-gw/status.json")

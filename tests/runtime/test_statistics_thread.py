@@ -22,7 +22,7 @@ from kontronik_can_gw.runtime import statistics as statistics_module
 from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.recorder import RecorderFacts
 from kontronik_can_gw.runtime.snapshot import STALE_NS
-from kontronik_can_gw.runtime.statistics import PERIOD_NS, Statistics
+from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.worker import Report
 
 PATIENCE = 60.0
@@ -108,16 +108,6 @@ def statistics(file: Path) -> Iterator[Statistics]:
     made = Statistics(file)
     yield made
     made.close()
-
-
-def test_a_document_is_wanted_at_once_and_then_once_a_second(
-    file: Path, statistics: Statistics
-) -> None:
-    assert statistics.wanted(0)
-    publish(statistics, 5)
-    assert not statistics.wanted(5 * SECOND + PERIOD_NS - 1)
-    assert statistics.wanted(5 * SECOND + PERIOD_NS)
-    assert statistics.due == 6 * SECOND
 
 
 def test_the_file_is_readable_for_all_whole_and_alone(file: Path) -> None:
@@ -232,17 +222,6 @@ def test_a_full_disk_leaves_the_old_document_and_no_half_one(
         assert number_in(file) == 1
         assert os.listdir(file.parent) == ["status.json"]
     put(statistics, file, 3)
-
-
-def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
-    target = tmp_path / "device"
-    os.mkfifo(target)
-    statistics = Statistics(target)
-    publish(statistics, 1)
-    (report,) = reports(statistics, 1)
-    assert report.begins and "no plain file" in report.text
-    statistics.close()
-    assert stat.S_ISFIFO(target.stat().st_mode)
 
 
 def test_all_signals_are_blocked_in_the_thread_and_in_no_other(file: Path) -> None:

@@ -3,7 +3,6 @@
 import os
 import select
 import threading
-from collections.abc import Callable
 
 import pytest
 
@@ -48,19 +47,6 @@ def test_a_closed_handover_writes_to_no_descriptor_that_is_anothers_by_now() -> 
         os.close(other)
 
 
-def test_what_was_put_before_the_end_is_done_in_order_and_nothing_after_it() -> None:
-    done: list[int] = []
-    worker: Worker[int] = Worker("test", done.extend)
-    assert worker.put(0), "before the start too"
-    assert worker.start() and worker.start()
-    for n in range(1, 100):
-        assert worker.put(n)
-    assert worker.stop(PATIENCE)
-    assert done == list(range(100))
-    assert not worker.put(100)
-    assert worker.stop(PATIENCE)
-
-
 def test_an_end_whose_wake_is_read_with_the_last_items_is_not_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -79,11 +65,6 @@ def test_an_end_whose_wake_is_read_with_the_last_items_is_not_lost(
     worker._thread.join(PATIENCE)
     assert not worker._thread.is_alive()
     assert done == [1]
-
-
-def test_a_worker_that_was_never_started_ends_at_once() -> None:
-    worker: Worker[int] = Worker("test", lambda _items: None)
-    assert worker.stop(0)
 
 
 @pytest.mark.parametrize("is_logged", [True, False])
@@ -118,22 +99,6 @@ def test_a_job_that_fails_is_reported_and_the_next_one_is_done(
     assert caplog.messages == (["test: ZeroDivisionError('of ours')"] if is_logged else [])
 
 
-def test_work_that_stands_still_is_waited_for_as_long_as_said_and_no_longer() -> None:
-    go, stands = threading.Event(), threading.Event()
-
-    def work(_items: list[int]) -> None:
-        stands.set()
-        assert go.wait(PATIENCE)
-
-    worker: Worker[int] = Worker("test", work)
-    worker.start()
-    worker.put(1)
-    assert stands.wait(PATIENCE)
-    assert not worker.stop(0)
-    go.set()
-    assert worker.stop(PATIENCE)
-
-
 def test_the_work_may_end_its_own_thread_and_the_end_comes_once() -> None:
     calls: list[str] = []
     ended = threading.Event()
@@ -152,26 +117,3 @@ def test_the_work_may_end_its_own_thread_and_the_end_comes_once() -> None:
     assert ended.wait(PATIENCE)
     assert worker.stop(PATIENCE)
     assert calls == ["work", "work", "end"]
-
-
-def test_without_a_thread_to_give_nothing_starts_and_a_later_start_does(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def refuse(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
-    done: list[int] = []
-    worker: Worker[int] = Worker("test", done.extend)
-    with monkeypatch.context() as patch:
-        patch.setattr(threading.Thread, "start", refuse)
-        assert not worker.start()
-    assert worker.put(1) and worker.start() and worker.stop(PATIENCE)
-    assert done == [1]
-
-
-def test_a_pause_ends_with_the_worker() -> None:
-    waits: list[Callable[[], None]] = []
-    worker: Worker[int] = Worker("test", lambda _items: None, wait=lambda: waits[0]())
-    waits.append(lambda: worker.pause(10 * PATIENCE))
-    worker.start()
-    assert worker.stop(PATIENCE)

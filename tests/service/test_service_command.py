@@ -130,19 +130,6 @@ def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
     assert not old.exists() and not example.exists()
 
 
-@pytest.mark.parametrize("kind", ["metrics", "mqtt"])
-def test_what_stands_by_the_gateway_is_a_service_of_its_own(root: Path, kind: str) -> None:
-    install(root, f"--{kind}")
-    edit(root, before='[mqtt]\nbroker = "broker.example"\n')
-    assert f"kontronik-can-gw-{kind}.service is enabled" in install(root, f"--{kind}").err
-    unit = root / UNITS / f"kontronik-can-gw-{kind}.service"
-    assert f"ExecStart={EXECUTABLE} {kind} -c /etc/" in unit.read_text()
-    link = root / UNITS / f"multi-user.target.wants/kontronik-can-gw-{kind}.service"
-    assert str(link.readlink()) == f"/{UNITS}/{unit.name}"
-    uninstall(root)
-    assert not unit.exists() and not link.is_symlink()
-
-
 def test_mqtt_without_a_broker_is_installed_but_not_enabled(root: Path) -> None:
     install(root)
     edit(root)
@@ -180,14 +167,6 @@ def test_a_faulty_configuration_is_reported_and_not_enabled(root: Path, wants: P
     assert "can.bitrat: unknown key" in done.err
     assert not wants.exists()
     assert install(root, "--now").code == 1
-
-
-def test_the_network_files_are_written_where_they_are_asked_for(root: Path) -> None:
-    install(root, "--network", 250_000, "--channel", "can1")
-    network = root / "etc/systemd/network/50-kontronik-can-gw-can1.network"
-    assert "BitRate=250000" in network.read_text() and "Name=can1" in network.read_text()
-    install(root)
-    assert sorted(network.parent.iterdir()) == [network.with_suffix(".link"), network]
 
 
 def test_installing_twice_changes_nothing_and_what_was_another_is_kept_aside(root: Path) -> None:

@@ -96,21 +96,6 @@ def test_the_service_is_hardly_exposed(tmp_path: Path, beside: bool) -> None:
 # --- line by line
 
 
-def test_an_instance_is_the_plain_unit_but_for_its_names() -> None:
-    made = files()
-    plain, own = settings(made[NAMES[0]]), settings(made[f"{NAMES[1]}.d"])
-    assert made[NAMES[0]] == made[NAMES[1]]
-    run = "/bin/true run --wait -c /etc/kontronik-can-gw"
-    assert plain["ExecStart"] == [f"{run}/gateway.toml"]
-    assert own.pop("Description") == [f"{plain['Description'][0]}, %i"]
-    folder = ["", "kontronik-can-gw-%i"]
-    assert own == {
-        "ExecStart": ["", f"{run}/%i.toml"],
-        "StateDirectory": folder,
-        "RuntimeDirectory": folder,
-    }
-
-
 SETTINGS = {
     "Type": ["notify"],
     "Restart": ["always"],

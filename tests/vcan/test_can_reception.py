@@ -87,19 +87,6 @@ def test_600_ids_are_merged_and_still_exactly_they_come(vcan: str) -> None:
         assert port.overruns == 0
 
 
-def test_on_a_bus_with_can_fd_frames_are_told_apart(vcan: str) -> None:
-    with port_on(vcan, [0x601], fd=True) as port, peer_on(vcan) as peer:
-        peer.send_fd(0x601, b"12345678")
-        peer.send_fd(0x601, bytes(64))
-        peer.send(0x601, b"classic")
-        assert all_of(port, vcan) == [
-            CanFrame(0x601, b"12345678", fd=True),
-            CanFrame(0x601, bytes(64), fd=True),
-            CanFrame(0x601, b"classic"),
-        ]
-        assert port.send(CanFrame(0x581, bytes(64), fd=True)) is Sent.OK
-
-
 def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vcan: str) -> None:
     with (
         port_on(vcan, [0x581], own=True) as port,

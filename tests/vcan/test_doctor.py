@@ -5,19 +5,16 @@ import io
 import json
 import os
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from slcan_adapters import Adapter, Bus
-from vcan_tools import Candump, GatewayProcess, bench, canopen_table, configuration, ip, wait_for
+from vcan_tools import Candump, configuration, ip, wait_for
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions
-
-Start = Callable[..., GatewayProcess]
 
 
 @pytest.fixture
@@ -68,27 +65,6 @@ def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_n
         assert found["can.kernel"]["severity"] == found["can.up"]["severity"] == "ok"
         assert "virtual interface" in found["can.exists"]["text"]
         assert not {"can.bitrate", "can.restart", "can.state", "can.queue"} & set(found)
-
-
-def test_a_running_gateway_is_noted_with_its_node_and_goes_on(
-    vcan: str, tmp_path: Path, start_gateway: Start
-) -> None:
-    with bench(EscOptions()) as run:
-        gateway = start_gateway(
-            configuration(vcan, [run.ports[0].path], canopen_table(tmp_path / "store", 42))
-        )
-        gateway.wait_for_line("esc1: /dev/pts")
-        file = tmp_path / "gateway0.toml"
-        found, code = doctor(file)
-        assert code == 0
-        assert found["port.users"]["severity"] == "note"
-        assert (
-            found["port.users"]["text"] == f"in use by kontronik-can-gw (pid {gateway.process.pid})"
-        )
-        assert found["can.gateway"]["severity"] == "note"
-        assert "node 42" in found["can.gateway"]["text"]
-        assert gateway.process.poll() is None
-        assert gateway.end() == 0
 
 
 def test_bit_rate_and_state_of_a_real_driver_are_seen(

@@ -61,7 +61,7 @@ if [ -z "$version" ]; then
 fi
 # Besides vcan and slcan: the CAN controllers, the serial adapter, and USB devices played by a test (vhci_hcd).
 modules="virtio_pci virtio_console 9pnet_virtio 9p can can_raw can_bcm can_gw can_isotp can_j1939 vcan vxcan slcan sch_tbf
-sch_netem kvaser_pci xhci_pci ftdi_sio vhci_hcd usb_8dev"
+sch_netem kvaser_pci ftdi_sio vhci_hcd"
 [ -e "$cache/$version/initrd.cpio" ] && [ "$(cat "$cache/$version/modules" 2>/dev/null)" = "$modules" ] && exit 0
 
 mkdir -p "$cache"

@@ -8,11 +8,8 @@ Prints what COMMAND prints, stdout and stderr apart, and exits with its exit cod
 native  COMMAND itself. Without the right to make interfaces: in a network namespace of its own, by `unshare` or `sudo`.
 uml     User Mode Linux, 2 s to boot, Python at full speed. vcan, CAN FD, vxcan, gateway, BCM, J1939, slcan, tbf, netem.
 qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci controllers on one bus (can0, can1);
-        a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1); an FTDI USB serial adapter (/dev/ttyUSB0, its
-        other end /dev/virtio-ports/ftdi) that QMP at /dev/virtio-ports/qmp unplugs (device_del, device_add usbser0).
-        device_add takes driver=usb-serial id=usbser0 serial=ESC0002 bus=xhci.0 port=1 chardev=ftdis
-        always-plugged=true; right after a device_del it has to be tried again after 0.1 s. USB devices played by the
-        command itself can be plugged in by vhci_hcd (drivers ftdi_sio, usb_8dev).
+        a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1). USB devices played by the command itself can be
+        plugged in by vhci_hcd (driver ftdi_sio).
 
 A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
 --rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
@@ -197,16 +194,9 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
         command += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
 
     # One end is the device that the guest's driver sees, the other a virtio port that a test plays the device with.
-    usb = "usb-serial,id=usbser0,serial=ESC0002,bus=xhci.0,port=1,chardev=ftdis,always-plugged=on"
-    for name, device in (
-        ("com1", "-device isa-serial,chardev=com1s,index=1"),
-        ("ftdi", f"-device qemu-xhci,id=xhci -device {usb}"),
-        ("qmp", "-mon chardev=qmps,mode=control"),
-    ):
-        far_end = f"socket,id={name}s,path={job}/{name},server=on,wait=off"
-        command += ["-chardev", far_end, *device.split()]
-        command += port(name, f"socket,path={job}/{name}")
-    return command
+    command += ["-chardev", f"socket,id=com1s,path={job}/com1,server=on,wait=off"]
+    command += ["-device", "isa-serial,chardev=com1s,index=1"]
+    return command + port("com1", f"socket,path={job}/com1")
 
 
 # --- one run in a VM

@@ -1,6 +1,6 @@
 /* The ESCs and the bus's other end: writes telemetry to pseudo terminals, receives and checks the CAN frames, measures the delay.
 
-       feeder [--escs N] [--seconds S] [--warmup S] [--period US] [--bytewise] [--seed N] [--priority P] [--sdo] [--file F] --bus BUS
+       feeder [--escs N] [--seconds S] [--warmup S] [--period US] [--seed N] [--priority P] [--sdo] [--file F] --bus BUS
 
    BUS as in bus.h. Prints lines of JSON: {"ports": [...]}; once the gateway has sent a frame and the warm-up is over
    {"begin": live frames so far}; at the end {"end": ...}; then the results. Every CAN frame with an id of
@@ -49,7 +49,7 @@ struct esc {
 };
 
 static struct esc *escs;
-static int count = 1, bus, on_can, bytewise, sdo, priority;
+static int count = 1, bus, on_can, sdo, priority;
 static const char *bus_name = "";
 static int64_t period = 10000000, strange, others, write_failures;
 static _Atomic int stopping;
@@ -178,37 +178,17 @@ static void write_all(struct esc *e, const uint8_t *data, int length)
 /* Begin the frame that is due, or write its next byte. */
 static void step(struct esc *e)
 {
-    static const int64_t BYTE = 95486;
-    if (!e->place) {
-        int info = e->due >= e->next_info;
-        if (info) {
-            make_info(e);
-            e->next_info += 1000000000;
-        } else {
-            make_live(e);
-        }
-        if (!bytewise) {
-            if (!info) {
-                e->ring[e->sent % RING].at = now_ns();
-                e->sent++;
-                e->due += period;
-            } /* an info frame goes just in front of a live one */
-            write_all(e, e->frame, e->length);
-            return;
-        }
-    }
-    int info = e->frame[3] == 'I';
-    if (e->place == e->length - 1 && !info) {
+    int info = e->due >= e->next_info;
+    if (info) { /* goes just in front of a live one */
+        make_info(e);
+        e->next_info += 1000000000;
+    } else {
+        make_live(e);
         e->ring[e->sent % RING].at = now_ns();
         e->sent++;
+        e->due += period;
     }
-    write_all(e, e->frame + e->place, 1);
-    if (++e->place == e->length) {
-        e->place = 0;
-        e->due += info ? BYTE : period - (e->length - 1) * BYTE;
-    } else {
-        e->due += BYTE;
-    }
+    write_all(e, e->frame, e->length);
 }
 
 static void note_delay(int64_t delay)
@@ -439,7 +419,6 @@ int main(int argc, char **argv)
     pthread_t thread, sdo_thread, watcher;
     for (int i = 1; i < argc; i++) {
         const char *name = argv[i], *value = i + 1 < argc ? argv[i + 1] : "";
-        if (!strcmp(name, "--bytewise")) { bytewise = 1; continue; }
         if (!strcmp(name, "--sdo")) { sdo = 1; continue; }
         i++;
         if (!strcmp(name, "--escs")) count = atoi(value);

@@ -1,21 +1,16 @@
 """The obvious program: a thread a port, pyserial, zlib, struct, cantools and python-can. What a competent person writes at first.
 
     python obvious.py DBC CHANNEL PORT...
-    python obvious.py DBC --log IN OUT
 
 Each live frame becomes the five messages of the DBC (ESC n has ids n-1 higher). A value that does not fit is sent as Error, without live
 frames for 250 ms everything is NotAvailable, as is the BEC current of a JIVEPro.
-
---log: bytes of one ESC, whose live frames come every 10 ms, become a candump log; CPU seconds and live frames are printed as JSON.
 """
 
 import contextlib
-import json
 import struct
 import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any
 from zlib import crc32
 
@@ -28,7 +23,6 @@ LENGTHS = {b"KODL": (38, 40), b"KODI": (41, 44)}
 TIMEOUT = 0.25
 INFO_TIMEOUT = 10.0
 JIVEPRO = 3
-PERIOD = 0.010
 
 
 def messages(frame: bytes, supplied: bool) -> list[tuple[str, dict[str, Any]]]:
@@ -186,40 +180,10 @@ class Esc:
             self.bus.send(frame)
 
 
-class Log:
-    """A candump log in place of the bus."""
-
-    def __init__(self, file: str) -> None:
-        self.writer = can.CanutilsLogWriter(file, channel="can0")
-        self.count = 0
-
-    def send(self, frame: can.Message) -> None:
-        frame.timestamp = self.count // 5 * PERIOD
-        frame.is_rx = False
-        self.count += 1
-        self.writer.on_message_received(frame)
-
-
-def convert(database: Any, source: str, target: str) -> None:
-    """A file of bytes to a log."""
-    begun = time.process_time()
-    log = Log(target)
-    esc = Esc(0, None, database, log, threading.Lock())
-    data = Path(source).read_bytes()
-    for at in range(0, len(data), 4096):
-        esc.buffer += data[at : at + 4096]
-        esc.find_frames()
-    log.writer.stop()
-    print(json.dumps({"cpu_s": time.process_time() - begun, "live": esc.frames}))
-
-
 def main(arguments: list[str]) -> None:
     """A thread a port."""
     dbc, channel, *ports = arguments
     database = cantools.database.load_file(dbc)
-    if channel == "--log":
-        convert(database, *ports)
-        return
     bus = can.Bus(interface="socketcan", channel=channel)
     lock = threading.Lock()
     threads = []

@@ -1,18 +1,13 @@
-"""Two adapters on a played USB: a serial one whose wire has real bits, and a CAN one whose bus has errors.
+"""A serial adapter on a played USB whose wire has real bits: an FT232BM (driver ftdi_sio).
 
-``SerialAdapter`` is an FT232BM (driver ftdi_sio). What is put on its wire is a sequence of levels, made with the sender's baud rate and
-parity; it is sampled with the rate and parity that the driver has set, so wrong parity, framing errors and breaks come out as they do
-on hardware. ``CanAdapter`` is an 8 devices USB2CAN (driver usb_8dev) on a ``CanBus`` in this process: bit rates, acknowledgement, error
-counters, error passive, bus-off and its end.
+What is put on its wire is a sequence of levels, made with the sender's baud rate and parity; it is sampled with the rate and parity
+that the driver has set, so wrong parity, framing errors and breaks come out as they do on hardware.
 """
 
-import struct
-import threading
 import time
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from qemu_machine import wait_until
 from qemu_usb import UsbDevice, descriptors
 
 # --- the wire of a UART
@@ -180,138 +175,3 @@ class SerialAdapter(UsbDevice):
     def _set(self, line: Line) -> None:
         self.line = line
         self._is_set = self._is_set or line == ESC_LINE
-
-
-# --- the CAN bus
-
-_TX = struct.Struct(">BBIB8sB")
-_RX = struct.Struct(">BBBIB8sIB")
-_COMMAND = struct.Struct(">BBBBB10sB")
-_OPEN, _CLOSE, _VERSION = 2, 3, 12
-_STATUS_OK, _STATUS_WARNING, _STATUS_PASSIVE, _STATUS_BUS_OFF = 0, 2, 3, 4
-_STATUS_FORM, _STATUS_ACK, STATUS_BIT = 0x21, 0x23, 0x24
-_CLOCK = 32_000_000
-
-
-class CanBus:
-    """A bus of played adapters; who is open at the sender's bit rate acknowledges and receives."""
-
-    def __init__(self) -> None:
-        self.adapters: list[CanAdapter] = []
-        self.lock = threading.RLock()
-        """Over all that the adapters count."""
-
-    def acknowledged(self, sender: "CanAdapter", frame: bytes) -> bool:
-        heard = False
-        for each in self.adapters:
-            if each is sender or not each.awake:
-                continue
-            if each.bitrate == sender.bitrate:
-                each.deliver(frame)
-                heard = True
-            else:  # it cannot read what it hears, and says so on the bus
-                each.disturb(_STATUS_FORM, receive=8)
-        return heard
-
-
-class CanAdapter(UsbDevice):
-    """An 8 devices USB2CAN with a controller that counts errors as ISO 11898-1 says."""
-
-    def __init__(self, port: int, bus: CanBus, serial_number: str) -> None:
-        strings = ("edevices", "USB2CAN converter", serial_number)
-        super().__init__(
-            port, descriptors((0x0483, 0x1234, 0x0100), strings, (0x81, 0x02, 0x83, 0x04))
-        )
-        self.bus = bus
-        bus.adapters.append(self)
-        self.bitrate = 0
-        self.open = False
-        self.bus_off = False
-        self.tx_errors = self.rx_errors = 0
-        self._told = _STATUS_OK
-        self._version_asked = False
-
-    def plug(self) -> None:
-        """Returns when there is an interface that may be used: the driver asks for the version last."""
-        super().plug()
-        wait_until(lambda: self._version_asked, 5, "the CAN adapter's driver")
-
-    @property
-    def awake(self) -> bool:
-        return self.plugged and self.open and not self.bus_off
-
-    def deliver(self, frame: bytes) -> None:
-        """A frame of another adapter."""
-        _, flags, can_id, size, content, _ = _TX.unpack(frame)
-        stamp = int(time.monotonic() * 1000) & 0xFFFFFFFF
-        self.rx_errors = max(0, self.rx_errors - 1)
-        self.give(1, _RX.pack(0x55, 0, flags, can_id, size, content, stamp, 0xAA))
-
-    def disturb(self, status: int, transmit: int = 0, receive: int = 0) -> None:
-        """Count an error; tell the driver of it and of what state it leads to."""
-        with self.bus.lock:
-            self.tx_errors += transmit
-            self.rx_errors = min(255, self.rx_errors + receive)
-            self._tell(status)
-            self._follow()
-
-    def go_bus_off(self) -> None:
-        """Thirty-two disturbed frames in a row."""
-        with self.bus.lock:
-            self.disturb(_STATUS_FORM, transmit=256 - self.tx_errors)
-
-    def heal(self) -> None:
-        """Errors counted down to 0, as by many good frames."""
-        with self.bus.lock:
-            self.tx_errors = self.rx_errors = 0
-            self._follow()
-
-    def _follow(self) -> None:
-        most = max(self.tx_errors, self.rx_errors)
-        if self.tx_errors > 255:
-            state = _STATUS_BUS_OFF
-        else:
-            state = _STATUS_PASSIVE if most > 127 else _STATUS_WARNING if most > 95 else _STATUS_OK
-        if state != self._told:
-            self._told = state
-            self.bus_off = state == _STATUS_BUS_OFF
-            self._tell(state)
-
-    def _tell(self, status: int) -> None:
-        counters = bytes((status, min(self.rx_errors, 127), min(self.tx_errors, 255))) + bytes(5)
-        self.give(1, _RX.pack(0x55, 3, 4, 0, 8, counters, 0, 0xAA))
-
-    def taken(self, endpoint: int, data: bytes) -> None:
-        if endpoint == 4:
-            self._command(data)
-            return
-        with self.bus.lock:
-            if not self.awake:
-                return
-            if self.bus.acknowledged(self, data):
-                self.tx_errors = max(0, self.tx_errors - 1)
-                self._follow()
-            elif self.tx_errors < 128:
-                # an error passive node does not count missing acknowledgement
-                self.disturb(_STATUS_ACK, transmit=8)
-
-    def _command(self, data: bytes) -> None:
-        _, channel, command, _, _, content, _ = _COMMAND.unpack(data)
-        answer = bytes(10)
-        after_bus_off = False
-        if command == _OPEN:
-            tseg1, tseg2, _, prescaler = struct.unpack(">BBBH", content[:5])
-            with self.bus.lock:
-                self.bitrate = _CLOCK // (prescaler * (1 + tseg1 + tseg2))
-                after_bus_off = self.bus_off
-                self.open, self.bus_off = True, False
-                self.tx_errors = self.rx_errors = 0
-                self._told = _STATUS_OK
-        elif command == _CLOSE:
-            self.open = False
-        elif command == _VERSION:
-            answer = b"\1\7\1\0" + bytes(6)
-            self._version_asked = True
-        self.give(3, _COMMAND.pack(0x11, channel, command, 0, 0, answer, 0x22))
-        if after_bus_off:
-            self._tell(_STATUS_OK)

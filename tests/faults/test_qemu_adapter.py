@@ -1,7 +1,7 @@
-"""The played adapters' wire: what a UART makes of the levels on it, and which bytes from the host count as sent."""
+"""The played adapter's wire: what a UART makes of the levels on it, and which bytes from the host count as sent."""
 
 import pytest
-from qemu_adapters import (
+from qemu_adapter import (
     ESC_LINE,
     STATUS_BREAK,
     STATUS_FRAMING,
