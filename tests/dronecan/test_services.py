@@ -21,8 +21,7 @@ def test_node_info_says_who_it_is() -> None:
         b"com.example.gw.e1",
     ]
     ids = [bytes(info.hardware_version.unique_id.to_bytes()) for info in infos]
-    assert len(set(ids)) == 2
-    assert all(any(each) for each in ids)
+    assert len({each[:6] for each in ids}) == 2  # what allocators are given first
     assert infos[0].status.uptime_sec == 2
     assert infos[0].hardware_version.major == 1
     other = Bench(given=loaded(name="com.example.gw.e0"))  # the same name: the same on this machine

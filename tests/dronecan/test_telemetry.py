@@ -215,7 +215,7 @@ def test_a_status_that_the_bus_takes_in_parts_is_never_one_of_two() -> None:
     whole = [assembler.receive(f.can_id, f.data, types.STATUS.seed, 0) for f in statuses]
     found = [each for each in whole if each is not None]
     assert 20 < len(found) < 200
-    assert len({each.payload for each in found}) == 1
+    assert len(set(found)) == 1
 
 
 def test_per_esc_nodes_send_for_themselves() -> None:
@@ -272,3 +272,15 @@ def test_what_is_no_frame_of_dronecan_is_nothing_to_it() -> None:
     ):
         bench.output.receive(frame, bench.now, bench.now)
     assert not bench.output.frames
+
+
+def test_what_is_on_is_logged_again_when_the_bus_returns_but_a_bit_no_more_than_each_ten_seconds() -> (
+    None
+):
+    """What began while the bus stood still is sent from the queue when it returns."""
+    bench = Bench().run(0.5)
+    bench.live[0] = LIVE._replace(operating_errors=1 << WARM)
+    begun = len(bench.run(1).of("LogMessage"))
+    bench.gateway.can_returned(bench.now)
+    assert len(bench.run(9).of("LogMessage")) == begun > 0
+    assert len(bench.run(1.5).of("LogMessage")) == 2 * begun
