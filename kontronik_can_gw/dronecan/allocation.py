@@ -34,8 +34,6 @@ class Allocation:
 
     def advance(self, now: int) -> list[CanFrame]:
         """The request that is due."""
-        if now < self.due:
-            return []
         first = not self._confirmed
         self.requests += first
         part = self._unique_id[self._confirmed : self._confirmed + _PART]

@@ -105,13 +105,17 @@ class Dronecan(Output):
     def advance(self, now: int) -> None:
         if now < self._due:
             return
+        if now >= self._allocation.due:
+            self.frames += self._allocation.advance(now)
+        due = self._allocation.due
         for task in self._tasks:
             if now >= task.due:
                 late = now - task.due >= task.period_ns  # none is made up for
                 task.due = (now if late else task.due) + task.period_ns
                 task.do(now)
-        self.frames += self._allocation.advance(now)
-        self._set_due()
+            if task.due < due:
+                due = task.due
+        self._due = due
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
         if not frame.extended or frame.remote or frame.fd:

@@ -5,6 +5,7 @@ where it belongs. Pure: ``now`` is integer nanoseconds.
 """
 
 from binascii import crc_hqx
+from functools import cache
 
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
@@ -19,7 +20,6 @@ TRANSFER_ID = 0x1F
 """Bits of a tail."""
 MAX_PAYLOAD, MAX_TRANSFERS, TIMEOUT_NS = 300, 32, 2 * SECOND
 _START, _END, _TOGGLE = 0x80, 0x40, 0x20
-_TAILS = tuple(bytes((each,)) for each in range(256))
 _frame = (
     tuple.__new__
 )  # without the detour of a named tuple's own: three frames for each esc.Status
@@ -45,18 +45,24 @@ def transfer(
     can_id: int, seed: int, payload: bytes, transfer_id: int, queued: bool, page: int = 0
 ) -> list[CanFrame]:
     """The frames of a transfer. ``seed``: of its type; ``queued`` as in CanFrame; of others ``page`` counts on from the first."""
-    tail = _START | transfer_id
     if len(payload) > 7:
         payload = crc_hqx(payload, seed).to_bytes(2, "little") + payload
-    frames, last = [], len(payload) - 7
-    for at in range(0, len(payload) or 1, 7):
-        if at >= last:
-            tail |= _END
-        data = payload[at : at + 7] + _TAILS[tail]
+    frames, at = [], 0
+    for tail in _tails(transfer_id, (len(payload) + 6) // 7 or 1):
+        data = payload[at : at + 7] + tail
         frames.append(_frame(CanFrame, (can_id, data, True, False, page, False, queued)))
-        tail = tail & ~_START ^ _TOGGLE
+        at += 7
         page += 1
     return frames
+
+
+@cache
+def _tails(transfer_id: int, count: int) -> tuple[bytes, ...]:
+    """The last bytes of so many frames."""
+    tails = [transfer_id | n % 2 * _TOGGLE for n in range(count)]
+    tails[0] |= _START
+    tails[-1] |= _END
+    return tuple(bytes((tail,)) for tail in tails)
 
 
 class Assembler:
