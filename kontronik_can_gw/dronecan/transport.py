@@ -58,7 +58,7 @@ def transfer(
 
 @cache
 def _tails(transfer_id: int, count: int) -> tuple[bytes, ...]:
-    """The last bytes of so many frames."""
+    """The last bytes of ``count`` frames."""
     tails = [transfer_id | n % 2 * _TOGGLE for n in range(count)]
     tails[0] |= _START
     tails[-1] |= _END
