@@ -30,6 +30,14 @@ def block_of(key: int, keys: Iterable[int]) -> int | None:
     return None
 
 
+def ids_in_words(key: int) -> str:
+    """A key, or the ids of a block, for people."""
+    can_id, mask = (each & MAX_EXTENDED_ID for each in id_and_mask(key))
+    if mask != MAX_EXTENDED_ID:
+        return f"29-bit ids with {can_id:X}h in their bits {mask:X}h"
+    return f"{'29-bit id' if key & EXTENDED else 'id'} {can_id:X}h"
+
+
 class CanFrame(NamedTuple):
     """A frame: id (11 or 29 bit), data (0 to 8 bytes, CAN FD to 64).
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, block_of, id_and_mask
+from kontronik_can_gw.frames import MAX_EXTENDED_ID, block_of, ids_in_words
 from kontronik_can_gw.output import NO_IDS, Output, Owner
 
 _OVER_NS = 10 * SECOND
@@ -34,10 +34,7 @@ class Conflict:
     @property
     def ids(self) -> str:
         """The id, or the ids of a block, in words."""
-        mask = id_and_mask(self.key)[1] & MAX_EXTENDED_ID
-        if mask != MAX_EXTENDED_ID:
-            return f"29-bit ids with {self.can_id:X}h in their bits {mask:X}h"
-        return f"{'29-bit id' if self.key & EXTENDED else 'id'} {self.can_id:X}h"
+        return ids_in_words(self.key)
 
 
 class IdConflicts:
@@ -81,6 +78,11 @@ class IdConflicts:
         return min(
             (key for key, (owner, _) in self._own.items() if owner.esc is None), default=None
         )
+
+    def own_blocks(self) -> tuple[int, ...]:
+        """The blocks of ids that only we send with."""
+        self._follow()
+        return self._own_blocks
 
     def can_opened(self, now: int) -> None:
         """The interface was opened (again): what we sent before may still come back, and is no conflict."""

@@ -20,7 +20,7 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+from kontronik_can_gw.runtime.locks import Locks, ids_lock, in_use, messages_lock, node_lock
 from kontronik_can_gw.runtime.open_can import check_interface, open_can
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import SignalReader
@@ -141,6 +141,9 @@ def _hold(locks: Locks, channel: str, layout: Layout, capture: CaptureInput | No
         for node in capture.setup.canopen.settings:
             if node.node_id != UNCONFIGURED:
                 names.append(node_lock(channel, node.node_id))
+    if capture is not None:
+        for output in capture.setup.outputs:
+            names += [ids_lock(channel, key) for key in output.taken_ids() if key >> 32]
     for taken in locks.hold(names):
         raise in_use(taken)
 

@@ -5,7 +5,7 @@ that hears another's request begins anew, later. Random numbers come from a seed
 """
 
 from kontronik_can_gw.dronecan.transport import LOW, MAX_NODE_ID, anonymous_id, transfer
-from kontronik_can_gw.dronecan.types import ALLOCATION, allocation
+from kontronik_can_gw.dronecan.types import ALLOCATION
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.output import NEVER
@@ -27,28 +27,21 @@ class Allocation:
         """Bytes of the unique id that the allocator has repeated."""
         self._transfer_id = 0
 
-    def begin(self, unique_id: bytes, now: int) -> None:
-        """Ask for the node with this id."""
+    def ask(self, unique_id: bytes, now: int) -> None:
+        """Ask for the node with this id; empty: nothing is to be asked for."""
         self._unique_id = unique_id
         self._begin_anew(now)
 
-    def stop(self) -> None:
-        """Nothing is to be asked for."""
-        self.due = NEVER
-
     def advance(self, now: int) -> list[CanFrame]:
         """The request that is due."""
-        if now < self.due:
-            return []
         first = not self._confirmed
         self.requests += first
         part = self._unique_id[self._confirmed : self._confirmed + _PART]
         self._transfer_id = self._transfer_id + 1 & 0x1F
-        can_id = anonymous_id(ALLOCATION, self._random(1 << 14), LOW)
+        can_id = anonymous_id(ALLOCATION.number, self._random(1 << 14), LOW)
         self._begin_anew(now)  # without an answer
-        return transfer(
-            can_id, ALLOCATION.seed, allocation(0, first, part), self._transfer_id, False
-        )
+        payload = ALLOCATION.pack(first) + part
+        return transfer(can_id, ALLOCATION.seed, payload, self._transfer_id, False)
 
     def receive(self, source: int, payload: bytes, taken: set[int], now: int) -> int | None:
         """Take an Allocation message of a node, 0: of another that asks. Returns the node-ID that was allocated to us.
@@ -58,7 +51,7 @@ class Allocation:
         if self.due == NEVER:
             return None
         said = payload[1:]
-        is_ours = source and payload and 0 < len(said) <= 16 and self._unique_id.startswith(said)
+        is_ours = source and said and self._unique_id.startswith(said)
         self._begin_anew(now)
         if not is_ours:
             return None
@@ -73,8 +66,9 @@ class Allocation:
         return node_id
 
     def _begin_anew(self, now: int) -> None:
-        self._confirmed = 0
-        self.due = now + (_PERIOD_MS + self._random(_MORE_MS)) * MS
+        self._confirmed, self.due = 0, NEVER
+        if self._unique_id:
+            self.due = now + (_PERIOD_MS + self._random(_MORE_MS)) * MS
 
     def _random(self, below: int) -> int:
         """A number from 0 on (Knuth's MMIX generator)."""

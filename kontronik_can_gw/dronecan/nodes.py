@@ -7,7 +7,14 @@ from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.dronecan.allocation import Allocation
 from kontronik_can_gw.dronecan.esc_report import EscReport
 from kontronik_can_gw.dronecan.node import SERVICES, Node
-from kontronik_can_gw.dronecan.transport import Assembler, header
+from kontronik_can_gw.dronecan.transport import (
+    LOWEST,
+    NODE,
+    REQUEST,
+    SERVICE,
+    TRANSFER_ID,
+    Assembler,
+)
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
@@ -18,11 +25,9 @@ if TYPE_CHECKING:
 
 MAX_ANSWERS = 50
 """Requests that are answered in a second: nobody keeps the bus busy by asking."""
-_LOG_NS = SECOND // 2
-_SOURCE = 0x7F
-_REQUEST_TO, _TO_MASK = 0x8080, 0xFF80
-_ALLOCATION_OF_NODE, _ALLOCATION_OF_NONE = (0x100, 0xFFFF80), (0x100, 0x3FF)
-"""Id and mask of Allocation messages: of an allocator, of others that ask."""
+_LOG_HZ = 2
+_ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
+"""Ids of Allocation messages: of an allocator, of others that ask."""
 
 
 class _Task:
@@ -30,13 +35,8 @@ class _Task:
 
     def __init__(self, period_ns: int, do: Callable[[int], None]) -> None:
         self.due = NEVER
+        self.period_ns = period_ns
         self.do = do
-        self._period = period_ns
-
-    def go_on(self, now: int) -> None:
-        self.due += self._period
-        if self.due <= now:  # late: none is made up for
-            self.due = now + self._period
 
 
 class Dronecan(Output):
@@ -46,10 +46,7 @@ class Dronecan(Output):
     events = Event.STATE
 
     def __init__(
-        self,
-        setup: "DronecanSetup",
-        escs: Sequence[EscTelemetry],
-        gateway: GatewayStatus,
+        self, setup: "DronecanSetup", escs: Sequence[EscTelemetry], gateway: GatewayStatus
     ) -> None:
         super().__init__()
         self._gateway = gateway
@@ -57,40 +54,44 @@ class Dronecan(Output):
         self._reports = [
             EscReport(esc, table.first_index + number, table.rpm) for number, esc in enumerate(escs)
         ]
-        self._nodes = [Node(each, setup, self._reports, self._put) for each in setup.nodes]
+        self._nodes = [Node(each, setup, self._reports) for each in setup.nodes]
         self._by_id: dict[int, Node] = {}
         self._allocation = Allocation(setup.given.seed)
         self._assembler = Assembler()
         self._status_sent = self._answered = self._unanswered = self._answers = 0
-        self._each_second = _Task(SECOND, self._say_second)
-        self._tasks = [self._each_second, _Task(SECOND // table.rate_hz, self._say_status)]
-        if table.extended_hz:
-            self._tasks.append(_Task(SECOND // table.extended_hz, self._say_extended))
-        if table.log_messages:
-            self._tasks.append(_Task(_LOG_NS, self._say_log))
+        rates = (
+            *((1, self._say_second), (table.rate_hz, self._say_status)),
+            *(
+                (table.extended_hz, self._say_extended),
+                (_LOG_HZ * table.log_messages, self._say_log),
+            ),
+        )
+        self._tasks = [_Task(SECOND // hertz, do) for hertz, do in rates if hertz]
         self._due = NEVER
         self._follow_ids()
 
     # --- what happens
 
     def start(self, now: int, can_open: bool) -> None:
-        self._all_due(now)
+        self.make_anew(now)
         self._ask(now)
 
     def stop(self, now: int) -> None:
         for node in self._by_id.values():
-            node.say_status(self._status_of(node, now, types.OFFLINE))
+            self._say_node_status(node, now, types.OFFLINE)
 
     def can_returned(self, now: int) -> None:
         self._log_anew()
-        self._all_due(now)
+        self.make_anew(now)
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         if before is CanState.BUS_OFF and state not in (CanState.BUS_OFF, CanState.DOWN):
             self._log_anew()
 
     def make_anew(self, now: int) -> None:
-        self._all_due(now)
+        for task in self._tasks:
+            task.due = now
+        self._set_due()
 
     def next_deadline(self) -> int:
         return self._due
@@ -104,64 +105,62 @@ class Dronecan(Output):
     def advance(self, now: int) -> None:
         if now < self._due:
             return
+        if now >= self._allocation.due:
+            self.frames += self._allocation.advance(now)
+        due = self._allocation.due
         for task in self._tasks:
             if now >= task.due:
-                task.go_on(now)
+                late = now - task.due >= task.period_ns  # none is made up for
+                task.due = (now if late else task.due) + task.period_ns
                 task.do(now)
-        self.frames += self._allocation.advance(now)
-        self._set_due()
+            if task.due < due:
+                due = task.due
+        self._due = due
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
         if not frame.extended or frame.remote or frame.fd:
             return
-        head = header(frame.can_id)
-        if head.to is None:
-            if head.kind == types.ALLOCATION.number and self._allocation.due != NEVER:
-                self._take_allocation(frame, head.source, now)
+        can_id = frame.can_id
+        source = can_id & NODE
+        if not can_id & SERVICE:
+            number = can_id >> 8 & (0xFFFF if source else 3)
+            if number == types.ALLOCATION.number and self._allocation.due != NEVER:
+                self._take_allocation(frame, source, now)
             return
-        node, service = self._by_id.get(head.to), SERVICES.get(head.kind)
-        if node is None or service is None or not head.is_request or not head.source:
+        node, kind = self._by_id.get(can_id >> 8 & NODE), SERVICES.get(can_id >> 16 & 0xFF)
+        if node is None or kind is None or not can_id & REQUEST or not source:
             return
-        whole = self._assembler.receive(frame.can_id, frame.data, service.seed, now)
-        if whole is None:
+        request = self._assembler.receive(can_id, frame.data, kind.seed, now)
+        if request is None:
             return
         if self._answers >= MAX_ANSWERS:
             self._unanswered += 1
             return
-        status = self._status_of(node, now)
-        answer = node.answer(service, whole.payload, status)
-        if answer is not None:
+        transfer_id, status = frame.data[-1] & TRANSFER_ID, self._status_of(node, now)
+        if answer := node.answer(can_id, kind, request, transfer_id, status):
             self._answers += 1
             self._answered += 1
-            node.respond(frame.can_id, service, answer, whole.transfer_id)
+            self.frames += answer
 
     def own_ids(self) -> dict[int, Owner]:
         """Whatever has one of our nodes as its source."""
         return {
-            id_block(node.node_id, _SOURCE): Owner(number, f"DroneCAN node-ID {node.node_id}")
+            id_block(node.node_id, NODE): Owner(number, f"DroneCAN node-ID {node.node_id}")
             for number, node in enumerate(self._nodes)
             if node.node_id
         }
 
     def facts(self) -> dict[str, Any]:
-        waits = f"waits for a node-ID, {self._allocation.requests} requests"
-        nodes = [
-            {
-                "node_id": node.node_id or None,
-                "name": node.setup.name,
-                "state": waits
-                if not node.node_id
-                else "another device has this node-ID"
-                if node.is_duplicate
-                else "operational",
-            }
-            for node in self._nodes
-        ]
+        nodes, lines = [], []
+        for node in self._nodes:
+            state = "another device has this node-ID" if node.is_duplicate else "operational"
+            if not node.node_id:
+                state = f"waits for a node-ID, {self._allocation.requests} requests"
+            name = node.setup.name
+            nodes.append({"node_id": node.node_id or None, "name": name, "state": state})
+            lines.append(" ".join(f"DroneCAN {node.node_id or ''} {name}: {state}".split()))
         return {
-            "lines": [
-                f"DroneCAN {each['node_id'] or ''}".rstrip() + f" {each['name']}: {each['state']}"
-                for each in nodes
-            ],
+            "lines": lines,
             "nodes": nodes,
             "status_sent": self._status_sent,
             "requests_answered": self._answered,
@@ -177,33 +176,36 @@ class Dronecan(Output):
             for place, report in enumerate(node.reports):
                 if (payload := report.status()) is not None:
                     self._status_sent += 1
-                    node.send(types.STATUS, payload, page=3 * place)
+                    self.frames += node.message(types.STATUS, payload, 3 * place)
 
     def _say_extended(self, now: int) -> None:
         for node in self._by_id.values():
             for place, report in enumerate(node.reports):
                 if (payload := report.status_extended()) is not None:
-                    node.send(types.STATUS_EXTENDED, payload, page=place)
+                    self.frames += node.message(types.STATUS_EXTENDED, payload, place)
 
     def _say_second(self, now: int) -> None:
         self._answers = 0
         for node in self._by_id.values():
-            node.say_status(self._status_of(node, now))
+            self._say_node_status(node, now)
             for place, report in enumerate(node.reports):
                 if (found := report.bec()) is not None:
-                    node.send(types.CIRCUIT_STATUS, found[0], page=place)
-                    node.send(types.TEMPERATURE, found[1], page=place)
+                    self.frames += node.message(types.CIRCUIT_STATUS, found[0], place)
+                    self.frames += node.message(types.TEMPERATURE, found[1], place)
 
     def _say_log(self, now: int) -> None:
         for node in self._by_id.values():
             for report in node.reports:
                 for message in report.log(now):
-                    node.send(types.LOG_MESSAGE, message, queued=True)
+                    self.frames += node.message(types.LOG_MESSAGE, message, queued=True)
 
     def _log_anew(self) -> None:
-        """What was logged may never have reached the bus."""
         for report in self._reports:
             report.log_anew()
+
+    def _say_node_status(self, node: Node, now: int, mode: int = types.OPERATIONAL) -> None:
+        status = self._status_of(node, now, mode)
+        self.frames += node.message(types.NODE_STATUS, status, priority=LOWEST)
 
     def _status_of(self, node: Node, now: int, mode: int = types.OPERATIONAL) -> bytes:
         bus_is_well = self._gateway.can_state not in (CanState.ERROR_PASSIVE, CanState.BUS_OFF)
@@ -213,44 +215,33 @@ class Dronecan(Output):
 
     def _ask(self, now: int) -> None:
         """Ask for the node-ID of the first node without one."""
-        for node in self._nodes:
-            if not node.node_id:
-                self._allocation.begin(node.setup.unique_id, now)
-                break
-        else:
-            self._allocation.stop()
+        waiting = [node.setup.unique_id for node in self._nodes if not node.node_id]
+        self._allocation.ask(waiting[0] if waiting else b"", now)
         self._follow_ids()
         self._set_due()
 
     def _take_allocation(self, frame: CanFrame, source: int, now: int) -> None:
-        whole = self._assembler.receive(frame.can_id, frame.data, types.ALLOCATION.seed, now)
-        if whole is None:
+        payload = self._assembler.receive(frame.can_id, frame.data, types.ALLOCATION.seed, now)
+        if payload is None:
             return
-        node_id = self._allocation.receive(source, whole.payload, set(self._by_id), now)
+        node_id = self._allocation.receive(source, payload, set(self._by_id), now)
         if node_id is not None:
             node = next(node for node in self._nodes if not node.node_id)
             node.node_id = node_id
             self.news.append(f"DroneCAN node {node.setup.name}: has node-ID {node_id}")
             self.state_changes += 1
-            self._each_second.due = now
+            self._tasks[0].due = now  # it says that it is there
             self._ask(now)
         self._set_due()
 
     def _follow_ids(self) -> None:
         """Receive what is for the nodes as they are now; make the ids of the bus anew."""
         self._by_id = {node.node_id: node for node in self._nodes if node.node_id}
-        blocks = [id_block(_REQUEST_TO | node_id << 8, _TO_MASK) for node_id in self._by_id]
-        if len(self._by_id) < len(self._nodes):
-            blocks += [id_block(*_ALLOCATION_OF_NODE), id_block(*_ALLOCATION_OF_NONE)]
-        self.receive_ids = frozenset(blocks)
-
-    def _put(self, frames: list[CanFrame]) -> None:
-        self.frames += frames
-
-    def _all_due(self, now: int) -> None:
-        for task in self._tasks:
-            task.due = now
-        self._set_due()
+        requests = SERVICE | REQUEST
+        mask = requests | NODE << 8
+        blocks = frozenset(id_block(requests | node_id << 8, mask) for node_id in self._by_id)
+        is_waiting = len(self._by_id) < len(self._nodes)
+        self.receive_ids = blocks | _ALLOCATIONS if is_waiting else blocks
 
     def _set_due(self) -> None:
-        self._due = min(self._allocation.due, *[task.due for task in self._tasks])
+        self._due = min([self._allocation.due, *[task.due for task in self._tasks]])

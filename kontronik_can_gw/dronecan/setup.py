@@ -1,9 +1,8 @@
 """What the DroneCAN output is made from: its nodes, what it needs of the bus, what is to be said about it."""
 
+from binascii import crc32
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from hashlib import sha256
 from typing import NamedTuple
 
 from kontronik_can_gw.dronecan.esc_report import SPEEDS
@@ -18,8 +17,8 @@ from kontronik_can_gw.output import Given
 from kontronik_can_gw.signals.plan import classic_bits
 
 _USUAL_BITRATE = 1_000_000
-_STATUS, _EXTENDED, _BEC, _NODE_STATUS = (8, 8, 3), (8,), (8, 6), (8,)
-"""Data bytes of the frames of esc.Status, esc.StatusExtended, CircuitStatus and Temperature, NodeStatus."""
+_STATUS, _BEC = (8, 8, 3), (8, 6)
+"""Data bytes of the frames of esc.Status, of CircuitStatus and Temperature."""
 _RESOLUTION = (
     "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V, 0.063 V from 64 V; "
     "current 0.031 A from 32 A, 0.063 A from 64 A, 0.125 A from 128 A; temperature 0.25 K"
@@ -45,20 +44,24 @@ class DronecanSetup:
     name = "dronecan"
     title = "the DroneCAN nodes"
 
-    @cached_property
+    @property
     def nodes(self) -> tuple[NodeSetup, ...]:
-        """The gateway's node, or one for each ESC; a unique id is the same for this machine and name, and others' are others."""
-        table, found = self.given.table, []
-        numbers = range(len(self.escs))
-        for place, group in enumerate(
-            [(n,) for n in numbers] if table.per_esc_nodes else [numbers]
-        ):
-            own = f".{self.escs[place].name.lower()}" if table.per_esc_nodes else ""
-            name = table.name + own
-            unique_id = sha256(self.given.identity + name.encode()).digest()[:16]
-            node_id = table.node_id and table.node_id + place
-            found.append(NodeSetup(node_id, name, unique_id, tuple(group)))
-        return tuple(found)
+        """The gateway's node, or one for each ESC."""
+        table, numbers = self.given.table, tuple(range(len(self.escs)))
+        first = table.node_id
+        if not table.per_esc_nodes:
+            return (NodeSetup(first, table.name, self._unique_id(table.name), numbers),)
+        names = [f"{table.name}.{esc.name.lower()}" for esc in self.escs]
+        return tuple(
+            NodeSetup(first and first + n, name, self._unique_id(name), (n,))
+            for n, name in enumerate(names)
+        )
+
+    def _unique_id(self, name: str) -> bytes:
+        """The same for this machine and name; others' are others from the first bytes on, for they are asked for by parts."""
+        machine, of_name = self.given.identity, name.encode()
+        checks = crc32(machine + of_name).to_bytes(4, "big") + crc32(of_name).to_bytes(4, "big")
+        return checks + machine[:8].ljust(8, b"\0")
 
     def make(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> Dronecan:
         return Dronecan(self, escs, gateway)
@@ -74,10 +77,8 @@ class DronecanSetup:
 
     def traffic(self) -> tuple[float, float]:
         table, escs = self.given.table, len(self.escs)
-        rates = [(size, table.rate_hz * escs) for size in _STATUS]
-        rates += [(size, table.extended_hz * escs) for size in _EXTENDED]
-        rates += [(size, escs) for size in _BEC]
-        rates += [(size, len(self.nodes)) for size in _NODE_STATUS]
+        rates = [*((size, table.rate_hz * escs) for size in _STATUS), (8, table.extended_hz * escs)]
+        rates += [*((size, escs) for size in _BEC), (8, len(self.nodes))]
         bits = sum(rate * classic_bits(size, True) for size, rate in rates)
         return sum(rate for _, rate in rates), bits
 

@@ -6,7 +6,7 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+from kontronik_can_gw.runtime.locks import Locks, ids_lock, in_use, messages_lock, node_lock
 
 
 class IdLocks:
@@ -31,6 +31,7 @@ class IdLocks:
         ]
         if (first := self._gateway.conflicts.first_own_id()) is not None:
             names.append(messages_lock(channel, first))
+        names += [ids_lock(channel, block) for block in self._gateway.conflicts.own_blocks()]
         if names == self._names:
             return
         all_taken = self._locks.hold(names)

@@ -1,4 +1,4 @@
-"""What only one gateway on this machine may have: a CANopen node-ID, the DBC's messages, a file that is written, an MQTT topic.
+"""What only one gateway on this machine may have: a node-ID, the DBC's messages, a file that is written, an MQTT topic.
 
 A lock is a file with flock(2) on it, in a folder where only gateways write: it ends with the process whatever ends it, and nobody who may
 not write there can have one. Its name holds the network namespace, for interfaces of the same name in two of them are two interfaces.
@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.frames import ids_in_words
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -41,6 +42,11 @@ def node_lock(channel: str, node_id: int) -> str:
 def messages_lock(channel: str, first_id: int) -> str:
     """The name of the lock on the DBC output whose lowest CAN id this is."""
     return f"{channel}/messages/{first_id:X}"
+
+
+def ids_lock(channel: str, block: int) -> str:
+    """The name of the lock on a block of ids (frames.id_block) of an output."""
+    return f"{channel}/ids/{ids_in_words(block)}"
 
 
 def lock_folder() -> Path:
@@ -245,6 +251,10 @@ def in_use(name: str) -> RunError:
     if what == "node":
         return RunError(
             f"CANopen node {number} on {channel}: another gateway on this machine is this node. End it, or change canopen.node_id."
+        )
+    if what == "ids":
+        return RunError(
+            f"CAN {channel}: another gateway on this machine sends with {number}. End it, or give it another node-ID."
         )
     return RunError(
         f"CAN {channel}: another gateway on this machine sends the messages from {number}h on. End it, or change dbc.base_id."

@@ -1,6 +1,8 @@
 """What is the machine's own: serial numbers for its nodes, the folder for its parameters."""
 
+import contextlib
 import os
+from importlib import import_module
 from pathlib import Path
 
 _IDENTITIES = ("/etc/machine-id", "/var/lib/dbus/machine-id", "/proc/device-tree/serial-number")
@@ -26,9 +28,7 @@ def identity_digest(root: Path = Path("/")) -> bytes:
     identity = machine_identity(root)
     if not identity:
         return b""
-    import hashlib  # which loads OpenSSL: 4 MB, and not every gateway needs it
-
-    return hashlib.sha256(identity + _NAME.encode()).digest()
+    return _sha256(identity + _NAME.encode())
 
 
 def serial_number(number: int, name: str, identity: bytes) -> int:
@@ -38,10 +38,17 @@ def serial_number(number: int, name: str, identity: bytes) -> int:
     """
     if not identity:
         return 0
-    import hashlib  # which loads OpenSSL: 4 MB, and not every gateway needs it
-
-    digest = hashlib.sha256(identity + f"{_NAME} {number} {name}".encode()).digest()
+    digest = _sha256(identity + f"{_NAME} {number} {name}".encode())
     return int.from_bytes(digest[:4], "big") or 1
+
+
+def _sha256(data: bytes) -> bytes:
+    """The digest, by the interpreter's own code where it has that: hashlib loads OpenSSL, 4 MB and 4 ms."""
+    for name in ("_sha2", "_sha256", "hashlib"):  # from Python 3.12 on, before, always
+        with contextlib.suppress(ImportError):
+            digest: bytes = import_module(name).sha256(data).digest()
+            return digest
+    raise AssertionError("no hashlib")
 
 
 def state_folder() -> Path:

@@ -58,7 +58,8 @@ def test_the_foreign_allocator_gives_each_node_its_id(escs: int) -> None:
     news = bench.output.news
     assert [line.split()[-1] for line in news] == [str(node_id) for node_id in found]
     serve(bench, peer, 2)
-    assert {entry.node_id for entry in monitor.find_all(lambda e: e.info is not None)} >= {*found}
+    seen = {e.node_id: e.status for e in monitor.find_all(lambda e: e.info is not None)}
+    assert {(seen[each].health, seen[each].mode) for each in found} == {(0, 0)}
 
 
 def test_without_an_allocator_it_asks_for_ever_and_says_nothing_else() -> None:

@@ -10,12 +10,11 @@ from dronecan_bench import Reader, dronecan, peers_frames
 from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.dronecan.transport import (
     Assembler,
-    DataType,
-    header,
     message_id,
     response_id,
     transfer,
 )
+from kontronik_can_gw.dronecan.types import DataType
 from kontronik_can_gw.frames import CanFrame
 
 equipment, protocol = dronecan.uavcan.equipment, dronecan.uavcan.protocol
@@ -31,33 +30,32 @@ def shown(frames: list[CanFrame]) -> str:
 
 
 def message(kind: DataType, payload: bytes, priority: int = 16) -> list[CanFrame]:
-    return transfer(message_id(kind, 42, priority), kind.seed, payload, 5, False)
+    return transfer(message_id(kind.number, 42, priority), kind.seed, payload, 5, False)
 
 
 def test_golden_messages() -> None:
     """Made by another implementation, of node 42, with transfer id 5."""
-    status = types.status(7, 24.23, 47.3, 303.15, 6303, 42, 3)
+    status = types.status(7, 24.23, 47.3, 30.0, 6303, 42, 3)
     assert shown(message(types.STATUS, status)) == (
         "10040A2A#A1F1070000000F85 #4EEA51BD5C9F1825 #150C45"
     )
     extended = types.status_extended(50, 48, -256, 0, 0x12345, 3)
     assert shown(message(types.STATUS_EXTENDED, extended)) == "10040C2A#64C00200452323C5"
-    state = types.node_status(100, types.OK, types.OPERATIONAL, 0xBEEF)
+    state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
     assert shown(message(types.NODE_STATUS, state, 24)) == "1801552A#6400000000EFBEC5"
-    warm = types.temperature(1, 300.0, False)
+    warm = types.TEMPERATURE.pack(1, 300.0, False)
     assert shown(message(types.TEMPERATURE, warm)) == "1004562A#0100B05C00C5"
 
 
 def test_a_golden_answer() -> None:
-    state = types.node_status(100, types.OK, types.OPERATIONAL, 0xBEEF)
-    info = types.node_info(state, (1, 2), (3, 4), UNIQUE_ID, "org.example.esc")
+    state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
+    info = types.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
     request = 0x10018000 | 42 << 8 | 0x80 | 10
     answer = transfer(response_id(request), types.GET_NODE_INFO.seed, info, 5, True)
     assert shown(answer) == (
         "10010AAA#6A76640000000085 #EFBE010200000025 #0000000000000005 #0000000304010225 #0304050607080905"
         " #0A0B0C0D0E0F1025 #006F72672E657805 #616D706C652E6525 #736345"
     )
-    assert header(request) == (10, 1, 42, True)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +75,7 @@ def test_a_golden_answer() -> None:
 )
 def test_numbers_and_signatures_are_those_of_the_package(kind: DataType, named: object) -> None:
     theirs = dronecan.get_dronecan_data_type(named())  # type: ignore[operator]
-    assert kind == (theirs.default_dtid, theirs.base_crc)
+    assert kind[:2] == (theirs.default_dtid, theirs.base_crc)
 
 
 def half(value: float) -> float:
@@ -89,17 +87,17 @@ def half(value: float) -> float:
 def test_random_measurements_are_read_as_they_were_sent() -> None:
     rng, reader = random.Random(1), Reader()
     for turn in range(2000):
-        volts, amperes, kelvin = (rng.uniform(-700, 700) for _ in range(3))
+        volts, amperes, celsius = (rng.uniform(-700, 700) for _ in range(3))
         rpm, percent, index = rng.randrange(-131072, 131072), rng.randrange(128), rng.randrange(32)
         errors = rng.randrange(1 << 32)
         made = message(
-            types.STATUS, types.status(errors, volts, amperes, kelvin, rpm, percent, index)
+            types.STATUS, types.status(errors, volts, amperes, celsius, rpm, percent, index)
         )
         found = [reader.read(turn, frame) for frame in made][-1]
         assert found is not None
         got = found.payload
         read = (got.error_count, got.voltage, got.current, got.temperature)
-        assert read == (errors, half(volts), half(amperes), half(kelvin))
+        assert read == (errors, half(volts), half(amperes), half(celsius + 273.15))
         assert (got.rpm, got.power_rating_pct, got.esc_index) == (rpm, percent, index)
         parts = [rng.randrange(128), rng.randrange(128), rng.randrange(-256, 256)]
         parts += [rng.randrange(512), rng.randrange(1 << 19), index]
@@ -127,25 +125,6 @@ def test_what_is_out_of_a_types_range_is_its_limit_and_what_is_unknown_is_nan() 
     assert found.payload.rpm == -131072
 
 
-def test_texts_and_circuits() -> None:
-    reader = Reader()
-    for length in (0, 1, 20, 90, 200):
-        made = message(types.LOG_MESSAGE, types.log_message(2, "left", "x" * length))
-        found = [reader.read(0, frame) for frame in made][-1]
-        assert found is not None
-        got = found.payload
-        assert (got.level.value, bytes(got.source.to_bytes()), len(got.text)) == (
-            *(2, b"left"),
-            min(length, 90),
-        )
-    made = message(types.CIRCUIT_STATUS, types.circuit_status(7, 5.98, None, 5))
-    found = reader.read(0, made[0])
-    assert found is not None
-    assert (found.payload.circuit_id, found.payload.error_flags) == (7, 5)
-    assert found.payload.voltage == half(5.98)
-    assert math.isnan(found.payload.current)
-
-
 def test_transfers_of_the_package_are_put_together_however_they_are_mixed() -> None:
     """Transfers of several nodes with frames in between, some doubled; each comes out once, whole."""
     rng, assembler = random.Random(2), Assembler()
@@ -166,7 +145,7 @@ def test_transfers_of_the_package_are_put_together_however_they_are_mixed() -> N
         for _ in range(rng.choice([1, 1, 2]) if len(frame.data) == 8 else 1):
             whole = assembler.receive(frame.can_id, frame.data, types.GET_SET.seed, 0)
             if whole is not None:
-                found.append(whole.payload)
+                found.append(whole)
         streams = [each for each in streams if each]
     assert sorted(found) == sorted(wanted)
 

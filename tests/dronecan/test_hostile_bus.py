@@ -67,7 +67,7 @@ def storm(count: int, seed: int, node_id: int, held: Callable[[], int]) -> Bench
     assert sizes[-1] - sizes[2] < 500_000, sizes
     begun = output._assembler._begun
     assert len(begun) <= MAX_TRANSFERS
-    assert all(len(each.payload) <= MAX_PAYLOAD + 7 for each in begun.values())
+    assert all(len(each[2]) <= MAX_PAYLOAD + 7 for each in begun.values())
     assert len(bench.gateway.conflicts._present) <= 2
     assert len(json.dumps(output.facts())) < 2000
     return bench

@@ -5,8 +5,7 @@ from dronecan_bench import LIVE, Bench, Peer, Reader, dronecan, loaded, peers_fr
 
 from kontronik_can_gw.dronecan.nodes import MAX_ANSWERS
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.frames import EXTENDED, CanFrame, id_block
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 
 protocol = dronecan.uavcan.protocol
 GetSet = protocol.param.GetSet
@@ -21,8 +20,7 @@ def test_node_info_says_who_it_is() -> None:
         b"com.example.gw.e1",
     ]
     ids = [bytes(info.hardware_version.unique_id.to_bytes()) for info in infos]
-    assert len(set(ids)) == 2
-    assert all(any(each) for each in ids)
+    assert len({each[:6] for each in ids}) == 2  # what allocators are given first
     assert infos[0].status.uptime_sec == 2
     assert infos[0].hardware_version.major == 1
     other = Bench(given=loaded(name="com.example.gw.e0"))  # the same name: the same on this machine
@@ -140,29 +138,6 @@ def test_another_device_with_our_node_id_is_reported_and_we_go_on() -> None:
     bench.run(11)
     assert [each.over for each in taken()] == [True]
     assert {node["state"] for node in bench.output.facts()["nodes"]} == {"operational"}
-
-
-def test_blocks_of_ids_are_told_apart() -> None:
-    gateway: Gateway = Bench(per_esc_nodes=True, escs=2).gateway
-    own = {id_block(node, 0x7F) for node in (42, 43)}
-    asked = {id_block(0x8080 | node << 8, 0xFF80) for node in (42, 43)}
-    assert gateway.receive_ids == own | asked
-    assert id_block(0x1FFFFFFF, 0x7F) == id_block(0x7F, 0x7F)
-
-
-def test_the_foreign_monitor_sees_the_nodes() -> None:
-    bench = Bench(2, per_esc_nodes=True)
-    peer = Peer(bench)
-    monitor = dronecan.app.node_monitor.NodeMonitor(peer.node)
-    for _ in range(30):
-        bench.run(0.1)
-        peer.spin()
-    seen = {entry.node_id: entry for entry in monitor.find_all(lambda _: True)}
-    assert set(seen) == {42, 43}
-    for entry in seen.values():
-        assert entry.status.health == entry.status.HEALTH_OK
-        assert entry.status.mode == entry.status.MODE_OPERATIONAL
-        assert entry.info is not None
 
 
 def test_a_reader_of_another_hand_finds_no_fault_in_a_long_run() -> None:

@@ -66,24 +66,29 @@ def test_what_one_has_another_cannot_have_until_it_is_given_back() -> None:
     assert list(locks.SYSTEM_FOLDER.iterdir()) == []
 
 
-@pytest.mark.parametrize("dbc", [True, False])
+@pytest.mark.parametrize("what", ["dbc", "canopen", "dronecan"])
 def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_opens_the_bus(
-    dbc: bool,
+    what: str,
 ) -> None:
     tables = {
         "can": {"channel": CHANNEL},
-        "dbc": {"enabled": dbc},
-        "canopen": {"enabled": not dbc, "node_id": 42, "store": "/nowhere"},
+        "dbc": {"enabled": what == "dbc"},
+        "canopen": {"enabled": what == "canopen", "node_id": 42, "store": "/nowhere"},
+        "dronecan": {"enabled": what == "dronecan", "node_id": 42},
         "esc": [{"port": "p"}],
     }
     loaded = assemble(parse(tables, "test"))
     sides = []
     try:
         for _ in range(2):
-            gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
+            made = [setup.make for setup in loaded.outputs]
+            gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen, further=made)
             sides.append(CanLink(loaded.config.can, gateway, Poller(), FaultLog()))
         sides[0].open(0, wait=True)
-        with pytest.raises(RunError, match=f"messages from 680h|CANopen node 42 on {CHANNEL}"):
+        with pytest.raises(
+            RunError,
+            match=f"messages from 680h|CANopen node 42 on {CHANNEL}|sends with 29-bit ids with 2Ah",
+        ):
             sides[1].open(0, wait=True)
         sides[0].close()
         sides[1].open(0, wait=True)
