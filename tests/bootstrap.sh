@@ -22,6 +22,14 @@ die() { say "$@"; exit 1; }
 can_root() { command -v apt-get >/dev/null && { [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null; }; }
 as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n "$@"; fi; }
 
+# Without rights to install: what is left out, said in one line at the end.
+left_out=
+lacks=
+lacking() { # $1: packages, $2: for what
+    lacks="$lacks $1"
+    case $left_out in *"$2"*) ;; *) left_out="$left_out${left_out:+; }$2" ;; esac
+}
+
 apt_update() {
     [ -z "${VM_APT_UPDATED:-}" ] || return 0
     say "package lists"
@@ -64,7 +72,7 @@ make_venv() {
 
 install_project() { # $1: demo or test, $2: what pip installs
     stamp=.venv/.installed-$1
-    key="$(cat pyproject.toml hatch_build.py kontronik_can_gw/native/*.[ch] | cksum) $PWD"
+    key="$(cat pyproject.toml hatch_build.py kontronik_can_gw/native/*.[ch] | cksum) $(command -v cc || command -v gcc || :) $PWD"
     for done in "$stamp" .venv/.installed-test; do
         [ -e "$done" ] && [ "$(cat "$done")" = "$key" ] && return
     done
@@ -75,13 +83,14 @@ install_project() { # $1: demo or test, $2: what pip installs
     echo "$key" >"$stamp"
 }
 
-vm_line="sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
+vm_packages="user-mode-linux can-utils iproute2 busybox-static"
+vm_line="sudo apt-get install $vm_packages"
 
 # User Mode Linux 6.1 does not know the registers of the newest processors: there it starts with the help of uml_xstate.c.
 install_uml() {
     key=$(cksum <tests/vm/uml_xstate.c)
     command -v linux.uml >/dev/null && [ "$(cat .venv/.uml-starts 2>/dev/null)" = "$key" ] && return
-    can_root || { say "cannot install User Mode Linux:  $vm_line"; return 1; }
+    can_root || { lacking "$vm_packages" "a kernel with vcan"; return 1; }
     apt_update
     say "User Mode Linux"
     tests/vm/setup.sh uml || { say "failed; by hand:  $vm_line"; return 1; }
@@ -96,7 +105,7 @@ install_uml() {
 install_vcan() {
     PATH=$PATH:/usr/sbin:/sbin
     if ! command -v ip >/dev/null || ! command -v candump >/dev/null; then
-        can_root || { say "cannot install what the vcan tests need:  $vm_line"; return; }
+        can_root || { lacking "$vm_packages" "a kernel with vcan"; return; }
         apt_update
         say "can-utils, iproute2"
         tests/vm/setup.sh || { say "failed; by hand:  $vm_line"; return; }
@@ -109,8 +118,8 @@ install_vcan() {
             install -y --no-install-recommends "$extra" </dev/null >/dev/null || say "failed; going on"
         has_vcan && return
     fi
-    say "this kernel has no vcan for us"
     install_uml && return
+    can_root || return 0
     say "User Mode Linux does not start here: QEMU"
     tests/vm/setup.sh qemu || say "failed; by hand:  sudo tests/vm/setup.sh qemu"
 }
@@ -127,7 +136,7 @@ install_programs() {
     shift
     for each in "$@"; do command -v "${each%%=*}" >/dev/null || wanted="$wanted $(echo "${each#*=}" | tr , ' ')"; done
     [ -n "$wanted" ] || return 0
-    can_root || { say "tests that need them are left out; they come with:  sudo apt-get install$wanted"; return; }
+    can_root || { lacking "$wanted" "$why"; return; }
     apt_update
     say "$why:$wanted"
     for package in $wanted; do
@@ -137,7 +146,7 @@ install_programs() {
 }
 
 install_small_tools() {
-    install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl
+    install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl jq
 }
 
 install_clang() { install_programs "a second C compiler, with a fuzzer" clang=clang,libclang-rt-dev; }
@@ -204,3 +213,5 @@ case $what in
     wheels) install_project test '.[test]'; install_cross_compilers ;;
     *) die "$what: demo, lint, test, test-all, wheels or release" ;;
 esac
+packages=$(echo "$lacks" | tr -s ' ' '\n' | sort -u | tr '\n' ' ')
+[ -z "$lacks" ] || say "tests are left out, for there is no right to install $left_out. By hand:  sudo apt-get install$packages"

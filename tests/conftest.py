@@ -71,6 +71,18 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     library.cache_clear()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def machine_with_an_id(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Gateways in this process find a machine's id; a container or a fresh root has none, of which a configuration warns."""
+    from kontronik_can_gw.runtime import machine
+
+    file = tmp_path_factory.mktemp("machine") / "machine-id"
+    file.write_text("0123456789abcdef0123456789abcdef\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(machine, "_IDENTITIES", (str(file), "/etc/machine-id"))
+        yield
+
+
 @pytest.fixture(scope="session")
 def native_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The core in C, optimised, for any layout; no warning of the compiler."""

@@ -26,6 +26,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -123,7 +124,8 @@ class Result:
     seconds: float = 0.0
     passed: int = 0
     failed: int = 0
-    skipped: list[str] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+    """Name and reason of each."""
     failures: list[str] = field(default_factory=list)
     """Name and message of each failed test of a JUnit report."""
     note: str = ""
@@ -146,7 +148,7 @@ def read_report(report: Path, result: Result) -> None:
         elif skipped is None or skipped.get("type") == "pytest.xfail":
             result.passed += 1
         else:
-            result.skipped.append(f"{name}: {skipped.get('message', '')}")
+            result.skipped.append((name, skipped.get("message", "")))
 
 
 def missing(step: str) -> str:
@@ -241,11 +243,12 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
     unrun = [result for result in results if result.enable]
     for result in unrun:
         print(f"not run: {result.step}: {result.note}\n    to enable it:  {result.enable}")
-    for each in skipped:
-        print(f"skipped: {each}")
+    for reason, count in Counter(reason for _, reason in skipped).most_common():
+        names = [name for name, why in skipped if why == reason]
+        print(f"skipped: {names[0] if count == 1 else f'{count} tests'}: {reason}")
     for failure in (each for result in results for each in result.failures):
         print(f"failed: {failure[:MESSAGE]}")
-    avoidable = [each for each in skipped if NOT_JUDGED not in each]
+    avoidable = [reason for _, reason in skipped if NOT_JUDGED not in reason]
     if strict and (unrun or avoidable):
         print("CI=true: what was not run is a failure")
     failed = sum(result.failed for result in results)

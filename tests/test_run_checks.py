@@ -88,21 +88,22 @@ def test_what_is_missing_is_not_run_and_the_remedy_is_named(
     [
         (3, 0, [], 0, 0),
         (3, 1, [], 1, 1),
-        (3, 0, ["a.b: no such tool"], 0, 1),
-        (3, 0, ["uml.x: not judged: 31 % of the processor time was taken"], 0, 0),
+        (3, 0, [("a.b", "no such tool"), ("a.c", "no such tool")], 0, 1),
+        (3, 0, [("uml.x", "not judged: 31 % of the processor time was taken")], 0, 0),
     ],
 )
 def test_the_last_line_has_the_totals(
     capsys: pytest.CaptureFixture[str],
     passed: int,
     failed: int,
-    skipped: list[str],
+    skipped: list[tuple[str, str]],
     code: int,
     strict_code: int,
 ) -> None:
     results = [checks.Result("unit", 1.0, passed, failed, skipped), checks.Result("lint", 1.0, 1)]
     assert checks.summarize(results, strict=False) == code
-    last = capsys.readouterr().out.splitlines()[-1]
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("skipped: ") for line in lines) == len({why for _, why in skipped})
     assert last == f"{passed + 1} passed, {failed} failed, {len(skipped)} skipped"
     assert re.fullmatch(r"\d+ passed, \d+ failed, \d+ skipped", last), "what CI reads"
     assert checks.summarize(results, strict=True) == strict_code

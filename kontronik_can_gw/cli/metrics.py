@@ -5,8 +5,8 @@ import ipaddress
 import threading
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import option
-from kontronik_can_gw.cli.common import say, stopping_on_signals
+from kontronik_can_gw.cli.arguments import CONFIG, option
+from kontronik_can_gw.cli.common import announced_config, say, stopping_on_signals
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import RunError
 
@@ -31,8 +31,8 @@ def _loopback(text: str) -> tuple[str, int]:
 # fmt: off
 OPTIONS = (
     (
-        option("-c --config FILE", "the gateway with this TOML configuration", type=Path),
-        option("--file FILE", f"the gateway with this statistics file (default {_RUN_FOLDER}/{_NAME}/status.json)", type=Path),
+        *CONFIG,
+        option("--file FILE", f"its statistics file (default: the configuration's, or {_RUN_FOLDER}/{_NAME}/status.json)", type=Path),
     ),
     option("--listen HOST:PORT", "where Prometheus may fetch /metrics, on this machine (default 127.0.0.1:9123)",
            type=_loopback, default=("127.0.0.1", 9123)),
@@ -46,7 +46,7 @@ def main(args: argparse.Namespace) -> int:
         from kontronik_can_gw.desk.metrics import server_of
     except ImportError:
         raise RunError("needs prometheus-client: pip install 'kontronik-can-gw[metrics]'") from None
-    file = args.file or _status_file(args.config)
+    file = args.file or _status_file(args.config or announced_config())
     host, port = args.listen
     stopped, server = threading.Event(), server_of(file, host, port)
     with server, stopping_on_signals(stopped.set):

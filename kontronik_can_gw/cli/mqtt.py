@@ -142,7 +142,10 @@ def _publish(source: Source, publisher: Publisher, client: "MqttClient") -> None
     """Publish from the source to the broker, until a signal or the end of the source."""
     stop, notifier, faults = Event(), Notifier(), FaultLog()
     with stopping_on_signals(stop.set):
-        client.start()
+        try:
+            client.start()
+        except OSError as error:
+            raise RunError(str(error)) from None
         notifier.ready("started")
         try:
             while not source.ended and not stop.is_set():

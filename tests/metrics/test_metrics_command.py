@@ -185,23 +185,29 @@ def test_without_the_library_its_extra_is_named(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("name", "own", "shown"),
+    ("name", "words", "own", "shown"),
     [
-        ("gateway.toml", "", "/run/kontronik-can-gw/status.json"),
-        ("left.toml", "", "/run/kontronik-can-gw-left/status.json"),
-        ("left.toml", '[statistics]\nfile = "own.json"\n', "own.json"),
+        ("gateway.toml", ["-c", "gateway.toml"], "", "/run/kontronik-can-gw/status.json"),
+        ("left.toml", ["left.toml"], "", "/run/kontronik-can-gw-left/status.json"),
+        ("gateway.toml", [], '[statistics]\nfile = "own.json"\n', "own.json"),
     ],
 )
 def test_it_serves_the_file_of_a_configuration_until_sigterm(
-    tmp_path: Path, name: str, own: str, shown: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    words: list[str],
+    own: str,
+    shown: str,
 ) -> None:
-    config = written(tmp_path / name, f'{own}[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n')
-    command = [sys.executable, "-m", "kontronik_can_gw", "metrics", "-c", str(config)]
+    written(tmp_path / name, f'{own}[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n')
+    command = [sys.executable, "-m", "kontronik_can_gw", "metrics", *words]
     paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    monkeypatch.chdir(tmp_path)
     program = LoggedProcess([*command, "--listen", "127.0.0.1:0"], paths)
     try:
         end = time.monotonic() + PATIENCE
-        while not program.lines:
+        while "serves" not in program.log:
             assert time.monotonic() < end
             time.sleep(0.01)
         assert program.log.endswith(shown)
@@ -211,4 +217,4 @@ def test_it_serves_the_file_of_a_configuration_until_sigterm(
         assert program.process.wait(PATIENCE) == 0
     finally:
         program.kill()
-    assert len(program.lines) == 1
+    assert len(program.lines) == 1 + (not words)

@@ -35,6 +35,7 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="to give files to othe
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The system's folder, of this test alone."""
     path = tmp_path / "run" / "lock"
+    path.parent.mkdir()
     monkeypatch.setattr(locks, "SYSTEM_FOLDER", path)
     return path
 

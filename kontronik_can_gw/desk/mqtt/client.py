@@ -122,9 +122,14 @@ class MqttClient:
         return f"MQTT broker [{host}]:{port}" if ":" in host else f"MQTT broker {host}:{port}"
 
     def start(self) -> None:
-        """Start paho's thread, which connects."""
+        """Start paho's thread, which connects. OSError with the remedy where 127.0.0.1, by which paho wakes it, does not work."""
         self._client.connect_async(*self.address, KEEPALIVE_S)
-        self._client.loop_start()
+        try:
+            self._client.loop_start()
+        except OSError as error:
+            raise OSError(
+                f"127.0.0.1: {error.strerror or error}. MQTT needs this machine's own network: sudo ip link set lo up"
+            ) from None
 
     @property
     def waiting(self) -> int:

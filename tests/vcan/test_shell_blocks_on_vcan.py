@@ -1,0 +1,61 @@
+"""Shell blocks of README, docs and examples that need a CAN interface do what they say: values are on vcan0."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from shell_blocks import Block, blocks, make_files, run_block
+
+pytestmark = pytest.mark.extended
+
+BEFORE = """
+sudo() { "$@"; }
+# A command in front that never ends is ended by a signal, once it shows an ESC that is heard.
+kontronik-can-gw() {
+    case $BASHPID.$1 in $$.run | $$.monitor) ;; *) command kontronik-can-gw "$@"; return ;; esac
+    : >said
+    command kontronik-can-gw "$@" >said 2>&1 &
+    until grep -Eq "esc1.*( ok|heard)" said || ! kill -0 $! 2>/dev/null; do sleep 0.1; done
+    kill $! 2>/dev/null || :
+    wait $! || { cat said; return 1; }
+}
+mount -t sysfs sys /sys  # that of this network namespace
+ip link set lo up
+"""
+RUNNING = """
+for channel in can0 can1; do
+    ip link add $channel type vcan
+    ip link set $channel up
+    kontronik-can-gw simulate --link $channel.esc &
+    kontronik-can-gw init - | sed "s#^port = .*#port = \\"$channel.esc\\"#; s#\\"can0\\"#\\"$channel\\"#" >$channel.toml
+    kontronik-can-gw run --wait -c $channel.toml &
+done
+"""
+INTERFACES = """
+for channel in can0 vcan0; do ip link add $channel type vcan && ip link set $channel up; done
+kontronik-can-gw simulate --link esc1 &
+until [ -e esc1 ]; do sleep 0.1; done
+"""
+
+
+def before(text: str) -> str:
+    """What a reader has already: interfaces, and gateways where they are looked at."""
+    if "ip link add" in text:
+        return BEFORE
+    return BEFORE + (RUNNING if "monitor" in text else INTERFACES)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    make_files(folder, "can0", 10)
+    return folder
+
+
+@pytest.mark.parametrize("block", blocks("vcan"), ids=lambda block: block.place)
+def test_a_block_can_be_typed_as_it_stands(
+    vcan: str, block: Block, files: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "f"
+    shutil.copytree(files, folder, symlinks=True)
+    run_block(block, folder, before(block.text), "unshare", "--net", "--mount")
