@@ -17,12 +17,8 @@ from kontronik_can_gw.esc.kontronik import (
 )
 from kontronik_can_gw.esc.kontronik.codec import FORMS
 from kontronik_can_gw.esc.kontronik.fields import DataType, device_and_variant
-from kontronik_can_gw.esc.kontronik.states import (
-    LARGEST_STATE,
-    device_text,
-    peak_current_of,
-    state_text,
-)
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
 from . import sheet
 from .sheet import Bit, Field, FormRow
@@ -90,21 +86,15 @@ def test_bec_current_alone_is_not_supplied_and_only_on_the_jivepro() -> None:
 
 
 def test_devices_and_states_have_the_names_of_the_sheet_and_no_others() -> None:
-    assert [device_text(number) for number in range(64)] == [
-        sheet.DEVICES.get(number) for number in range(64)
-    ]
-    assert {device.value: device.text for device in Device} == sheet.DEVICES
-    assert [state_text(number) for number in range(256)] == [
-        sheet.OPERATING_STATES.get(n) for n in range(256)
-    ]
-    assert {state.value: state.text for state in OperatingState} == sheet.OPERATING_STATES
+    assert {device.value: device.text for device in Device} == KONTRONIK.devices == sheet.DEVICES
+    assert {state.value: state.name for state in OperatingState} == sheet.OPERATING_STATES
+    states = {number: state.text for number, state in KONTRONIK.states.items()}
+    assert states == sheet.OPERATING_STATES
     assert LARGEST_STATE == 26
 
 
 def test_the_peak_current_belongs_to_motor_or_battery_by_device() -> None:
-    assert [peak_current_of(number) for number in range(64)] == [
-        sheet.PEAK_CURRENT_OF.get(n) for n in range(64)
-    ]
+    assert KONTRONIK.peak_current_of == sheet.PEAK_CURRENT_OF
 
 
 @pytest.mark.parametrize(
