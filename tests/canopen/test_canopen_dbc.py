@@ -18,10 +18,10 @@ from packer_oracle import pascal, read
 from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.canopen import dbc_names
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.storage import Stored, encode
+from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.names import esc_prefix
@@ -127,7 +127,11 @@ class Bench(dialogue.Bench):
         decoded: Any = message.decode(sent.data)
         values = {k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()}
         self.seen.setdefault(message.name, []).append(values)
-        esc = next(n for n, node in enumerate(self.nodes) if sent.can_id in dict(all_ids(node)))
+        esc = next(
+            n
+            for n, node in enumerate(self.nodes)
+            if sent.can_id in {use.cob_id for use in uses(node)}
+        )
         if "Tpdo" in message.name:
             self.check(self.gateway.escs[esc], self.prefixes[esc], values)
 
