@@ -153,7 +153,7 @@ def expected(esc: EscTelemetry) -> dict[str, Any]:
     for data, kind in ((live, LiveData), (info, InfoData)):
         for name, row in rows(kind).items():
             signal = pascal(name) + ("Percent" if row.unit == "%" else "")
-            found[signal] = NA if data is None else row.physical(getattr(data, name))
+            found[signal] = NA if data is None else getattr(data, name) / row.per_unit
     found["OperatingState"] = NA
     if live is not None:
         found["OperatingState"] = ENUMS["OperatingState"].get(
@@ -163,7 +163,7 @@ def expected(esc: EscTelemetry) -> dict[str, Any]:
     found |= {pascal(bit.name): word >> bit & 1 for bit in OperatingError}
     if not (esc.supplies(frozenset({Device.JIVEPRO}), live.bec_current) if live else False):
         found["BecCurrent"] = NA
-    if info is None or info.device == Device.JIVEPRO:
+    if info is None or esc.device == Device.JIVEPRO:
         found["MaxBecCurrent"] = NA
     found["LinkState"] = ENUMS["LinkState"][esc.link]
     found["Replay"] = 0

@@ -4,6 +4,7 @@ import struct
 
 import pytest
 
+from kontronik_can_gw.desk.recordings.decode import physical_fields
 from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
 from kontronik_can_gw.esc.kontronik import (
     Device,
@@ -68,12 +69,6 @@ def test_a_field_is_read_from_its_own_bytes_and_no_others(form_row: FormRow) -> 
         assert differing == owners, f"byte {offset}"
         for owner in owners:
             assert getattr(data, owner.name) == 0x5A << 8 * (offset - owner.offset), "little-endian"
-
-
-@pytest.mark.parametrize(("name", "expected"), sheet.STATED_RANGES.items())
-def test_a_stated_range_is_that_of_the_sheet(name: str, expected: tuple[int, int]) -> None:
-    row = (rows(LiveData) | rows(InfoData))[name]
-    assert row.stated_range == expected
 
 
 def test_bec_current_alone_is_not_supplied_and_only_on_the_jivepro() -> None:
@@ -171,7 +166,8 @@ def test_device_and_variant_share_a_word_six_bits_high_ten_low(
 ) -> None:
     assert device_and_variant(device, variant) == word
     info = InfoData(device_and_variant=word)
-    assert (info.device, info.variant) == (device, variant)
+    found = [KONTRONIK.value(name, info) for name in ("device_raw", "variant")]
+    assert found == [device, variant]
 
 
 @pytest.mark.parametrize(("device", "variant"), [(64, 0), (-1, 0), (0, 1024), (0, -1)])
@@ -184,22 +180,7 @@ def test_a_device_or_variant_that_does_not_fit_is_refused(device: int, variant: 
     ("word", "text"), [(0x010E, "1.14"), (0x0411, "4.17"), (0x0300, "3.0"), (0xFFFF, "255.255")]
 )
 def test_the_firmware_is_main_and_sub_version(word: int, text: str) -> None:
-    assert InfoData(firmware_word=word).firmware == text
-
-
-@pytest.mark.parametrize(
-    ("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", "")
-)
-def test_every_step_survives_the_way_to_the_unit_and_back(data: DataType, field: Field) -> None:
-    row = row_of(data, field)
-    low, high = sheet.TYPE_RANGES[field.code]
-    steps = (
-        range(low, high + 1)
-        if high < 1 << 16
-        else [low, low + 1, 1 << 31, (1 << 24) + 1, high - 1, high]
-    )
-    for raw in steps:
-        assert row.raw(row.physical(raw)) == raw
+    assert KONTRONIK.firmware_text(InfoData(firmware_word=word)) == text
 
 
 @pytest.mark.parametrize(
@@ -222,7 +203,5 @@ def test_every_step_survives_the_way_to_the_unit_and_back(data: DataType, field:
 def test_a_value_in_its_unit_is_the_nearest_float_and_is_not_clipped(
     field: str, raw: int, physical: float
 ) -> None:
-    row = rows(LiveData)[field]
-    assert row.physical(raw) == physical
-    assert str(row.physical(raw)) == str(physical)
-    assert row.raw(physical) == raw
+    found = physical_fields(KONTRONIK, False, LiveData(**{field: raw}))[field]
+    assert (found, str(found)) == (physical, str(physical))
