@@ -1,6 +1,6 @@
 """The SDO server: one transfer at a time, expedited, segmented or block (``sdo_transfers``), by CiA 301 v4.2 clause 7.2.4.
 
-Request frames and time in, answer frames out through ``send``; the object dictionary is asked through ``Objects``. Byte 0 of a
+Request frames and time in, answer frames out through ``send``; the object dictionary says what is there. Byte 0 of a
 request holds the client command specifier in its three highest bits; index, sub-index and all numbers are little endian.
 
 Choices where the standard leaves room:
@@ -21,9 +21,10 @@ Choices where the standard leaves room:
 """
 
 from collections.abc import Callable
-from typing import NoReturn, Protocol, TypeVar
+from typing import NoReturn, TypeVar
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.sdo_transfers import (
     BLOCK_SIZE,
     BlockDownload,
@@ -43,19 +44,6 @@ _CLIENT_ABORT = 0x80
 _NO_MULTIPLEXER = b"\0\0\0"
 
 
-class Objects(Protocol):
-    """What the server needs of the object dictionary. All methods raise ``SdoAbort`` to refuse."""
-
-    def upload(self, index: int, sub: int, now: int) -> bytes:
-        """The whole value, as one snapshot."""
-
-    def check_download(self, index: int, sub: int, size: int | None) -> int:
-        """Existence, access and length, before data moves. ``size`` in bytes; None: not indicated. Returns the most there can be."""
-
-    def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
-        """Write a value. False: the confirmation comes later through ``SdoServer.confirm``."""
-
-
 _Transfer = SegmentedDownload | SegmentedUpload | BlockDownload | BlockUpload
 _T = TypeVar("_T", SegmentedDownload, SegmentedUpload, BlockDownload, BlockUpload)
 
@@ -68,7 +56,7 @@ class SdoServer:
     """
 
     def __init__(
-        self, objects: Objects, send: Callable[[bytes], None], segment_ns: int = 0
+        self, objects: Dictionary, send: Callable[[bytes], None], segment_ns: int = 0
     ) -> None:
         self._objects = objects
         self._send = send

@@ -1,5 +1,7 @@
 """The SDO server where dialogues in files would be long: a sub-block cut short, calls from within a download."""
 
+from typing import Any, cast
+
 from sdo_bench import Bench, Dictionary, Entry
 
 from kontronik_can_gw.canopen.sdo import SdoServer
@@ -30,7 +32,7 @@ def test_a_dictionary_may_confirm_from_within_the_download() -> None:
 
     answers: list[bytes] = []
     server = SdoServer(
-        Eager({(0x2005, 0): Entry(size=4), (0x2005, 1): Entry(size=4)}), answers.append
+        cast(Any, Eager({(0x2005, 0): Entry(size=4), (0x2005, 1): Entry(size=4)})), answers.append
     )
     server.receive(WRITE_LATE, 0)
     assert answers == [LATE_OK]
@@ -46,7 +48,7 @@ def test_a_dictionary_may_reset_the_server_from_within_the_download() -> None:
             return True
 
     answers: list[bytes] = []
-    server = SdoServer(Restarting(), answers.append)
+    server = SdoServer(cast(Any, Restarting()), answers.append)
     server.receive(WRITE_LATE, 0)
     assert answers == []
     assert not server.busy and server.due == NEVER
