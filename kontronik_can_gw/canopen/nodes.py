@@ -14,7 +14,7 @@ from kontronik_can_gw.canopen.cob_ids import (
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.canopen.nmt import is_reset_of_all
+from kontronik_can_gw.canopen.nmt import ALL_NODES, RESETS, command
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
 from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAX_TPDOS
@@ -117,7 +117,7 @@ class Nodes(Output):
         if frame.extended or frame.remote or frame.fd:
             return
         begin = len(self.frames)
-        if frame.can_id == NMT and is_reset_of_all(frame.data):
+        if frame.can_id == NMT and command(frame.data, ALL_NODES) in RESETS:
             for node in self.nodes:
                 node.tpdos.release_ids()
         self._route(frame, now, at)
