@@ -1,17 +1,12 @@
-"""COB-IDs: the predefined connection set and the restricted ones (CiA 301, 7.3.3 and 7.3.5), and which of them a node uses."""
+"""COB-IDs: the predefined connection set and the restricted ones (CiA 301, 7.3.3 and 7.3.5)."""
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.node_state import UNCONFIGURED
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.node import Node
 
 Taken = Callable[[int, object], bool]
-"""Whether another user than this has a COB-ID, see ``Use``."""
+"""Whether another user than this has a COB-ID, see ``uses.Use``."""
 
 NMT, EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
 """Those of EMERGENCY and after are first ids: the node-ID is added."""
@@ -51,39 +46,3 @@ def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int
             cob_id = int(variable.default(node_id))
             if not cob_id & INVALID_BIT:
                 yield index, sub, cob_id & 0x7FF
-
-
-class Use(NamedTuple):
-    """A COB-ID that a node uses."""
-
-    cob_id: int
-    what: str
-    user: object = None
-    """The service for which a master can choose it; that of SYNC is one for all nodes. None: it cannot be chosen."""
-    own: bool = False
-    """No other device on the bus may send with it."""
-
-
-def uses(node: "Node") -> Iterator[Use]:
-    """All COB-IDs that a node sends with or listens to as its own."""
-    yield Use(NMT, "NMT")
-    yield Use(LSS_REQUEST, "LSS")
-    yield Use(LSS_ANSWER, "LSS")
-    if node.node_id == UNCONFIGURED:
-        return
-    name = f"CANopen node {node.node_id}"
-    yield Use(node.sync.cob_id, "SYNC", SYNC)
-    yield Use(SDO_REQUEST + node.node_id, f"SDO requests to {name}")
-    yield Use(HEARTBEAT + node.node_id, f"the heartbeat of {name}", own=True)
-    yield Use(SDO_ANSWER + node.node_id, f"SDO answers of {name}", own=True)
-    emergencies = node.emergencies
-    if not emergencies.cob_id & INVALID_BIT:
-        yield Use(emergencies.cob_id & 0x7FF, f"emergencies of {name}", emergencies, own=True)
-    for tpdo in node.tpdos:
-        if tpdo.valid:
-            yield Use(tpdo.cob_id, f"TPDO {tpdo.number + 1} of {name}", tpdo, own=True)
-
-
-def all_ids(node: "Node") -> Iterator[tuple[int, str]]:
-    """All COB-IDs of a node, and what they are."""
-    return ((use.cob_id, use.what) for use in uses(node))

@@ -1,6 +1,6 @@
 """The CANopen side as a DBC: transmit PDOs as they are mapped now, heartbeats and emergencies, so that a plain logger reads them.
 
-Nodes in, rows for ``dbc/writer.py`` out.
+Nodes in, a database for ``dbc/writer.py`` out.
 """
 
 from collections.abc import Sequence
@@ -8,23 +8,21 @@ from collections.abc import Sequence
 from kontronik_can_gw.canopen.dbc_messages import GATEWAY, LOGGER, NodeMessages
 from kontronik_can_gw.canopen.dbc_names import Names
 from kontronik_can_gw.canopen.nodes import Nodes
+from kontronik_can_gw.dbc import builder
+from kontronik_can_gw.dbc.builder import Database, Message
 from kontronik_can_gw.dbc.names import esc_prefix
-from kontronik_can_gw.dbc.rows import Message, Node, Rows
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
 
 LAYOUT_VERSION = "1.0.0"
-_NODES = (
-    Node(
-        GATEWAY,
-        "Gateway that is a CANopen node for each KONTRONIK ESC. It sends every message of this file.",
-    ),
-    Node(LOGGER, "Any receiver: logger, display or controller."),
-)
+_NODES = {
+    GATEWAY: "Gateway that is a CANopen node for each KONTRONIK ESC. It sends every message of this file.",
+    LOGGER: "Any receiver: logger, display or controller.",
+}
 
 
-def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Rows:
+def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Database:
     """What the nodes send by themselves, as they are configured now; ``escs`` in their order.
 
     With several ESCs each name begins with that of its ESC. Nodes that wait for LSS have no frames; the database's comment names
@@ -38,7 +36,7 @@ def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Rows:
         prefix = esc_prefix(esc.name) if len(escs) > 1 else ""
         messages += NodeMessages(node, prefix, message_names, signal_names).all()
     _check_ids(messages)
-    return Rows(_NODES, _about(nodes, escs), LAYOUT_VERSION, messages)
+    return builder.database(_NODES, _about(nodes, escs), LAYOUT_VERSION, messages)
 
 
 def waiting_for_lss(nodes: Nodes, escs: Sequence[EscSettings]) -> list[str]:

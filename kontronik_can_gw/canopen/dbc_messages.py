@@ -1,4 +1,4 @@
-"""The messages that one CANopen node sends by itself, as rows of a DBC: transmit PDOs, heartbeat, emergencies.
+"""The messages that one CANopen node sends by itself, as messages of a DBC: transmit PDOs, heartbeat, emergencies.
 
 Rules: those of the shipped DBC, but PDOs know no Error code: what cannot be shown is NotAvailable (all bits set, signed:
 only the sign bit).
@@ -19,7 +19,8 @@ from kontronik_can_gw.canopen.emergency_codes import Register
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
-from kontronik_can_gw.dbc.rows import Message, Signal, number
+from kontronik_can_gw.dbc import builder
+from kontronik_can_gw.dbc.builder import Message, Signal, number
 from kontronik_can_gw.esc.decoder import ErrorBit
 from kontronik_can_gw.esc.telemetry import MS, LinkState
 from kontronik_can_gw.esc.values import Group
@@ -27,7 +28,6 @@ from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.signals.plan import SignalPlan
 
 GATEWAY, LOGGER = "KontronikGateway", "Logger"
-_SENDERS = (GATEWAY,)
 _MAX_START_VALUE_BITS = 32
 """That the range of GenSigStartValue holds."""
 _ASCII_UNITS = {"°C": "degC", "µs": "us"}
@@ -77,9 +77,9 @@ class NodeMessages:
     def _signal(
         self, stem: str, start: int, length: int, comment: str, end: str = "", **more: Any
     ) -> Signal:
-        """``stem`` and ``end``: the name, see ``Names``; ``more``: further fields."""
+        """``stem`` and ``end``: the name, see ``Names``; ``more``: as for ``builder.signal``."""
         name = self._signal_names.take(self._prefix, stem, end)
-        return Signal(name, start, length, comment, receivers=(LOGGER,), **more)
+        return builder.signal(name, start, length, comment, receivers=(LOGGER,), **more)
 
     # --- heartbeat and emergency
 
@@ -100,8 +100,8 @@ class NodeMessages:
         name = self._message_names.take(self._message_prefix, "Heartbeat")
         cob_id = HEARTBEAT + self._node.node_id
         comment = f"Heartbeat of {self._title}, {when}."
-        send_type = "Cyclic" if period else "Event"
-        return Message(cob_id, name, 1, comment, _SENDERS, send_type, period, 0, [state])
+        schedule = "Cyclic" if period else "Event", period, 0
+        return builder.message(cob_id, name, 1, comment, GATEWAY, schedule, [state])
 
     def _emergency(self, cob_id: int) -> Message:
         names = emergency_names(self._errors)
@@ -127,7 +127,7 @@ class NodeMessages:
         delay = self._node.dictionary.number(0x1015) // 10
         name = self._message_names.take(self._message_prefix, "Emergency")
         comment = f"Emergencies of {self._title}, sent when an error comes, again after a reset or outage, NoError when all are gone."
-        return Message(cob_id, name, 8, comment, _SENDERS, "Event", 0, delay, signals)
+        return builder.message(cob_id, name, 8, comment, GATEWAY, ("Event", 0, delay), signals)
 
     # --- PDOs
 
@@ -148,8 +148,8 @@ class NodeMessages:
             signals += self._flags(variable, place, bits, state_name)
         name = self._message_names.take(self._message_prefix, f"Tpdo{tpdo.number + 1}")
         comment = f"TPDO {tpdo.number + 1} of {self._title}. {_when(tpdo)}"
-        schedule = _schedule(tpdo)
-        return Message(tpdo.cob_id, name, plan.length, comment, _SENDERS, *schedule, signals)
+        about = name, plan.length, comment, GATEWAY, _schedule(tpdo)
+        return builder.message(tpdo.cob_id, *about, signals)
 
     def _object(self, variable: Variable, place: SignalPlan) -> list[Signal]:
         """The signals of one mapped object that is no error word."""

@@ -6,7 +6,7 @@ Built from an EDS. A variable is either plain storage or bound: ``read`` then gi
 from collections.abc import Callable, Iterator, Mapping
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, codec
+from kontronik_can_gw.canopen.data_types import CODECS, DOMAIN_TYPE
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.objects import Bound
@@ -47,7 +47,7 @@ class Variable:
 
     def __init__(self, entry: Entry) -> None:
         self.entry = entry
-        self.codec = codec(entry.data_type)
+        self.codec = CODECS.get(entry.data_type)
         self.bound: Bound | None = None
         """The value of ESC or gateway that it shows."""
         self.read: Read | None = None

@@ -168,19 +168,9 @@ class _Reader:
                 elif key != "nrofentries":
                     given.wrong(f"{key}: not a sub-index from 1 to {count}.")
         counts = eds_rules.counts(item.index)
-        item.subs[0] = Entry(
-            item.index,
-            0,
-            f"{item.name} highest sub-index",
-            data_type=U8,
-            access="rw" if counts else "const",
-            mappable=False,
-            low=None,
-            high=None,
-            default=0 if counts else count,
-            relative=False,
-            object_type=item.kind,
-        )
+        about = f"{item.name} highest sub-index", U8, "rw" if counts else "const"
+        default = 0 if counts else count
+        item.subs[0] = Entry(item.index, 0, *about, False, None, None, default, False)
         for sub, name in names.items():
             item.subs[sub] = replace(first, sub=sub, name=name)
 
@@ -204,4 +194,4 @@ def _entry(section: Section, item: EdsObject, sub: int, name: str, kind: int) ->
         section.wrong("ParameterValue: values belong in a DCF. Write DefaultValue.")
     limit = limits(section, data_type)
     default = default_value(section, data_type, *limit)
-    return Entry(item.index, sub, name, data_type, access, mappable, *limit, *default, item.kind)
+    return Entry(item.index, sub, name, data_type, access, mappable, *limit, *default)

@@ -11,7 +11,7 @@ class Entry:
     """One entry of the object dictionary, as the EDS describes it.
 
     ``access`` is ro, wo, rw, rwr, rww or const. ``default`` is an int, a float, or bytes for texts and domains; with ``relative`` the
-    node-ID is still to be added to it. ``object_type``: DOMAIN, VAR, ARRAY or RECORD, of the object it belongs to.
+    node-ID is still to be added to it.
     """
 
     index: int
@@ -24,7 +24,6 @@ class Entry:
     high: int | None
     default: int | float | bytes | None
     relative: bool
-    object_type: int
 
 
 @dataclass

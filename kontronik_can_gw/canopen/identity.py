@@ -1,4 +1,4 @@
-"""Node-ID and identity of one node: 1018h, 2101h, and what an LSS master does with them (CiA 305; ``lss.Host``)."""
+"""Node-ID and identity of one node: 1018h, 2101h, and what an LSS master does with them (CiA 305)."""
 
 from collections.abc import Callable
 
@@ -63,9 +63,14 @@ class Identity:
         return True
 
     def store_configuration(self) -> bool:
+        """LSS: begin to save the pending node-ID. False: refused.
+
+        After True exactly one call of ``LssSlave.stored`` follows, in the order of the requests, also when the node was reset between.
+        """
         return not self._settings.read_only and self._parameters.store_node_id()
 
     def lss_left_configuration(self, now: int) -> None:
+        """The slave was switched from configuration to waiting state."""
         if self.active_node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
             self._boot(now)
 

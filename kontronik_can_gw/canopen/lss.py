@@ -21,8 +21,8 @@ of another slave; only "switch state global" brings it back to waiting.
 from collections import deque
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Protocol
 
+from kontronik_can_gw.canopen.identity import Identity
 from kontronik_can_gw.node_state import UNCONFIGURED
 
 
@@ -68,37 +68,10 @@ SCAN_RESET = 0x80
 """BitChecked of the frame that begins a fastscan."""
 
 
-class Host(Protocol):
-    """The node as LSS sees it. Node-IDs: 1..127, or 255: unconfigured."""
-
-    @property
-    def identity(self) -> tuple[int, int, int, int]:
-        """1018h:1..4: vendor-ID, product code, revision number, serial number; 32 bit each."""
-
-    @property
-    def active_node_id(self) -> int: ...
-
-    @property
-    def pending_node_id(self) -> int:
-        """Becomes the active one at reset communication."""
-
-    def configure_node_id(self, node_id: int) -> bool:
-        """Set the pending node-ID, 1..127 or 255. False: refused (bus writes switched off)."""
-
-    def store_configuration(self) -> bool:
-        """Begin to save the pending node-ID. False: refused.
-
-        After True exactly one call of ``LssSlave.stored`` follows, in the order of the requests, also when the node was reset between.
-        """
-
-    def lss_left_configuration(self, now: int) -> None:
-        """The slave was switched from configuration to waiting state. An unconfigured node with a valid pending node-ID boots now."""
-
-
 class LssSlave:
     """Configures one node, selected by its identity (1018h). Several slaves hear the same frames, each answers for itself only."""
 
-    def __init__(self, host: Host, send: Callable[[bytes], None]) -> None:
+    def __init__(self, host: Identity, send: Callable[[bytes], None]) -> None:
         self._host = host
         self._send = send
         self._configuring = False

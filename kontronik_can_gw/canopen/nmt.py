@@ -20,6 +20,9 @@ class Command(IntEnum):
     RESET_COMMUNICATION = 130
 
 
+RESETS = (Command.RESET_NODE, Command.RESET_COMMUNICATION)
+ALL_NODES = 0
+"""The node-ID in a command to every node on the bus."""
 STATE_AFTER = {
     Command.START: NmtState.OPERATIONAL,
     Command.STOP: NmtState.STOPPED,
@@ -28,22 +31,17 @@ STATE_AFTER = {
 
 
 def command(data: bytes, node_id: int) -> Command | None:
-    """The command that an NMT message holds for this node: byte 0 command, byte 1 node-ID or 0 for all.
+    """The command that an NMT message holds for this node: byte 0 command, byte 1 node-ID or ALL_NODES.
 
     None for commands to other nodes, unknown, or not exactly two bytes long.
     """
-    if len(data) != 2 or data[1] not in (0, node_id) or data[0] not in Command._value2member_map_:
+    if (
+        len(data) != 2
+        or data[1] not in (ALL_NODES, node_id)
+        or data[0] not in Command._value2member_map_
+    ):
         return None
     return Command(data[0])
-
-
-def is_reset_of_all(data: bytes) -> bool:
-    """True for a reset of every node on the bus."""
-    return (
-        len(data) == 2
-        and data[1] == 0
-        and data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION)
-    )
 
 
 class Nmt:

@@ -10,23 +10,23 @@ from kontronik_can_gw.canopen.cob_ids import (
     NMT,
     OF_NODE_ID,
     default_ids,
-    uses,
 )
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.canopen.nmt import is_reset_of_all
+from kontronik_can_gw.canopen.nmt import ALL_NODES, RESETS, command
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
 from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAX_TPDOS
-from kontronik_can_gw.canopen.reception import FrameTaker, routes
 from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.canopen.uses import FrameTaker, routes, uses
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.output import NEVER, Output, Owner
+from kontronik_can_gw.signals.plan import classic_bits
 from kontronik_can_gw.slots import Slot, Slots
 
 SettingsChanged = Callable[[int, EscSettings], None]
@@ -117,7 +117,7 @@ class Nodes(Output):
         if frame.extended or frame.remote or frame.fd:
             return
         begin = len(self.frames)
-        if frame.can_id == NMT and is_reset_of_all(frame.data):
+        if frame.can_id == NMT and command(frame.data, ALL_NODES) in RESETS:
             for node in self.nodes:
                 node.tpdos.release_ids()
         self._route(frame, now, at)
@@ -174,6 +174,15 @@ class Nodes(Output):
             (node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos))
             for node in self.nodes
         ]
+
+    def traffic(self) -> tuple[float, float]:
+        """Frames a second of PDOs and heartbeats, to be expected when all is well, and the bits that they need with the most stuffing."""
+        rates: list[tuple[int, float]] = []
+        for node in (node for node in self.nodes if node.node_id != UNCONFIGURED):
+            if period := node.dictionary.number(0x1017):
+                rates.append((1, 1000 / period))
+            rates += [(8, tpdo.rate_hz) for tpdo in node.tpdos]
+        return sum(rate for _, rate in rates), sum(classic_bits(n) * rate for n, rate in rates)
 
     def own_ids(self) -> dict[int, Owner]:
         """COB-IDs that only our nodes send with."""

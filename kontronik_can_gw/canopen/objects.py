@@ -1,12 +1,14 @@
 """Which objects show what: index and sub-index to a value, in which steps. What is not here is plain storage or a service's own object.
 
-The objects' types, names, limits and PDO defaults are in the EDS; the values, units and ranges in ``VALUES``.
+Values of ESC and gateway stand in ``objects.tsv``, those of the link here. The objects' types, names, limits and PDO defaults are in
+the EDS; the values, units and ranges in ``VALUES``.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -27,73 +29,9 @@ U8, U16 = 0xFF, 0xFFFF
 LIVE, DERIVED, INFO, EXTREMES, LINK, GATEWAY = 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x2021
 UNITS = 0x2002
 SETTINGS, NODE_ID, RESET_STATISTICS = 0x2100, 0x2101, 0x2102
-ERROR_CODE, VELOCITY, DC_LINK_VOLTAGE = 0x603F, 0x606C, 0x6079
+ERROR_CODE = 0x603F
 
-_VALUES: Mapping[int, Mapping[int, tuple[str, int]]] = {
-    LIVE: {
-        1: ("electrical_speed", 1),
-        2: ("battery_voltage", 100),
-        3: ("battery_current", 10),
-        4: ("motor_current", 10),
-        5: ("peak_current", 10),
-        6: ("consumed_charge", 1),
-        7: ("bec_current", 1000),
-        8: ("bec_voltage", 1000),
-        9: ("pwm_input", 1),
-        10: ("throttle", 1),
-        11: ("output_opening", 1),
-        12: ("power_stage_temperature", 1),
-        13: ("bec_temperature", 1),
-        14: ("operating_errors", 1),
-        15: ("operating_state_raw", 1),
-        16: ("timing", 1),
-    },
-    DERIVED: {
-        1: ("motor_speed", 1),
-        2: ("output_speed", 1),
-        3: ("battery_power", 10),
-        4: ("energy_used", 10),
-        5: ("mean_cell_voltage", 1000),
-        6: ("motor_run_time", 1),
-    },
-    INFO: {
-        1: ("device_raw", 1),
-        2: ("variant", 1),
-        3: ("firmware", 1),
-        4: ("selftest_errors", 1),
-        5: ("cell_count", 1),
-    },
-    EXTREMES: {
-        1: ("max_electrical_speed", 1),
-        2: ("min_battery_voltage", 100),
-        3: ("max_battery_voltage", 100),
-        4: ("max_battery_current", 10),
-        5: ("max_motor_current", 10),
-        6: ("max_peak_current", 10),
-        7: ("max_bec_current", 1000),
-        8: ("min_bec_voltage", 1000),
-        9: ("max_throttle", 1),
-        10: ("max_output_opening", 1),
-        11: ("min_power_stage_temperature", 1),
-        12: ("max_power_stage_temperature", 1),
-        13: ("min_bec_temperature", 1),
-        14: ("max_bec_temperature", 1),
-    },
-    GATEWAY: {
-        1: ("uptime", 1),
-        2: ("can_state", 1),
-        3: ("sent_frames", 1),
-        4: ("received_frames", 1),
-        5: ("send_failures", 1),
-        6: ("bus_off_count", 1),
-        7: ("replaced_frames", 1),
-        8: ("esc_count", 1),
-        9: ("escs_ok", 1),
-    },
-    VELOCITY: {0: ("motor_speed", 1)},
-    DC_LINK_VOLTAGE: {0: ("battery_voltage", 1000)},
-}
-"""By index and sub-index the name of a value, and steps of the object to one of the value's units."""
+_TABLE = Path(__file__).with_name("objects.tsv")
 _ROLL = frozenset({(DERIVED, 4), (DERIVED, 6)})
 """These start again at 0 after the greatest number of their type."""
 _STATUS = frozenset({"operating_errors", "operating_state_raw", "link_status"})
@@ -187,14 +125,14 @@ def bindings_of(protocol: EscProtocol) -> Mapping[tuple[int, int], Bound]:
     """(Index, sub-index) to what the object shows of an ESC of this protocol."""
     values = {**values_of(protocol), _FIRMWARE.name: _FIRMWARE}
     found = {}
-    for index, subs in _VALUES.items():
-        for sub, (name, per_unit) in subs.items():
-            value = values[name]
-            if index in (INFO, EXTREMES):
-                value = _kept(value)
-            elif (index, sub) in _ROLL:
-                value = replace(value, rolls=True)
-            found[index, sub] = Bound(value, Fraction(per_unit))
+    for line in _TABLE.read_text(encoding="ascii").splitlines()[1:]:
+        at, number, name, per_unit = line.split("\t")
+        index, sub, value = int(at, 16), int(number), values[name]
+        if index in (INFO, EXTREMES):
+            value = _kept(value)
+        elif (index, sub) in _ROLL:
+            value = replace(value, rolls=True)
+        found[index, sub] = Bound(value, Fraction(per_unit))
     link = {
         (LINK, sub): Bound(value, Fraction(value.per_unit)) for sub, value in _LINK_VALUES.items()
     }

@@ -1,6 +1,6 @@
-"""The SDO server: one transfer at a time, expedited, segmented or block (``sdo_block``), by CiA 301 v4.2 clause 7.2.4.
+"""The SDO server: one transfer at a time, expedited, segmented or block (``sdo_transfers``), by CiA 301 v4.2 clause 7.2.4.
 
-Request frames and time in, answer frames out through ``send``; the object dictionary is asked through ``Objects``. Byte 0 of a
+Request frames and time in, answer frames out through ``send``; the object dictionary says what is there. Byte 0 of a
 request holds the client command specifier in its three highest bits; index, sub-index and all numbers are little endian.
 
 Choices where the standard leaves room:
@@ -21,18 +21,20 @@ Choices where the standard leaves room:
 """
 
 from collections.abc import Callable
-from typing import NoReturn, Protocol, TypeVar
+from typing import NoReturn, TypeVar
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.sdo_block import (
+from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.sdo_transfers import (
     BLOCK_SIZE,
     BlockDownload,
     BlockUpload,
     InFlight,
     Pace,
+    SegmentedDownload,
+    SegmentedUpload,
     check_block_size,
 )
-from kontronik_can_gw.canopen.sdo_segments import Incoming, SegmentedDownload, SegmentedUpload
 from kontronik_can_gw.output import NEVER
 
 TIMEOUT_NS = 2_000_000_000
@@ -40,19 +42,6 @@ TIMEOUT_NS = 2_000_000_000
 
 _CLIENT_ABORT = 0x80
 _NO_MULTIPLEXER = b"\0\0\0"
-
-
-class Objects(Protocol):
-    """What the server needs of the object dictionary. All methods raise ``SdoAbort`` to refuse."""
-
-    def upload(self, index: int, sub: int, now: int) -> bytes:
-        """The whole value, as one snapshot."""
-
-    def check_download(self, index: int, sub: int, size: int | None) -> int:
-        """Existence, access and length, before data moves. ``size`` in bytes; None: not indicated. Returns the most there can be."""
-
-    def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
-        """Write a value. False: the confirmation comes later through ``SdoServer.confirm``."""
 
 
 _Transfer = SegmentedDownload | SegmentedUpload | BlockDownload | BlockUpload
@@ -67,7 +56,7 @@ class SdoServer:
     """
 
     def __init__(
-        self, objects: Objects, send: Callable[[bytes], None], segment_ns: int = 0
+        self, objects: Dictionary, send: Callable[[bytes], None], segment_ns: int = 0
     ) -> None:
         self._objects = objects
         self._send = send
@@ -202,13 +191,9 @@ class SdoServer:
             self._store(value, self._initiated(0x60), now)
             return
         size = int.from_bytes(data[4:8], "little") if indicated else None
-        self._transfer = SegmentedDownload(self._prepare_download(size))
-        self._send(self._initiated(0x60))
-
-    def _prepare_download(self, size: int | None) -> Incoming:
-        """Have everything checked that can be before data moves."""
         limit = self._objects.check_download(self._index, self._sub, size)
-        return Incoming(size, limit if size is None else size)
+        self._transfer = SegmentedDownload(size, limit if size is None else size)
+        self._send(self._initiated(0x60))
 
     def _take_segment(self, data: bytes, now: int) -> None:
         download = self._running(SegmentedDownload)
@@ -251,7 +236,8 @@ class SdoServer:
         """110x xCs0 (C: CRC), multiplexer, size. Answer: A4h (CRC supported), multiplexer, block size, 0 (3)."""
         self._begin(data)
         size = int.from_bytes(data[4:8], "little") if data[0] & 2 else None
-        self._transfer = BlockDownload(self._prepare_download(size), bool(data[0] & 4))
+        limit = self._objects.check_download(self._index, self._sub, size)
+        self._transfer = BlockDownload(size, limit if size is None else size, bool(data[0] & 4))
         self._in_flight.segment_seen(now)
         self._send(self._initiated(0xA4, bytes((BLOCK_SIZE,))))
 

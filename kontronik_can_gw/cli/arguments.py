@@ -1,6 +1,7 @@
 """Options of commands as rows of a table, and what several commands share of them."""
 
 import argparse
+import tomllib
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -8,39 +9,14 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.errors import UserError
 
-# fmt: off
 REMOVED_OPTIONS: dict[tuple[str, str], str] = {
-    ("describe", "--format html"): "Type kontronik-can-gw describe -o bus.md; pandoc -s bus.md -o bus.html makes a page of it.",
-    ("describe", "--format man"): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
-    ("simulate", "--variant"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
-    ("simulate", "--firmware"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
-    ("simulate", "--cells"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
-    ("simulate", "--rate"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
-    ("simulate", "--info-every"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
-    ("simulate", "--info-replaces"): "Leave it out: a simulated ESC has variant 120, firmware 4.17, 6 cells, 100 frames a second.",
-    ("simulate", "--noise"): "Type --flip-bits 0.0001: a bad line.",
-    ("simulate", "--lose-bytes"): "Type --flip-bits 0.0001: a bad line.",
-    ("simulate", "--swap-device"): "End it, and type simulate --device NAME with the same --link.",
-    ("service", "--prometheus"):
-        "Type kontronik-can-gw service install --metrics: a service of its own serves /metrics, and the gateway listens on nothing.",
-    ("service", "--dry-run"):
-        "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
-    ("service", "--print"):
-        "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
-    ("service", "--force"): "Leave it out: every file is written anew, and one that was another is kept as .bak.",
-    ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
-    ("status", "--interval"): "Type watch -n S kontronik-can-gw status.",
-    ("mqtt", "--remove-discovery"):
-        "Type mosquitto_sub -h BROKER -W 2 --remove-retained -t homeassistant/device/kontronik_GATEWAY/config, and for "
-        "each ESC -t homeassistant/device/kontronik_GATEWAY_ESC/config.",
-    ("report", "--to"): "Type --until S.",
-    ("replay", "--to"): "Type --on can or --on pty; a log is made by kontronik-can-gw convert FILE flight.log.",
+    (command, removed): advice
+    for command, rows in tomllib.loads(
+        Path(__file__).with_name("removed_options.toml").read_text(encoding="ascii")
+    ).items()
+    for removed, advice in rows.items()
 }
-# fmt: on
-"""Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.
-
-A removed choice is written with its option: ("describe", "--format html"). Entries may be deleted a year after the removal.
-"""
+"""By command and option, and what to type instead."""
 
 
 class Option(NamedTuple):

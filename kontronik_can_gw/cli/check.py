@@ -1,12 +1,11 @@
 """``check``: says in short whether a configuration can be used and what it sends, without opening anything."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.canopen.node import Node
-from kontronik_can_gw.canopen.traffic import bits_per_second, frames_per_second
+from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file, option
 from kontronik_can_gw.cli.check_details import can_id, details, lost, source, timing
 from kontronik_can_gw.cli.common import say, show
@@ -41,7 +40,7 @@ def main(args: argparse.Namespace) -> int:
         print(printable_json({"file": str(path), "mistakes": list(error.problems)}, indent=2))
         return error.exit_code
     warnings = [*loaded.layout.warnings, *loaded.warnings, *_examples(loaded)]
-    nodes = [] if loaded.canopen is None else loaded.canopen.nodes(loaded.escs).nodes
+    nodes = None if loaded.canopen is None else loaded.canopen.nodes(loaded.escs)
     if args.json:
         print(printable_json(document(path, loaded, nodes, warnings), indent=2))
         return 0
@@ -66,7 +65,7 @@ def _examples(loaded: Loaded) -> Iterator[str]:
             )
 
 
-def summary(path: Path, loaded: Loaded, nodes: Sequence[Node], warnings: int) -> Iterator[str]:
+def summary(path: Path, loaded: Loaded, nodes: Nodes | None, warnings: int) -> Iterator[str]:
     """What the gateway reads and sends, in a few lines that fit 80 columns."""
     config, layout = loaded.config, loaded.layout
     found = _counted(warnings, "warning") if warnings else "no warnings"
@@ -84,7 +83,7 @@ def summary(path: Path, loaded: Loaded, nodes: Sequence[Node], warnings: int) ->
         span = f", {' to '.join(dict.fromkeys((ids[0], ids[-1])))}" if ids else ""
         yield f"  DBC       {_counted(len(layout.messages), 'message')}{span}, layout {layout.fingerprint}"
         yield f"            {layout.file}"
-    for node, each in zip(nodes, loaded.escs, strict=False):  # none, or one for each
+    for node, each in zip(nodes.nodes if nodes else (), loaded.escs, strict=False):
         sent = f"node {node.node_id}, {_counted(sum(tpdo.valid for tpdo in node.tpdos), 'TPDO')}"
         yield f"  CANopen   {each.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else sent}"
     for output in loaded.outputs:
@@ -100,20 +99,20 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def _traffic(loaded: Loaded, nodes: Sequence[Node]) -> tuple[float, float]:
+def _traffic(loaded: Loaded, nodes: Nodes | None) -> tuple[float, float]:
     """Share of the bus and frames a second. What is sent on change is counted by its cycle."""
     can, layout = loaded.config.can, loaded.layout
-    load = layout.bus_load(can.bitrate, can.data_bitrate) + bits_per_second(nodes) / can.bitrate
-    frames = sum(message.rate_hz for message in layout.messages) + frames_per_second(nodes)
-    for output in loaded.outputs:
-        more, bits = output.traffic()
+    load = layout.bus_load(can.bitrate, can.data_bitrate)
+    frames = sum(message.rate_hz for message in layout.messages)
+    others = [] if nodes is None else [nodes.traffic()]
+    for more, bits in (*others, *(output.traffic() for output in loaded.outputs)):
         load += bits / can.bitrate
         frames += more
     return load, frames
 
 
 def document(
-    path: Path, loaded: Loaded, nodes: Sequence[Node], warnings: list[str]
+    path: Path, loaded: Loaded, nodes: Nodes | None, warnings: list[str]
 ) -> dict[str, Any]:
     """The same as JSON, with every message and signal."""
     config, layout = loaded.config, loaded.layout
@@ -146,5 +145,8 @@ def document(
             for message in layout.messages
         ],
         "outputs": {output.name: output.lines() for output in loaded.outputs},
-        "canopen_nodes": [None if node.node_id == UNCONFIGURED else node.node_id for node in nodes],
+        "canopen_nodes": [
+            None if node.node_id == UNCONFIGURED else node.node_id
+            for node in (nodes.nodes if nodes else ())
+        ],
     }

@@ -4,10 +4,10 @@ import re
 import struct
 from collections.abc import Iterator, Sequence
 
-from kontronik_can_gw.canopen.cob_ids import all_ids
-from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
+from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.dbc.loss import is_mute, reporter
@@ -16,7 +16,7 @@ from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 
-def details(loaded: Loaded, nodes: Sequence[Node]) -> Iterator[str]:
+def details(loaded: Loaded, nodes: Nodes | None) -> Iterator[str]:
     """The effective configuration, each message and signal with its source, what is lost, and each node with its COB-IDs."""
     config, layout = loaded.config, loaded.layout
     yield f"# effective configuration of {config.file}"
@@ -26,7 +26,7 @@ def details(loaded: Loaded, nodes: Sequence[Node]) -> Iterator[str]:
         yield from table(layout, [esc.name for esc in config.escs])
         yield ""
         yield from unbound(layout)
-    if loaded.canopen is not None:
+    if loaded.canopen is not None and nodes is not None:
         yield f"# CANopen nodes by {loaded.canopen.eds.name}"
         yield from node_table(nodes, loaded)
         yield ""
@@ -36,17 +36,17 @@ def details(loaded: Loaded, nodes: Sequence[Node]) -> Iterator[str]:
         yield ""
 
 
-def node_table(nodes: Sequence[Node], loaded: Loaded) -> list[str]:
+def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
     """Each node's COB-IDs and PDOs in columns."""
     rows: list[tuple[str, ...]] = [("node", "COB-ID", "what", "sent", "objects")]
-    for node, esc in zip(nodes, loaded.escs, strict=True):
+    for node, esc in zip(nodes.nodes, loaded.escs, strict=True):
         if node.node_id == UNCONFIGURED:
             serial = f"serial number {node.identity.identity[3]}"
             rows.append((f"{esc.name}: waits for LSS", "7E5h", "LSS", "", serial))
             continue
         first = f"{esc.name}: {node.node_id}"
         tpdos = {tpdo.cob_id: tpdo for tpdo in node.tpdos if tpdo.valid}
-        for cob_id, what in dict(all_ids(node)).items():
+        for cob_id, what in {use.cob_id: use.what for use in uses(node)}.items():
             sent, objects = "", ""
             if (tpdo := tpdos.get(cob_id)) is not None:
                 sent = pdo_timing(tpdo)

@@ -16,7 +16,6 @@ from kontronik_can_gw.config.parse import name_problem
 from kontronik_can_gw.dbc.expand import among_canopen, expand
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import choose_node, load_database
-from kontronik_can_gw.dbc.rows import Rows
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
@@ -83,7 +82,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _canopen(args: argparse.Namespace) -> Rows:
+def _canopen(args: argparse.Namespace) -> "Database":
     """The DBC of the configured nodes, or of nodes from the shipped EDS with node-IDs from 1."""
     beside = "--canopen, which describes the nodes as they are"
     _refuse(args, ("from", "base_id", "id_step", "node"), beside)

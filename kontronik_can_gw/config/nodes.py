@@ -11,14 +11,13 @@ from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds, without_objects
-from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.storage import Stored, decode
-from kontronik_can_gw.canopen.traffic import bits_per_second
+from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
@@ -97,8 +96,8 @@ def needs(
     """COB-IDs of the nodes and what each is for, what they need of the bus in bit/s, and warnings for objects that the EDS lacks."""
     made = setup.nodes(escs)
     lacks = [f"{setup.eds.name}: {line}" for line in without_objects(made)]
-    ids = {cob_id: what for node in made.nodes for cob_id, what in all_ids(node)}
-    return ids, bits_per_second(made.nodes), lacks
+    ids = {cob_id: what for node in made.nodes for cob_id, what, *_ in uses(node)}
+    return ids, made.traffic()[1], lacks
 
 
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
@@ -197,7 +196,7 @@ def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
     """Nodes with a COB-ID that another service, another node or a DBC message uses."""
     users: dict[int, list[tuple[int, str]]] = {}
     for number, node in enumerate(nodes.nodes):
-        for cob_id, what in all_ids(node):
+        for cob_id, what, *_ in uses(node):
             users.setdefault(cob_id, []).append((number, what))
     found = {
         number

@@ -1,5 +1,7 @@
 """When a message is sent: its send type as Vector's and OEM templates spell it, its cycle time and minimum distance."""
 
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.names import normalize
@@ -20,34 +22,18 @@ SEND_TYPES = {
 """Meanings that ``dbc.send_type`` can give."""
 _BY_CYCLE = ""
 """A meaning too: cyclic with a cycle time, else sent with each new value."""
-_SPELLINGS = {
-    "Cyclic": "Cyclic CyclicX Periodic FixedPeriodic FixedCyclic Cycle Zyklisch Periodique P CyclicWithRepeatOnDemand "
-    "CyclicFast Time TimeTriggered",
-    "Event": "Event OnEvent EventTriggered Evenement Ereignis E Spontaneous Spontan SpontanX SpontaneousWithDelay "
-    "SpontanWithDelay SpontanWD SpontaneousWithRepetition SpontanWithRepetition SpontanWithRepitition "
-    "OnWrite OnWriteWithRepetition Triggered Direct Sporadic Acyclic Aperiodic",
-    "OnChange": "OnChange OnChangeWithRepetition Change OnDelta",
-    "CyclicAndEvent": "CyclicAndEvent EventPeriodic PeriodicEvent PeriodicAndEvent EventAndPeriodic EventAndCyclic "
-    "CyclicAndSpontaneous CyclicAndSpontan CyclicAndSpontanX SpontaneousAndCyclic "
-    "CyclicAndSpontaneousWithDelay CyclicAndSpontanWithDelay CyclicAndSpontanWD CyclicAndSpontaneousWD "
-    "CyclicAndOnWrite CyclicEvent EventCyclic CE PE Mixed Mixte",
-    "CyclicAndOnChange": "CyclicAndOnChange PeriodicAndOnChange CyclicOnChange CyclicAndChange",
-    _BY_CYCLE: "None NoMsgSendType NoSendType NoSigSendType NotUsed NotDefined Undefined vector_leerstring Unknown NA "
-    "Reserved Default",
-}
-_WHILE_ACTIVE = {
-    "Cyclic": "IfActive CyclicIfActive CyclicIfActiveX CyclicIfActiveFast EnabledPeriodic IfActiveWithRepetition",
-    "CyclicAndEvent": "CyclicIfActiveAndSpontaneousWD CyclicIfActiveAndSpontanWD CyclicIfActiveAndSpontaneous "
-    "CyclicIfActiveAndSpontan IfActiveAndOnWrite",
-    "CyclicAndOnChange": "OnChangeAndIfActive OnChangeAndIfActiveWithRepetition IfActiveAndOnChange",
-}
-"""Only while a signal is active, which is covered by sending always."""
-_MEANINGS = {"": (_BY_CYCLE, False)} | {
-    normalize(text): (name, while_active)
-    for table, while_active in ((_SPELLINGS, False), (_WHILE_ACTIVE, True))
-    for name, texts in table.items()
-    for text in texts.split()
-}
+_TABLE = Path(__file__).with_name("send_types.tsv")
+
+
+@cache
+def _meanings() -> dict[str, tuple[str, bool]]:
+    """By a normalized spelling its meaning, and whether it holds only while a signal is active."""
+    found = {"": (_BY_CYCLE, False)}
+    for line in _TABLE.read_text(encoding="ascii").splitlines()[2:]:
+        name, spellings = line.split("\t")
+        meaning = name.rstrip("*-"), name.endswith("*")
+        found |= {normalize(text): meaning for text in spellings.split()}
+    return found
 
 
 def timing(job: Compilation, message: "Message", where: str) -> tuple[SendType, int, int]:
@@ -56,7 +42,7 @@ def timing(job: Compilation, message: "Message", where: str) -> tuple[SendType, 
     delay = _time(job, message, "GenMsgDelayTime", where)
     text = str(attribute(message, "GenMsgSendType", job.database) or "")
     job.send_types.add(text)
-    name, while_active = _MEANINGS.get(normalize(text), (None, False))
+    name, while_active = _meanings().get(normalize(text), (None, False))
     if text in job.settings.send_types:
         name, while_active = job.settings.send_types[text], False
     if name is None:

@@ -7,14 +7,8 @@ of database comments and text attributes.
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.dbc import rows
-
 if TYPE_CHECKING:
-    from cantools.database import can
-
-    Database = can.Database | rows.Rows
-    Message = can.Message | rows.Message
-    Signal = can.Signal | rows.Signal
+    from cantools.database.can import Database, Message, Signal
 
 _LONG_NAMES = frozenset(
     {f"System{kind}LongSymbol" for kind in ("Node", "Message", "Signal", "EnvVar")}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 from script import Heard, bytes_of, hexadecimal, ms
 
@@ -53,7 +54,7 @@ class Talk(Heard):
         super().__init__()
         self.now = 0
         self.node = Node()
-        self.slave = LssSlave(self.node, self._sent)
+        self.slave = LssSlave(cast(Any, self.node), self._sent)
         for option in options:
             match option.split():
                 case ["node-id", active, pending]:

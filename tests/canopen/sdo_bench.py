@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 from script import MS, Heard, bytes_of, hexadecimal, ms
 
@@ -92,7 +93,7 @@ class Bench(Heard):
     def __init__(self, segment_ns: int = 0) -> None:
         super().__init__()
         self.objects = Dictionary()
-        self.server = SdoServer(self.objects, self._sent, segment_ns)
+        self.server = SdoServer(cast(Any, self.objects), self._sent, segment_ns)
         self.now = 0
         self.answers: list[bytes] = []
         """Those of the last request, and what followed it."""

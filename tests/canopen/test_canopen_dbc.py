@@ -16,10 +16,10 @@ from packer_oracle import pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.storage import Stored, encode
+from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.writer import dbc_text
@@ -124,7 +124,11 @@ class Bench(dialogue.Bench):
         decoded: Any = message.decode(sent.data)
         values = {k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()}
         self.seen.setdefault(message.name, []).append(values)
-        esc = next(n for n, node in enumerate(self.nodes) if sent.can_id in dict(all_ids(node)))
+        esc = next(
+            n
+            for n, node in enumerate(self.nodes)
+            if sent.can_id in {use.cob_id for use in uses(node)}
+        )
         if "Tpdo" in message.name:
             self.check(self.gateway.escs[esc], self.prefixes[esc], values)
 
@@ -146,7 +150,7 @@ def expected(esc: EscTelemetry) -> dict[str, Any]:
     for data, kind in ((live, LiveData), (info, InfoData)):
         for name, row in rows(kind).items():
             signal = pascal(name) + ("Percent" if row.unit == "%" else "")
-            found[signal] = NA if data is None else row.physical(getattr(data, name))
+            found[signal] = NA if data is None else getattr(data, name) / row.per_unit
     found["OperatingState"] = NA
     if live is not None:
         found["OperatingState"] = ENUMS["OperatingState"].get(
@@ -156,7 +160,7 @@ def expected(esc: EscTelemetry) -> dict[str, Any]:
     found |= {pascal(bit.name): word >> bit & 1 for bit in OperatingError}
     if not (esc.supplies(frozenset({Device.JIVEPRO}), live.bec_current) if live else False):
         found["BecCurrent"] = NA
-    if info is None or info.device == Device.JIVEPRO:
+    if info is None or esc.device == Device.JIVEPRO:
         found["MaxBecCurrent"] = NA
     found["LinkState"] = ENUMS["LinkState"][esc.link]
     found["Replay"] = 0

@@ -3,7 +3,7 @@
 import random
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import canopen
 import canopen.lss
@@ -31,7 +31,7 @@ class Bus:
 
     def __init__(self, *nodes: Node) -> None:
         self._answers: list[bytes] = []
-        self.slaves = [LssSlave(node, self._answers.append) for node in nodes]
+        self.slaves = [LssSlave(cast(Any, node), self._answers.append) for node in nodes]
 
     def send(self, data: bytes) -> list[bytes]:
         """Give a frame to all; return what was answered."""

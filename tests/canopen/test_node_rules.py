@@ -9,9 +9,9 @@ from eds_text import SHIPPED, variable, with_object
 from script import MS
 
 from kontronik_can_gw.canopen.bound_values import message_plan
-from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.storage import Stored, encode
+from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
@@ -205,7 +205,7 @@ def test_nothing_a_master_stored_keeps_the_gateway_from_starting(
     ids: dict[int, str] = {m.can_id: m.name for m in loaded.layout.messages}
     nodes = loaded.canopen.nodes(loaded.escs, dict(ids)).nodes
     for node in nodes:
-        for cob_id, what in all_ids(node):
+        for cob_id, what, *_ in uses(node):
             assert ids.setdefault(cob_id, what) == what
     # said at start, or by the node when it boots
     assert loaded.warnings or any(node.rejected for node in nodes)

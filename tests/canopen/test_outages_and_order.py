@@ -5,7 +5,6 @@ from dialogue import EMPTY, QUIET, Bench, live, tpdo
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import GATEWAY, LINK
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.canopen.traffic import frames_per_second
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -69,7 +68,7 @@ def test_what_the_bus_has_to_carry_is_reckoned_with_the_pace_of_each_pdo() -> No
     def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
         bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()
         assert bench.gateway.nodes is not None
-        return frames_per_second(bench.nodes)
+        return bench.gateway.nodes.traffic()[0]
 
     assert rate(0x20000210) == 100
     assert rate(CRC_ERRORS) == rate(SENT_FRAMES) == rate(LINK_STATUS) == 1

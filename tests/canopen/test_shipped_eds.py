@@ -16,7 +16,6 @@ from eds_text import dcfchk, device_info, with_key
 
 from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.data_types import RECORD, VAR
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.config.keys import EscConfig
@@ -138,8 +137,9 @@ def test_what_may_be_mapped_is_what_telemetry_and_gateway_tell(
     assert mappable == {0x2000, 0x2001, 0x2011, 0x2020, 0x2021, 0x603F, 0x606C, 0x6079}
     for (index, sub), entry in entries.items():
         if index in mappable:
-            assert entry.mappable == (sub > 0 or entry.object_type == VAR)
-            assert entry.access == ("const" if sub == 0 and entry.object_type == RECORD else "ro")
+            is_count = sub == 0 and (index, 1) in entries
+            assert entry.mappable != is_count
+            assert entry.access == ("const" if is_count else "ro")
 
 
 def limits(entry: Entry) -> tuple[int, int]:

@@ -17,6 +17,7 @@ from kontronik_can_gw.esc.kontronik import (
     LiveData,
     OperatingError,
 )
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
 
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
@@ -50,8 +51,9 @@ def test_error_bits_and_the_device_are_as_asked(tmp_path: Path) -> None:
     bec = 1 << OperatingError.BEC_OVERCURRENT
     assert [word & bec for word in errors] == [bec if n >= 200 else 0 for n in range(600)]
     infos = [frame.data for frame in frames if isinstance(frame.data, InfoData)]
-    assert [info.device for info in infos] == [Device.KONTROL_X] * 6
-    assert (infos[0].variant, infos[0].firmware, infos[0].cell_count) == (120, "4.17", 6)
+    assert [KONTRONIK.value("device_raw", info) for info in infos] == [Device.KONTROL_X] * 6
+    assert KONTRONIK.value("variant", infos[0]) == 120
+    assert (KONTRONIK.firmware_text(infos[0]), infos[0].cell_count) == ("4.17", 6)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -48,7 +48,10 @@ def holds(found: Facts, **expected: object) -> None:
 # --- texts
 
 
-@pytest.mark.parametrize("kind", [OperatingError, SelfTestError, OperatingState, GatewayError])
+STATES = [state.about for state in OperatingState]
+
+
+@pytest.mark.parametrize("kind", [OperatingError, SelfTestError, STATES, GatewayError])
 def test_each_error_and_state_has_a_meaning_of_its_own_and_a_remedy(kind: Any) -> None:
     assert all(each.meaning.strip() == each.meaning != "" for each in kind)
     assert all(each.remedy.endswith(".") for each in kind)

@@ -4,6 +4,7 @@ import struct
 
 import pytest
 
+from kontronik_can_gw.desk.recordings.decode import physical_fields
 from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
 from kontronik_can_gw.esc.kontronik import (
     Device,
@@ -17,12 +18,8 @@ from kontronik_can_gw.esc.kontronik import (
 )
 from kontronik_can_gw.esc.kontronik.codec import FORMS
 from kontronik_can_gw.esc.kontronik.fields import DataType, device_and_variant
-from kontronik_can_gw.esc.kontronik.states import (
-    LARGEST_STATE,
-    device_text,
-    peak_current_of,
-    state_text,
-)
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
 from . import sheet
 from .sheet import Bit, Field, FormRow
@@ -74,12 +71,6 @@ def test_a_field_is_read_from_its_own_bytes_and_no_others(form_row: FormRow) -> 
             assert getattr(data, owner.name) == 0x5A << 8 * (offset - owner.offset), "little-endian"
 
 
-@pytest.mark.parametrize(("name", "expected"), sheet.STATED_RANGES.items())
-def test_a_stated_range_is_that_of_the_sheet(name: str, expected: tuple[int, int]) -> None:
-    row = (rows(LiveData) | rows(InfoData))[name]
-    assert row.stated_range == expected
-
-
 def test_bec_current_alone_is_not_supplied_and_only_on_the_jivepro() -> None:
     absent = {
         field.name: row_of(data, field).not_on
@@ -90,21 +81,15 @@ def test_bec_current_alone_is_not_supplied_and_only_on_the_jivepro() -> None:
 
 
 def test_devices_and_states_have_the_names_of_the_sheet_and_no_others() -> None:
-    assert [device_text(number) for number in range(64)] == [
-        sheet.DEVICES.get(number) for number in range(64)
-    ]
-    assert {device.value: device.text for device in Device} == sheet.DEVICES
-    assert [state_text(number) for number in range(256)] == [
-        sheet.OPERATING_STATES.get(n) for n in range(256)
-    ]
-    assert {state.value: state.text for state in OperatingState} == sheet.OPERATING_STATES
+    assert {device.value: device.text for device in Device} == KONTRONIK.devices == sheet.DEVICES
+    assert {state.value: state.name for state in OperatingState} == sheet.OPERATING_STATES
+    states = {number: state.text for number, state in KONTRONIK.states.items()}
+    assert states == sheet.OPERATING_STATES
     assert LARGEST_STATE == 26
 
 
 def test_the_peak_current_belongs_to_motor_or_battery_by_device() -> None:
-    assert [peak_current_of(number) for number in range(64)] == [
-        sheet.PEAK_CURRENT_OF.get(n) for n in range(64)
-    ]
+    assert KONTRONIK.peak_current_of == sheet.PEAK_CURRENT_OF
 
 
 @pytest.mark.parametrize(
@@ -181,7 +166,8 @@ def test_device_and_variant_share_a_word_six_bits_high_ten_low(
 ) -> None:
     assert device_and_variant(device, variant) == word
     info = InfoData(device_and_variant=word)
-    assert (info.device, info.variant) == (device, variant)
+    found = [KONTRONIK.value(name, info) for name in ("device_raw", "variant")]
+    assert found == [device, variant]
 
 
 @pytest.mark.parametrize(("device", "variant"), [(64, 0), (-1, 0), (0, 1024), (0, -1)])
@@ -194,22 +180,7 @@ def test_a_device_or_variant_that_does_not_fit_is_refused(device: int, variant: 
     ("word", "text"), [(0x010E, "1.14"), (0x0411, "4.17"), (0x0300, "3.0"), (0xFFFF, "255.255")]
 )
 def test_the_firmware_is_main_and_sub_version(word: int, text: str) -> None:
-    assert InfoData(firmware_word=word).firmware == text
-
-
-@pytest.mark.parametrize(
-    ("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", "")
-)
-def test_every_step_survives_the_way_to_the_unit_and_back(data: DataType, field: Field) -> None:
-    row = row_of(data, field)
-    low, high = sheet.TYPE_RANGES[field.code]
-    steps = (
-        range(low, high + 1)
-        if high < 1 << 16
-        else [low, low + 1, 1 << 31, (1 << 24) + 1, high - 1, high]
-    )
-    for raw in steps:
-        assert row.raw(row.physical(raw)) == raw
+    assert KONTRONIK.firmware_text(InfoData(firmware_word=word)) == text
 
 
 @pytest.mark.parametrize(
@@ -232,7 +203,5 @@ def test_every_step_survives_the_way_to_the_unit_and_back(data: DataType, field:
 def test_a_value_in_its_unit_is_the_nearest_float_and_is_not_clipped(
     field: str, raw: int, physical: float
 ) -> None:
-    row = rows(LiveData)[field]
-    assert row.physical(raw) == physical
-    assert str(row.physical(raw)) == str(physical)
-    assert row.raw(physical) == raw
+    found = physical_fields(KONTRONIK, False, LiveData(**{field: raw}))[field]
+    assert (found, str(found)) == (physical, str(physical))

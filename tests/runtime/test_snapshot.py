@@ -12,8 +12,9 @@ from statistics_bench import PROGRAM, Bench
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
-from kontronik_can_gw.esc.kontronik.states import OperatingError, state_text
+from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
@@ -54,11 +55,11 @@ def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
             for (name, row), raw in zip(rows(kind).items(), sent, strict=True):
                 if name in ("operating_state", "device_and_variant", "firmware_word"):
                     continue
-                assert esc["values"][name] == row.physical(raw), name
+                assert esc["values"][name] == raw / row.per_unit, name
                 assert document["units"][name] == row.unit
         live, info = bench.newest(number, LiveData), bench.newest(number, InfoData)
-        assert esc["operating_state"] == state_text(live.operating_state)
-        assert (esc["device"], esc["firmware"]) == ("KOSMIK", info.firmware)
+        assert esc["operating_state"] == OperatingState(live.operating_state).name
+        assert (esc["device"], esc["firmware"]) == ("KOSMIK", KONTRONIK.firmware_text(info))
         assert esc["values"]["motor_speed"] == pytest.approx(live.electrical_speed / 7, abs=1e-6)
         assert esc["values"]["output_speed"] == pytest.approx(
             live.electrical_speed / 7 / 9.8, abs=1e-6

@@ -6,7 +6,6 @@ from fractions import Fraction
 from pathlib import PurePath
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.data_types import TYPE_NAMES
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
@@ -16,6 +15,7 @@ from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, reg
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.describe.tables import meanings_of, number, protocols_of
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
@@ -36,7 +36,7 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     ids = [
         {"node": name, "cob_id": cob_id, "use": use}
         for name, node in named
-        for cob_id, use in sorted(dict(all_ids(node)).items())
+        for cob_id, use in sorted({use.cob_id: use.what for use in uses(node)}.items())
     ]
     writes = any(settings.read_only for settings in setup.settings)
     refused = "Nothing can be written over the bus: canopen.read_only is true." if writes else ""

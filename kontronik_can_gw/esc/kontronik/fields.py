@@ -1,7 +1,7 @@
-"""One typed line per row of the sheet. Wire order, type, step, unit, stated range and absence are defined here and nowhere else.
+"""One typed line per row of the sheet. Wire order, type, step, unit and absence are defined here and nowhere else.
 
-LiveData and InfoData hold raw wire integers. ``physical`` and ``raw`` convert by a Row. Nothing is clipped: the stated
-range is information for people, every value that fits the wire type is passed on.
+LiveData and InfoData hold raw wire integers. Nothing is clipped: every value that fits the wire type is passed on, also beyond the range
+that the sheet states.
 """
 
 import struct
@@ -13,14 +13,12 @@ from kontronik_can_gw.esc.kontronik.states import Device
 class Row(NamedTuple):
     """A row of the sheet.
 
-    ``wire`` is the struct code, ``per_unit`` how many steps make one ``unit``, low..high the stated range in steps.
+    ``wire`` is the struct code, ``per_unit`` how many steps make one ``unit``.
     """
 
     wire: str
     unit: str
     per_unit: int = 1
-    low: int | None = None
-    high: int | None = None
     not_on: frozenset[Device] = frozenset()
     """Devices that do not supply this value."""
 
@@ -32,33 +30,18 @@ class Row(NamedTuple):
             (-(1 << bits - 1), (1 << bits - 1) - 1) if self.wire.islower() else (0, (1 << bits) - 1)
         )
 
-    @property
-    def stated_range(self) -> tuple[int, int]:
-        """The sheet's range in steps; the type's range where the sheet is silent."""
-        low, high = self.type_range
-        return (low if self.low is None else self.low, high if self.high is None else self.high)
-
-    def physical(self, raw: int) -> int | float:
-        """The value in ``unit``: the float nearest to the exact step (24.42, never 24.419999)."""
-        return raw if self.per_unit == 1 else raw / self.per_unit
-
-    def raw(self, physical: float) -> int:
-        """The nearest step of a value in ``unit``."""
-        return round(physical * self.per_unit)
-
 
 _NOT_JIVEPRO = frozenset({Device.JIVEPRO})
 
 ElectricalSpeed = Annotated[int, Row("I", "1/min")]
-# "10.000" in the sheet is a German ten thousand
-Voltage = Annotated[int, Row("H", "V", 100, 0, 10_000)]
-Current = Annotated[int, Row("h", "A", 10, -10_000, 10_000)]  # signed: regeneration is negative
+Voltage = Annotated[int, Row("H", "V", 100)]
+Current = Annotated[int, Row("h", "A", 10)]  # signed: regeneration is negative
 Charge = Annotated[int, Row("H", "mAh")]
 BecCurrent = Annotated[int, Row("H", "A", 1000, not_on=_NOT_JIVEPRO)]
 BecVoltage = Annotated[int, Row("H", "V", 1000)]
 PwmInput = Annotated[int, Row("H", "µs")]
-Throttle = Annotated[int, Row("b", "%", 1, -100, 100)]  # <= 0 brakes
-Opening = Annotated[int, Row("B", "%", 1, 0, 100)]
+Throttle = Annotated[int, Row("b", "%")]  # <= 0 brakes
+Opening = Annotated[int, Row("B", "%")]
 Temperature = Annotated[int, Row("b", "°C")]
 Word = Annotated[int, Row("I", "")]
 State = Annotated[int, Row("B", "")]
@@ -109,21 +92,6 @@ class InfoData(NamedTuple):
     max_power_stage_temperature: Temperature = 0
     min_bec_temperature: Temperature = 0
     max_bec_temperature: Temperature = 0
-
-    @property
-    def device(self) -> int:
-        """Device number, 0..63: a Device where it has a name."""
-        return self.device_and_variant >> 10
-
-    @property
-    def variant(self) -> int:
-        """Variant number, 0..1023."""
-        return self.device_and_variant & 0x3FF
-
-    @property
-    def firmware(self) -> str:
-        """Main and sub version, as "1.14"."""
-        return f"{self.firmware_word >> 8}.{self.firmware_word & 0xFF}"
 
 
 Data = LiveData | InfoData

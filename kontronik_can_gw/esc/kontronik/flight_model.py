@@ -8,7 +8,6 @@ from kontronik_can_gw.esc.kontronik.states import (
     Device,
     OperatingError,
     OperatingState,
-    peak_current_of,
 )
 
 _STANDING = frozenset(state for state in OperatingState if state <= OperatingState.StandBy)
@@ -39,7 +38,7 @@ class FlightModel:
         self._device = device
         self._dt = options.period_ns / 1e9
         self._random = Random(f"model {seed}").random
-        self._measures_battery_peak = peak_current_of(device) == "battery"
+        self._measures_battery_peak = device.peak_current_of == "battery"
         self._supplies_bec_current = device not in _SUPPLIES_NO_BEC_CURRENT
         self._strength = options.max_current * (0.95 + 0.1 * self._random())
         self._stage_temperature = _AMBIENT + 4 + 2 * self._random()

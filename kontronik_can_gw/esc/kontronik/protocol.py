@@ -1,25 +1,16 @@
 """The KONTRONIK protocol for the gateway: the tables of fields.py and states.py in the form of an EscProtocol."""
 
-from kontronik_can_gw.esc.decoder import EscProtocol, Field, State
+from kontronik_can_gw.esc.decoder import EscProtocol, Field
 from kontronik_can_gw.esc.kontronik.deframer import Deframer
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, body_format, rows
 from kontronik_can_gw.esc.kontronik.states import (
-    KIND_OF_STATE,
-    PHASE_OF_STATE,
     Device,
     OperatingError,
     OperatingState,
     SelfTestError,
-    peak_current_of,
 )
 
-_STATES = {
-    int(state): State(
-        *(state.text, state.meaning, state.remedy),
-        *(KIND_OF_STATE[state], PHASE_OF_STATE[state]),
-    )
-    for state in OperatingState
-}
+_STATES = {int(state): state.about for state in OperatingState}
 _DEVICES = {int(device): device.text for device in Device}
 _PARTS = ("operating_state", "device_and_variant", "firmware_word")
 """Rows of the sheet that are several values, or have names."""
@@ -69,7 +60,5 @@ KONTRONIK = EscProtocol(
     states=_STATES,
     devices=_DEVICES,
     wire=((body_format(LiveData), LiveData), (body_format(InfoData), InfoData)),
-    peak_current_of={
-        int(device): whose for device in Device if (whose := peak_current_of(device)) is not None
-    },
+    peak_current_of={int(d): d.peak_current_of for d in Device if d.peak_current_of is not None},
 )

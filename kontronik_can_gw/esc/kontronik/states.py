@@ -4,140 +4,83 @@ Numbers without a name stay numbers: no function here raises for a value that ne
 """
 
 from enum import IntEnum
+from typing import Self
 
-from kontronik_can_gw.esc.decoder import ErrorBit, Severity
+from kontronik_can_gw.esc.decoder import ErrorBit, Severity, State
 
 
 class Device(IntEnum):
-    """High six bits of the info frame's first word. 0 is reserved."""
+    """High six bits of the info frame's first word. 0 is reserved. A member is written ``NAME = (number, text, peak_current_of)``."""
 
-    KOSMIK = 1
-    KOLIBRI = 2
-    JIVEPRO = 3
-    KONTROL_X = 4
-    UHV = 5
+    text: str
+    """The maker's spelling."""
+    peak_current_of: str | None
+    """Whose peak current it reports (a held maximum): ``motor``, ``battery``, or None where unknown."""
 
-    @property
-    def text(self) -> str:
-        """The maker's spelling."""
-        return _DEVICE_TEXTS[self]
+    def __new__(cls, number: int, text: str, peak_current_of: str | None) -> Self:
+        member = int.__new__(cls, number)
+        member._value_ = number
+        member.text = text
+        member.peak_current_of = peak_current_of
+        return member
 
-
-_DEVICE_TEXTS = {
-    Device.KOSMIK: "KOSMIK",
-    Device.KOLIBRI: "KOLIBRI",
-    Device.JIVEPRO: "JIVEPro",
-    Device.KONTROL_X: "KONTROL-X",
-    Device.UHV: "UHV",
-}
+    KOSMIK = (1, "KOSMIK", "motor")
+    KOLIBRI = (2, "KOLIBRI", "motor")
+    JIVEPRO = (3, "JIVEPro", "battery")
+    KONTROL_X = (4, "KONTROL-X", "motor")
+    UHV = (5, "UHV", None)
 
 
+# fmt: off
 class OperatingState(IntEnum):
-    """Live frame, offset 32. 0, 4, 5, 6 and 8 have no name; 12 stands in every recorded idle frame."""
+    """Live frame, offset 32. 0, 4, 5, 6 and 8 have no name; 12 stands in every recorded idle frame.
 
-    WaitForSignal = 1
-    WaitForMotorOff = 2
-    WaitForMotorOn = 3
-    Selftest = 7
-    Error_Selftest = 9
-    CutOffDuringOperation = 10
-    AcousticSignal = 11
-    MotorOff = 12
-    StandBy = 13
-    Brake = 14
-    BrakeTargetBackward = 15
-    BrakeTargetForward = 16
-    Programming = 17
-    Sync_Forward = 18
-    Sync_Backward = 19
-    Sync_StandBy = 20
-    Forward = 21
-    Backward = 22
-    SpoolUpFromStill = 23
-    SpoolUpFromTurn = 24
-    SpoolUpQuick = 25
-    RPMControl = 26
+    A member is written ``NAME = (number, meaning, kind, phase, remedy)``, see ``State``; the sheet has nothing but the names.
+    """
 
-    @property
-    def text(self) -> str:
-        """The sheet's spelling."""
-        return self.name
+    about: State
 
-    @property
-    def meaning(self) -> str:
-        """The name in words: the sheet has nothing but the names."""
-        return _STATE_MEANINGS[self]
+    def __new__(cls, number: int, meaning: str, kind: str, phase: str, remedy: str = "Nothing to do.") -> Self:
+        member = int.__new__(cls, number)
+        member._value_ = number
+        member.about = State("", meaning, remedy, kind, phase)
+        return member
 
-    @property
-    def remedy(self) -> str:
-        """What a person should do; for most states nothing."""
-        return _STATE_REMEDIES.get(self, "Nothing to do.")
+    def __init__(self, *_: object) -> None:
+        self.about = self.about._replace(text=self.name)  # the sheet's spelling
 
+    WaitForSignal = (1, "waits for a signal at its input", "idle", "Waiting",
+        "If it stays: switch transmitter and receiver on, check the cable from the receiver.")
+    WaitForMotorOff = (2, "waits for the command motor off", "idle", "Waiting",
+        "If it stays: put the throttle to motor off.")
+    WaitForMotorOn = (3, "waits for the command motor on", "idle", "Waiting")
+    Selftest = (7, "tests itself", "idle", "Self-test, signal")
+    Error_Selftest = (9, "the self-test found an error", "fault", "Fault",
+        "Do not run the motor. See the remedy of the self-test error that is set.")
+    CutOffDuringOperation = (10, "switched off during operation", "fault", "Fault",
+        "See the remedy of the operating error that is set.")
+    AcousticSignal = (11, "gives an acoustic signal", "idle", "Self-test, signal")
+    MotorOff = (12, "motor off", "idle", "Motor off, standby")
+    StandBy = (13, "stands by", "idle", "Motor off, standby")
+    Brake = (14, "brakes", "brake", "Braking")
+    BrakeTargetBackward = (15, "brakes, target backward", "brake", "Braking")
+    BrakeTargetForward = (16, "brakes, target forward", "brake", "Braking")
+    Programming = (17, "is being programmed", "idle", "Programming")
+    Sync_Forward = (18, "synchronizes, forward", "run", "Spooling up, synchronising")
+    Sync_Backward = (19, "synchronizes, backward", "run", "Spooling up, synchronising")
+    Sync_StandBy = (20, "synchronizes, stand-by", "idle", "Spooling up, synchronising")
+    Forward = (21, "runs forward", "run", "Running")
+    Backward = (22, "runs backward", "run", "Running")
+    SpoolUpFromStill = (23, "spools up from standstill", "start", "Spooling up, synchronising")
+    SpoolUpFromTurn = (24, "spools up while it already turns", "start", "Spooling up, synchronising")
+    SpoolUpQuick = (25, "spools up quickly", "start", "Spooling up, synchronising")
+    RPMControl = (26, "speed control", "run", "Running")
 
-_STATE_MEANINGS = {
-    OperatingState.WaitForSignal: "waits for a signal at its input",
-    OperatingState.WaitForMotorOff: "waits for the command motor off",
-    OperatingState.WaitForMotorOn: "waits for the command motor on",
-    OperatingState.Selftest: "tests itself",
-    OperatingState.Error_Selftest: "the self-test found an error",
-    OperatingState.CutOffDuringOperation: "switched off during operation",
-    OperatingState.AcousticSignal: "gives an acoustic signal",
-    OperatingState.MotorOff: "motor off",
-    OperatingState.StandBy: "stands by",
-    OperatingState.Brake: "brakes",
-    OperatingState.BrakeTargetBackward: "brakes, target backward",
-    OperatingState.BrakeTargetForward: "brakes, target forward",
-    OperatingState.Programming: "is being programmed",
-    OperatingState.Sync_Forward: "synchronizes, forward",
-    OperatingState.Sync_Backward: "synchronizes, backward",
-    OperatingState.Sync_StandBy: "synchronizes, stand-by",
-    OperatingState.Forward: "runs forward",
-    OperatingState.Backward: "runs backward",
-    OperatingState.SpoolUpFromStill: "spools up from standstill",
-    OperatingState.SpoolUpFromTurn: "spools up while it already turns",
-    OperatingState.SpoolUpQuick: "spools up quickly",
-    OperatingState.RPMControl: "speed control",
-}
-_STATE_REMEDIES = {
-    OperatingState.WaitForSignal: "If it stays: switch transmitter and receiver on, check the cable from the receiver.",
-    OperatingState.WaitForMotorOff: "If it stays: put the throttle to motor off.",
-    OperatingState.Error_Selftest: "Do not run the motor. See the remedy of the self-test error that is set.",
-    OperatingState.CutOffDuringOperation: "See the remedy of the operating error that is set.",
-}
-
-KIND_OF_STATE = {
-    OperatingState[name]: kind
-    for kind, names in {
-        "idle": "WaitForSignal WaitForMotorOff WaitForMotorOn Selftest AcousticSignal MotorOff StandBy"
-        " Programming Sync_StandBy",
-        "start": "SpoolUpFromStill SpoolUpFromTurn SpoolUpQuick",
-        "run": "Forward Backward Sync_Forward Sync_Backward RPMControl",
-        "brake": "Brake BrakeTargetBackward BrakeTargetForward",
-        "fault": "Error_Selftest CutOffDuringOperation",
-    }.items()
-    for name in names.split()
-}
-PHASE_OF_STATE = {
-    OperatingState[name]: phase
-    for phase, names in {
-        "Motor off, standby": "MotorOff StandBy",
-        "Waiting": "WaitForSignal WaitForMotorOff WaitForMotorOn",
-        "Self-test, signal": "Selftest AcousticSignal",
-        "Spooling up, synchronising": "SpoolUpFromStill SpoolUpFromTurn SpoolUpQuick Sync_Forward Sync_Backward"
-        " Sync_StandBy",
-        "Running": "Forward Backward RPMControl",
-        "Braking": "Brake BrakeTargetBackward BrakeTargetForward",
-        "Programming": "Programming",
-        "Fault": "Error_Selftest CutOffDuringOperation",
-    }.items()
-    for name in names.split()
-}
 
 LARGEST_STATE = max(OperatingState)
 
 
 # Two lines a bit: number, severity and meaning; remedy (common practice with any ESC: the sheet has none), emergency code, summary.
-# fmt: off
 _E, _W, _S = Severity.ERROR, Severity.WARNING, Severity.STATUS
 
 
@@ -240,20 +183,3 @@ class SelfTestError(ErrorBit):
 
 
 # fmt: on
-
-
-def device_text(number: int) -> str | None:
-    """The device's name, or None for a number that has none."""
-    return Device(number).text if number in Device._value2member_map_ else None
-
-
-def state_text(number: int) -> str | None:
-    """The operating state's name, or None for a number that has none."""
-    return OperatingState(number).text if number in OperatingState._value2member_map_ else None
-
-
-def peak_current_of(device: int) -> str | None:
-    """Whose peak current the device reports (a held maximum): ``motor``, ``battery``, or None where unknown."""
-    if device == Device.JIVEPRO:
-        return "battery"
-    return "motor" if device in (Device.KOSMIK, Device.KOLIBRI, Device.KONTROL_X) else None

@@ -1,11 +1,10 @@
-"""SDO block transfers, one object each (CiA 301, 7.2.4.2.9 to 7.2.4.2.16): segments in and out; refusals are ``SdoAbort``."""
+"""SDO transfers, one object each (CiA 301, 7.2.4.2.3 to 7.2.4.2.16): segments in and out; refusals are ``SdoAbort``."""
 
 from binascii import crc_hqx
 from collections.abc import Callable
 from enum import Enum, auto
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.sdo_segments import Incoming
 
 BLOCK_SIZE = 127
 """Segments of one sub-block of a block download, the most there can be."""
@@ -14,16 +13,79 @@ BURST = 4
 IN_FLIGHT_NS = 50_000_000
 """Segments sent before the client saw our abort follow one another more closely than this."""
 
+_TOGGLE = 0x10
 _LAST_SEGMENT = 0x80
 
 
-class BlockDownload:
-    """Only segments in sequence are taken; the client repeats what follows the last accepted one."""
+class Download:
+    """What comes in. ``size``: as the client indicated, or None; more than ``limit`` bytes are refused."""
 
-    def __init__(self, incoming: Incoming, with_crc: bool) -> None:
+    def __init__(self, size: int | None, limit: int) -> None:
         self.complete = False
-        """All segments are here; the end request follows."""
-        self._incoming = incoming
+        """The last segment is here."""
+        self._data = bytearray()
+        self._size = size
+        self._limit = limit
+
+    def _check_limit(self) -> None:
+        if len(self._data) > self._limit:
+            raise SdoAbort(Abort.TOO_LONG)
+
+    def whole(self) -> bytes:
+        """All data, its length checked."""
+        self._check_limit()
+        if self._size is not None and len(self._data) < self._size:
+            raise SdoAbort(Abort.TOO_SHORT)
+        return bytes(self._data)
+
+
+class SegmentedDownload(Download):
+    """Each segment is confirmed."""
+
+    _toggle = 0
+
+    def take(self, data: bytes) -> bytes:
+        """000t nnnc, data (7). Answer: 001t 0000, 0 (7)."""
+        command = data[0]
+        if command & _TOGGLE != self._toggle:
+            raise SdoAbort(Abort.TOGGLE)
+        self._data += data[1 : 8 - (command >> 1 & 7)]
+        self._check_limit()
+        answer = bytes((0x20 | self._toggle, 0, 0, 0, 0, 0, 0, 0))
+        self._toggle ^= _TOGGLE
+        self.complete = bool(command & 1)
+        return answer
+
+
+class SegmentedUpload:
+    """The segments of one value."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._offset = 0
+        self._toggle = 0
+
+    @property
+    def complete(self) -> bool:
+        """The last segment was given."""
+        return bool(self._offset) and self._offset >= len(self._data)
+
+    def give(self, command: int) -> bytes:
+        """011t xxxx, 0 (7). Answer: 000t nnnc, data (7)."""
+        if command & _TOGGLE != self._toggle:
+            raise SdoAbort(Abort.TOGGLE)
+        segment = self._data[self._offset : self._offset + 7]
+        self._offset += 7
+        head = self._toggle | (7 - len(segment)) << 1 | self.complete
+        self._toggle ^= _TOGGLE
+        return bytes((head,)) + segment.ljust(7, b"\0")
+
+
+class BlockDownload(Download):
+    """Only segments in sequence are taken; the client repeats what follows the last accepted one. The end request comes after the last."""
+
+    def __init__(self, size: int | None, limit: int, with_crc: bool) -> None:
+        super().__init__(size, limit)
         self._with_crc = with_crc
         # number of the last segment in sequence and of the last one seen
         self._accepted = self._seen = 0
@@ -43,10 +105,10 @@ class BlockDownload:
         taken = number == self._accepted + 1
         if taken:
             self._accepted = number
-            self._incoming.data += data[1:]
+            self._data += data[1:]
             # how many bytes of the last segment count is not known before the end request
             if not last:
-                self._incoming.check_limit()
+                self._check_limit()
         if not last and number < BLOCK_SIZE:
             return None
         answer = bytes((0xA2, self._accepted, BLOCK_SIZE, 0, 0, 0, 0, 0))
@@ -56,9 +118,8 @@ class BlockDownload:
 
     def end(self, data: bytes) -> bytes:
         """110n nnx1 (n: bytes of the last segment that are none), CRC (2), 0 (5). Returns the whole data."""
-        received = self._incoming.data
-        del received[len(received) - (data[0] >> 2 & 7) :]
-        whole = self._incoming.whole()  # before the CRC, which over a wrong length is wrong anyway
+        del self._data[len(self._data) - (data[0] >> 2 & 7) :]
+        whole = self.whole()  # before the CRC, which over a wrong length is wrong anyway
         if self._with_crc and crc_hqx(whole, 0) != int.from_bytes(data[1:3], "little"):
             raise SdoAbort(Abort.CRC)
         return whole
