@@ -66,10 +66,8 @@ class Loop:
         self._notifier = notifier or Notifier({})
         self._statistics = statistics or Statistics(None)
         self._recorder = recorder
-        self._now = 0
-        self._due: int | None = None
-        """When something is to be done; None: not known since something was."""
-        self._node_changes = 0
+        self._now = self._node_changes = 0
+        self._due: int | None = None  # not known since something was done
         self._stopping = False
         self._poller = poller or Poller(clock)
         self._lost: set[EscPort] = set()
