@@ -180,7 +180,8 @@ static void ask_all(kcg_turns *t)
     if (!t->fds[t->bus_place].revents)
         t->before = t->asked; /* what the bus has brought came since */
     t->asked = now_ns();
-    if (poll(t->fds, t->count, 0) < 0)
+    t->happened = poll(t->fds, t->count, 0);
+    if (t->happened < 0)
         for (uint32_t i = 0; i < t->count; i++)
             t->fds[i].revents = POLLIN; /* not known: reading tells */
     for (uint32_t i = 0; i < t->count; i++)
@@ -207,6 +208,8 @@ static int wait_for_turn(kcg_turns *t)
     int64_t due = kcg_next_deadline(t->core), wake = t->asked + t->period, begun = now_ns(), limit = MS * 3600000;
     if (t->due < due)
         due = t->due;
+    if (t->outputs_due < due)
+        due = t->outputs_due;
     int64_t up = wake < due ? 0 : MS - 1; /* by which a wait is too long rather than too short: not where it is to ask all */
     if (wake < due)
         due = wake;
@@ -239,19 +242,21 @@ static int turn(kcg_turns *t)
         if (!serve(t))
             return 0;
     if (t->found < 0 && !t->advanced) {
-        if (!t->ready && t->now < kcg_next_deadline(t->core) && (!t->unsent || t->is_full))
+        if (!t->ready && t->now < kcg_next_deadline(t->core) && t->now < t->outputs_due && (!t->unsent || t->is_full))
             return !t->unsent || t->now - t->full_since < MAX_FULL; /* nothing has come, nothing is due */
         note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
         t->found = kcg_advance(t->core, t->now);
         t->advanced = 1;
     }
+    if (t->found < 0 && t->now >= t->outputs_due)
+        t->found = KCG_OUTPUTS;
     return t->found >= 0 || transmit(t);
 }
 
 void kcg_begin(kcg_turns *t)
 {
     t->found = -1;
-    t->unsent = t->spoken = t->taken = t->recorded = t->turns = 0;
+    t->unsent = t->spoken = t->taken = t->recorded = t->turns = t->is_over = 0;
     for (uint32_t i = 0; i < t->count; i++)
         if (t->fds[i].fd == t->bus) {
             t->bus_place = i, t->fds[i].revents = 0;
@@ -270,6 +275,7 @@ int kcg_turn(kcg_turns *t)
         t->turns++;
         if (!is_done || t->now >= t->leave || !has_room(t, KCG_RING / 2)) {
             t->late = 0;
+            t->is_over = is_done && !t->unsent;
             break;
         }
         if (t->now - t->asked >= (t->period - MS < ASK_ALL ? t->period - MS : ASK_ALL))

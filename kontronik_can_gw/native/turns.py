@@ -10,6 +10,8 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.output import NEVER
 
+OUTPUTS = 1 << 29
+"""Found: time is to pass for the outputs."""
 _OUT, _MADE, _READ, _RING, _MAX_FDS, _AT_ONCE = 512, 256, 1 << 12, 1 << 18, 1024, 64
 _ENTRY = struct.Struct("=qqIBBxx")
 _CLASSIC = struct.Struct("=IB3x8s")
@@ -18,7 +20,7 @@ _u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_i
 
 
 def _is_plain(frame: CanFrame) -> bool:
-    return frame.queued and not (frame.fd or frame.remote)
+    return not (frame.fd or frame.remote)
 
 
 class Input(c.Structure):
@@ -41,14 +43,15 @@ class _Turns(c.Structure):
     _fields_ = (
         *((name, c.c_void_p) for name in ("core", "inputs")),
         *((name, _i64) for name in ("now", "asked", "before", "late")),
-        *((name, _i64) for name in ("due", "leave", "period", "max_late", "max_turn")),
+        *((name, _i64) for name in ("due", "outputs_due")),
+        *((name, _i64) for name in ("leave", "period", "max_late", "max_turn")),
         *((name, _i64) for name in ("full_since", "since")),
-        *((name, _i32) for name in ("epoll", "bus", "found")),
+        *((name, _i32) for name in ("epoll", "bus", "found", "happened")),
         *(
             (name, _u32)
             for name in (
                 *("count", "ready", "unsent", "taken", "turns", "records", "recorded"),
-                *("bus_place", "is_full", "spoken", "at", "size", "advanced"),
+                *("bus_place", "is_full", "spoken", "is_over", "at", "size", "advanced"),
             )
         ),
         ("fds", _PollFd * _MAX_FDS),
@@ -79,6 +82,8 @@ class Turns:
         self.leave = partial(library.kcg_leave, address)
         """The rest of the turn is the loop's."""
         self._raw = memoryview(self.state).cast("B")
+        self._spoken: list[CanFrame] = []
+        """The last frames of ``speak``: at least those that are not sent."""
 
     def watch(self, descriptors: Sequence[tuple[int, int, int | None]]) -> bool:
         """(descriptor, what to wait for, ESC whose port it is) from now on. False: that cannot be."""
@@ -103,6 +108,8 @@ class Turns:
             return False
         if not state.unsent:  # nothing waits: when the bus was full before says nothing of these
             state.full_since = state.now
+            self._spoken = []
+        self._spoken += frames
         at = _Turns.frames.offset + state.unsent * _FRAME_SIZE
         for can_id, data, extended, *_ in frames:
             number = can_id | EXTENDED if extended else can_id
@@ -120,14 +127,14 @@ class Turns:
 
     def ready(self) -> list[tuple[int, int]]:
         """The descriptors that are ready, with what happened."""
-        fds, count = self.state.fds, self.state.count
+        fds, count = self.state.fds, self.state.count if self.state.happened else 0
         return [(fds[n].fd, fds[n].revents) for n in range(count) if fds[n].revents]
 
     def unsent(self) -> list[CanFrame]:
         """The frames that the bus did not take, in their order."""
         state = self.state
         frames = frames_in(self._raw, _Turns.frames.offset, state.unsent)
-        spoken = [frame._replace(queued=True) for frame in frames[: state.spoken]]
+        spoken = self._spoken[-state.spoken :] if state.spoken else []
         return spoken + frames[state.spoken :]
 
     def entries(self) -> Iterator[tuple[int, int, int, bytes, int | None]]:

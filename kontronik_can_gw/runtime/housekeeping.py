@@ -4,7 +4,6 @@ import logging
 import time
 from collections.abc import Sequence
 from copy import copy
-from functools import partial
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -17,7 +16,7 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.process import ProcessFacts, process_facts
-from kontronik_can_gw.runtime.snapshot import name_in_words, snapshot
+from kontronik_can_gw.runtime.snapshot import Moment, name_in_words
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.worker import Report
@@ -96,8 +95,7 @@ class Housekeeping:
         """Hand the statistics' thread what a document is made of, if it is time."""
         statistics = self._statistics
         if statistics.wanted(now):
-            make = partial(
-                snapshot,
+            moment = Moment(
                 gateway_facts(self._gateway),
                 now=now,
                 wall=time.time(),
@@ -109,7 +107,7 @@ class Housekeeping:
                 log_lines=list(self._conditions.recent),
                 recorder=None if self._recorder is None else copy(self._recorder.facts),
             )
-            statistics.publish(now, make)
+            statistics.publish(moment)
         self._log(statistics.reports(now), now)
 
     def _process_now(self, now: int) -> ProcessFacts:

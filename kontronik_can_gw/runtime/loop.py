@@ -66,8 +66,8 @@ class Loop:
         self._notifier = notifier or Notifier({})
         self._statistics = statistics or Statistics(None)
         self._recorder = recorder
-        self._now = self._due = 0
-        self._node_changes = 0
+        self._now = self._node_changes = 0
+        self._due: int | None = None  # not known since something was done
         self._stopping = False
         self._poller = poller or Poller(clock)
         self._lost: set[EscPort] = set()
@@ -141,34 +141,31 @@ class Loop:
         """Wait until something has come or is due, and do it."""
         period = self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
         ready = self._turn_in_c(period) if self._poller.is_native else None
-        is_idle = ready is None
         if ready is None:
+            if self._due is None:
+                self._due = self._next_deadline()
             ready = self._poller.wait(self._now, min(self._now + period, self._due))
+            is_over = self._poller.now < self._due
+        else:
+            is_over, self._due = self._poller.is_over, None
         now, late = self._poller.now, self._poller.late
         held_up = late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns()
-        is_idle = is_idle and not (held_up or ready or now >= self._due)
         if held_up:
             self._follow_hold_up(late, now)
-        if not is_idle:  # otherwise it is known that nothing has come until now
-            now = self._serve(ready, now)
+        if held_up or ready or not is_over or now >= self.can.controller.due:
+            now, self._due = self._serve(ready, now), None
         self._now = now
         if now >= self._housekeeping.due:
             self._housekeeping.run(now)
-            is_idle = False
-        if not is_idle:  # otherwise nothing has changed
-            self._due = self._next_deadline()
+            self._due = None
 
     def _turn_in_c(self, period: int) -> list[tuple[Handler, int]] | None:
         """Let turns be made in C, as long as these are plain; what is ready then. None where it is not the time for that."""
-        can, housekeeping = self.can, self._housekeeping
-        if can.port is None:
-            return None
-        due = min(can.due, housekeeping.wake_due, self.gateway.next_deadline(with_core=False))
-        due = min([due, *(esc.due for esc in self._lost)])
-        max_turn = can.transmitter.max_turn_ns()
+        max_turn = self.can.transmitter.max_turn_ns()
         max_late = max(MIN_HELD_UP_NS, max_turn)
-        leave = housekeeping.due  # what the controller says is asked for with it
-        return self._poller.turn(can, Bounds(self._now, due, leave, period, max_late, max_turn))
+        leave = self._housekeeping.due  # what the controller says is asked for with it
+        bounds = Bounds(self._now, self._own_deadline(), leave, period, max_late, max_turn)
+        return self._poller.turn(self.can, bounds)
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
         """Take what has come, do what is due, send what is made of it. Returns the time."""
@@ -222,13 +219,13 @@ class Loop:
         self._wake.take()
 
     def _next_deadline(self) -> int:
-        gateway = self.gateway
-        if gateway.frames_wait:  # of a change that sending itself brought about
+        if self.gateway.frames_wait:  # of a change that sending itself brought about
             return 0
-        due = gateway.next_deadline()
-        for esc in self._lost:
-            due = min(due, esc.due)
-        return min(self.can.due, self._housekeeping.wake_due, due)
+        return min(self._own_deadline(), self.gateway.next_deadline())
+
+    def _own_deadline(self) -> int:
+        """Of what is to be done apart from the gateway."""
+        return min([self.can.due, self._housekeeping.wake_due, *(esc.due for esc in self._lost)])
 
     def _others(self, esc: EscPort) -> tuple[Identity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.native.turns import OUTPUTS
 from kontronik_can_gw.runtime.poller import Bounds, Handler, Poller, PortInput
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ class NativePoller(Poller):
         state.asked, state.before, state.bus = self.now, self.before, bus
         state.now, due, state.leave, state.period, state.max_late, state.max_turn = bounds
         state.due = min(due, self._core.deadline_in_python())
+        state.outputs_due = gateway.next_deadline(with_core=False)
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
             recorded.prepare_turns(bounds.last)
@@ -93,6 +95,7 @@ class NativePoller(Poller):
         self.before, self.now, self.late = state.before, state.asked, state.late
         if recorded is not None:
             recorded.turned(turns.entries(), state.taken)
+        self.is_over = bool(state.is_over)
         if state.unsent:
             can.transmitter.put_refused(turns.unsent(), state.full_since)
         if state.found >= 0 and state.advanced:  # it ends at its own time, as in a replay
@@ -102,19 +105,22 @@ class NativePoller(Poller):
         return self.handlers(turns.ready())
 
     def _follow(self) -> bool:
-        """Follow the event that C has come back with; False where the rest of the turn is the loop's.
+        """Follow the event that C has come back with, or let time pass for the outputs; False where the rest of the turn is the loop's.
 
         As a rule nothing but frames comes of it, if anything, and C sends them first.
         """
         gateway, core, turns = self._gateway, self._core, self._turns
         state, outputs = turns.state, gateway.outputs
         before = [output.marks for output in outputs]
-        core.follow(state.found, state.now)
+        if is_due := state.found == OUTPUTS:
+            gateway.advance(state.now, with_core=False)
+        else:
+            core.follow(state.found, state.now)
         if core.link_changes or core.reports_live or before != [each.marks for each in outputs]:
             return False
-        due = gateway.next_deadline(with_core=False)
-        state.due = min(state.due, due, core.deadline_in_python())
-        if state.now >= state.due:
+        state.outputs_due = due = gateway.next_deadline(with_core=False)
+        state.due = min(state.due, core.deadline_in_python())
+        if state.now >= (min(state.due, due) if is_due else state.due):
             return False
         for output in outputs:
             if output.frames:

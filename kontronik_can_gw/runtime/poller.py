@@ -64,8 +64,8 @@ class StuckCheck:
 class Bounds(NamedTuple):
     """Of turns that are made in C, in ns.
 
-    ``last``: the last turn; ``due``: what the loop has to do apart from the core; ``leave``: when to come back in any case; ``period``: how
-    long a wait is at most; ``max_late``, ``max_turn``: how late a turn, and the sending of its frames, may be.
+    ``last``: the last turn; ``due``: what the loop has to do apart from the gateway; ``leave``: when to come back in any case; ``period``:
+    how long a wait is at most; ``max_late``, ``max_turn``: how late a turn, and the sending of its frames, may be.
     """
 
     last: int
@@ -81,7 +81,7 @@ class Poller:
 
     ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
     ``late``: by how much more than its pause the last turn and the wait took. ``changes`` grows with each change of what is watched.
-    ``is_native``: ``turn`` can do something.
+    ``is_native``: ``turn`` can do something. ``is_over``: it has left nothing to do, but for what is ready.
     """
 
     is_native = False
@@ -90,6 +90,7 @@ class Poller:
         self._clock = clock
         self.now = self.before = clock()
         self.late = 0
+        self.is_over = False
         self.changes = 0
         self._poll = select.poll()
         self._epoll = select.epoll()

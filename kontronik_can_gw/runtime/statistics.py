@@ -7,11 +7,9 @@ neither a disk nor the making holds the loop up.
 
 import contextlib
 import errno
-import json
 import os
 import stat
 import time
-from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.disk import reason_of, write_all
 from kontronik_can_gw.runtime.locks import Locks
-from kontronik_can_gw.runtime.snapshot import STALE_NS, Document, with_rates
+from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment, snapshot
 from kontronik_can_gw.runtime.worker import Faults, Report, Worker
 
 PERIOD_NS = SECOND
@@ -39,11 +37,9 @@ class Statistics:
         self.due: int | None = None
         """When the next document is wanted; None: never."""
         self._faults = Faults()
-        self._newest: Callable[[], Document] | None = None
-        """Makes the newest document."""
-        self._made: Callable[[], Document] | None = None
-        self._written: Document | None = None
-        """What made the last document, and that; of the worker's thread."""
+        self._newest: Moment | None = None
+        self._written: Moment | None = None
+        """What the last document was made of; of the worker's thread."""
         self._writing_since: int | None = None
         self._locks = Locks()
         self._worker: Worker[None] | None = None
@@ -68,11 +64,11 @@ class Statistics:
         """True once a second, where anybody wants a document."""
         return self.due is not None and now >= self.due
 
-    def publish(self, now: int, make: Callable[[], Document]) -> None:
-        """Let this be what makes the newest document, that of ``now``; never blocks. It is called in the thread."""
+    def publish(self, moment: Moment) -> None:
+        """Let this be what the newest document is made of; never blocks."""
         if self._worker is not None and not self._worker.is_ending:
-            self.due = now + PERIOD_NS
-            self._newest = make
+            self.due = moment.now + PERIOD_NS
+            self._newest = moment
             self._worker.put(None)  # without room it is awake already
 
     def reports(self, now: int) -> list[Report]:
@@ -93,15 +89,12 @@ class Statistics:
 
     def _work(self, _items: list[None]) -> None:
         """Write the newest document."""
-        make = self._newest
-        if make is None or make is self._made:
+        moment, before = self._newest, self._written
+        if moment is None or moment is before:
             return
-        self._made = make
+        self._written = moment
         if self._worker is not None and not self._worker.is_ending:
-            before, self._written = self._written, make()
-            text = json.dumps(
-                with_rates(self._written, before), ensure_ascii=False, separators=(",", ":")
-            )
+            text = snapshot(moment, before)
             self._writing_since = time.monotonic_ns()
             try:
                 self._write(f"{text}\n".encode("utf-8", "replace"))

@@ -18,7 +18,7 @@ from kontronik_can_gw.desk.monitor import status
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
 from kontronik_can_gw.runtime.process import ProcessFacts
-from kontronik_can_gw.runtime.snapshot import snapshot
+from kontronik_can_gw.runtime.snapshot import Moment, snapshot
 
 ON = {"enabled": True, "node_id": 42, "per_esc_nodes": True, "extended_hz": 7}
 TOML = """
@@ -233,7 +233,7 @@ def test_a_header_that_no_recorder_wrote_is_refused(change: object) -> None:
 
 
 def document(bench: Bench) -> dict[str, object]:
-    return snapshot(
+    moment = Moment(
         gateway_facts(bench.gateway),
         now=bench.now,
         wall=time.time(),
@@ -242,6 +242,8 @@ def document(bench: Bench) -> dict[str, object]:
         ports=[PortFacts(esc.settings.name, "/dev/x", True) for esc in bench.gateway.escs],
         can=CanFacts("socketcan", "can0", 1_000_000, True),
     )
+    made: dict[str, object] = json.loads(snapshot(moment))
+    return made
 
 
 def test_status_shows_the_nodes() -> None:

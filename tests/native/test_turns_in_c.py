@@ -31,6 +31,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
+from kontronik_can_gw.output import Output
 from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.native_poller import NativePoller
@@ -235,6 +236,61 @@ def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], 
         return method(*arguments)
 
     patch.setattr(of, name, noted)
+
+
+class Beacon(Output):
+    """A measurement of its own each 20 ms: the newest wins, unless it is ``queued``."""
+
+    events = Event.NONE
+
+    def __init__(self, queued: bool) -> None:
+        super().__init__()
+        self.due = 0
+        self.count = 0
+        self._queued = queued
+
+    def next_deadline(self) -> int:
+        return self.due
+
+    def advance(self, now: int) -> None:
+        if now >= self.due:
+            self.due = now + 20 * MS
+            self.count += 1
+            self.frames.append(CanFrame(0x700, struct.pack("<I", self.count), queued=self._queued))
+
+
+@pytest.mark.parametrize("queued", [True, False])
+def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
+    queued: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With telemetry and without; on a full bus what is queued waits, of what is not the newest alone."""
+    monkeypatch.setenv(load.PURE, "0")
+    world = wire_world.World()
+    escs = (EscSettings("esc1"),)
+    beacon = Beacon(queued)
+    loop = wire_world.loop_in(world, monkeypatch, escs, further=[lambda *_: beacon])
+    turns: list[int] = []
+    _count(monkeypatch, loop, "_serve", lambda: turns.append(world.now))
+    loop.open()
+    loop.begin()
+    wire, begun = world.wires[0], world.now
+    for n in range(300):
+        frame = encode(LiveData(consumed_charge=n), WireLayout.V4)
+        wire.put(frame, [begun + n * 10 * MS] * len(frame))
+    wire_world.run(loop, world, begun + 5 * SECOND)
+    sent = [(at, f) for at, f in world.bus.sent if f.can_id == 0x700]
+    assert [f.data for _, f in sent] == [struct.pack("<I", 1 + n) for n in range(len(sent))]
+    assert 200 < len(sent) == beacon.count <= 251
+    assert len(turns) < 5 * 4
+    world.bus.frame_ns = 300 * MS
+    while world.bus.send(CanFrame(0x100, b"")) is Sent.OK:
+        pass
+    wire_world.run(loop, world, begun + 5500 * MS)
+    waiting = [f for f in loop.can.transmitter.queue.in_order() if f.can_id == 0x700]
+    assert waiting[-1].data == struct.pack("<I", beacon.count)
+    assert (len(waiting) > 10) == queued
+    assert len(waiting) == 1 or queued
+    loop.close()
 
 
 def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_is_sent(

@@ -18,7 +18,7 @@ from kontronik_can_gw.runtime.facts import (
     gateway_facts,
 )
 from kontronik_can_gw.runtime.process import ProcessFacts
-from kontronik_can_gw.runtime.snapshot import snapshot
+from kontronik_can_gw.runtime.snapshot import Moment, snapshot
 from kontronik_can_gw.signals.plan import Layout
 
 START = 1000 * SECOND
@@ -74,7 +74,7 @@ class Bench:
     ) -> dict[str, Any]:
         """The document now, as a reader of the file gets it."""
         names = [esc.settings.name for esc in self.gateway.escs]
-        document = snapshot(
+        moment = Moment(
             gateway_facts(self.gateway),
             now=self.now if at is None else at,
             wall=1_700_000_000.5,
@@ -85,7 +85,7 @@ class Bench:
             store=store,
             log_lines=log_lines,
         )
-        read: dict[str, Any] = json.loads(json.dumps(document, allow_nan=False))
+        read: dict[str, Any] = json.loads(snapshot(moment))
         return read
 
 

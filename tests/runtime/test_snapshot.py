@@ -1,5 +1,6 @@
 """The document: every value true and fresh or null, every counter there, and figures that come from /proc."""
 
+import json
 import os
 from dataclasses import fields, replace
 from fractions import Fraction
@@ -17,14 +18,24 @@ from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
+from kontronik_can_gw.runtime.facts import (
+    CanFacts,
+    GatewayFacts,
+    PortFacts,
+    gateway_facts,
+    program_facts,
+)
 from kontronik_can_gw.runtime.process import ProcessFacts, process_facts, start_ticks
-from kontronik_can_gw.runtime.snapshot import LOG_LINES, snapshot
+from kontronik_can_gw.runtime.snapshot import LOG_LINES, Moment, snapshot
 
 
 def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> None:
     bench = Bench()
     bench.run(3)
+
+    def document_of(gateway: GatewayFacts) -> Any:
+        return json.loads(snapshot(Moment(gateway, **facts)))
+
     facts: dict[str, Any] = {
         "now": bench.now,
         "wall": 0.0,
@@ -34,14 +45,14 @@ def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> N
         "can": CanFacts("socketcan", "can0", 500_000, True),
     }
     moment = gateway_facts(bench.gateway)
-    document = snapshot(moment, **facts)
+    document = document_of(moment)
     bench.silent = {1}
     bench.run(2)
     bench.gateway.escs[0].line_errors += 1
     bench.gateway.status.sent_frames += 1
     bench.gateway.core.apply(0, EscSettings("another", 3))
-    assert snapshot(moment, **facts) == document
-    assert snapshot(gateway_facts(bench.gateway), **facts)["escs"] != document["escs"]
+    assert document_of(moment) == document
+    assert document_of(gateway_facts(bench.gateway))["escs"] != document["escs"]
     assert document["escs"][1]["fresh"]
 
 

@@ -8,20 +8,21 @@ import stat
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from wire_world import World, loop_in
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.runtime import statistics as statistics_module
+from kontronik_can_gw.runtime.facts import CanFacts, GatewayFacts, ProgramFacts
 from kontronik_can_gw.runtime.locks import Locks
+from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.recorder import RecorderFacts
-from kontronik_can_gw.runtime.snapshot import STALE_NS
+from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment, snapshot
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.worker import Report
 
@@ -29,15 +30,12 @@ PATIENCE = 60.0
 """Seconds that something may take on a busy machine before a test fails."""
 
 
-def numbered(number: int, size: int = 0) -> dict[str, Any]:
-    """A document as far as the thread looks into it."""
-    counters = {"sent_frames": number, "received_frames": 0}
-    return {
-        "monotonic_ns": number * SECOND,
-        "can": {"counters": counters},
-        "nodes": [],
-        "pad": [number] * size,
-    }
+def numbered(number: int) -> Moment:
+    """A moment of a gateway without an ESC."""
+    gateway = GatewayFacts([], GatewayStatus(sent_frames=number), [], {}, None, "Python", "")
+    can = CanFacts("socketcan", "can0", None, True)
+    now = number * SECOND
+    return Moment(gateway, now, 0.0, ProgramFacts("x"), ProcessFacts(), [], can)
 
 
 def until(condition: Callable[[], bool]) -> None:
@@ -56,7 +54,7 @@ def number_in(file: Path) -> int:
 
 
 def publish(statistics: Statistics, number: int) -> None:
-    statistics.publish(number * SECOND, partial(numbered, number))
+    statistics.publish(numbered(number))
 
 
 def put(statistics: Statistics, file: Path, number: int) -> None:
@@ -243,17 +241,17 @@ def test_a_document_has_the_recorder_as_it_was_when_it_was_published(
 ) -> None:
     """The recorder's thread goes on while the statistics' thread makes it."""
     loop = loop_in(World(), monkeypatch)
-    made: list[Callable[[], dict[str, Any]]] = []
+    made: list[Moment] = []
     facts = RecorderFacts("one.kcap", 1000)
     keeping = loop._housekeeping
     monkeypatch.setattr(keeping, "_recorder", SimpleNamespace(facts=facts))
     statistics = SimpleNamespace(
         wanted=lambda _now: True,
-        publish=lambda _now, make: made.append(make),
+        publish=made.append,
         reports=lambda _now: [],
     )
     monkeypatch.setattr(keeping, "_statistics", statistics)
     keeping.publish(7 * SECOND)
     before = dict(vars(facts))
     facts.file, facts.bytes, facts.problem = "", 2000, "the disk is full"
-    assert made[0]()["recording"] == before
+    assert json.loads(snapshot(made[0]))["recording"] == before

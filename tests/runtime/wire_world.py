@@ -24,7 +24,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway import Gateway, MakeOutput
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime import can_link
@@ -344,6 +344,7 @@ def loop_in(
     layout: Layout | None = None,
     canopen: CanopenSetup | None = None,
     notifier: Notifier | None = None,
+    further: Sequence[MakeOutput] = (),
 ) -> Loop:
     """A loop whose ports, bus, and time are the world's. Not open yet."""
 
@@ -358,7 +359,8 @@ def loop_in(
     patch.setattr(esc_input, "SerialPort", lambda path, _protocol: by_path[path])
     if in_c := os.environ.get(load.PURE, "1") != "1":
         patch.setattr(load, "library", lambda: (native_world.library(), ""))
-    gateway = Gateway(escs, layout or layout_of(escs), world.now, canopen=canopen)
+    layout = layout or layout_of(escs)
+    gateway = Gateway(escs, layout, world.now, canopen=canopen, further=further)
     config = CanConfig(interface="virtual", channel="world")
     paths = list(by_path)
     poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller
