@@ -546,18 +546,32 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
     return (uint64_t)v;
 }
 
+/* A field of live data as it is. */
+static inline uint64_t direct(const kcg_signal *s, const kcg_esc *e)
+{
+    if (!e->has_live)
+        return s->not_available;
+    int64_t x = wire(e->live + s->place, s->wire);
+    if (s->mask)
+        x = x >> s->shift & s->mask;
+    return x < s->low || x > s->high ? s->error : (uint64_t)x;
+}
+
 static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int alive, uint64_t *bits)
 {
     const kcg_plan *plan = g->plan;
     const kcg_signal *s = plan->signal + m->first_signal, *end = s + m->signals;
-    memcpy(bits, plan->constant + m->first_word + (size_t)place * WORDS_OF(m), WORDS_OF(m) * sizeof *bits);
+    const uint64_t *constant = plan->constant + m->first_word + (size_t)place * WORDS_OF(m);
+    for (uint32_t k = 0; k < WORDS_OF(m); k++)
+        bits[k] = constant[k];
     for (; s < end; s++) {
         if (s->page != KCG_PAGES && s->page != place)
             continue;
-        uint64_t raw = raw_of(g, s, now, alive);
-        const kcg_piece *p = plan->piece + s->first_piece;
-        for (int i = 0; i < s->pieces; i++, p++)
+        uint64_t raw = s->flags & KCG_DIRECT ? direct(s, &g->esc[s->esc]) : raw_of(g, s, now, alive);
+        const kcg_piece *p = plan->piece + s->first_piece, *last = p + s->pieces;
+        do
             bits[WORDS == 1 ? 0 : p->at / 64] |= (raw >> p->shift & (~UINT64_C(0) >> (64 - p->width))) << p->at % 64;
+        while (++p < last);
     }
 }
 
@@ -640,18 +654,21 @@ static void turn_page(kcg *g, uint32_t i)
     s->page = (uint8_t)page_after(&g->plan->message[i], s->page);
 }
 
-/* The first page that is to follow, from the one on whose turn it is next. */
-static int next_place(kcg *g, uint32_t i)
+/* Of several pages the first that is to follow, from the one on whose turn it is next. */
+static int next_of_pages(kcg *g, uint32_t i)
 {
     const kcg_message *m = &g->plan->message[i];
-    if (PAGES_OF(m) <= 1)
-        return 0;
     if (!g->sending[i].pages_to_send)
         turn_page(g, i);
     int place = g->sending[i].page;
     while (!(g->page[m->first_page + place] & TO_SEND))
         place = page_after(m, place);
     return place;
+}
+
+static inline int next_place(kcg *g, uint32_t i)
+{
+    return PAGES_OF(&g->plan->message[i]) > 1 ? next_of_pages(g, i) : 0;
 }
 
 static void mark(kcg *g, uint32_t i, int64_t since, int why)
@@ -666,14 +683,12 @@ static void mark(kcg *g, uint32_t i, int64_t since, int why)
     s->why = (uint8_t)(s->why | why);
 }
 
-/* False for a message that is sent on change and has not changed; of several pages those that have follow. */
-static int is_news(kcg *g, uint32_t i, int64_t now)
+/* Of a message that is sent on change: whether it has changed; of several pages those that have follow. */
+static int has_changed(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
     uint64_t bits[WORDS];
     int changed = 0;
-    if (m->flags & KCG_EVENT || !(m->flags & KCG_ON_CHANGE))
-        return 1;
     for (int place = 0; place < PAGES_OF(m); place++) {
         pack(g, m, place, now, 0, bits);
         if (!(g->page[m->first_page + place] & KNOWN) ||
@@ -684,6 +699,11 @@ static int is_news(kcg *g, uint32_t i, int64_t now)
         }
     }
     return changed || g->sending[i].pages_to_send;
+}
+
+static inline int is_news(kcg *g, uint32_t i, int64_t now)
+{
+    return (g->plan->message[i].flags & (KCG_EVENT | KCG_ON_CHANGE)) != KCG_ON_CHANGE || has_changed(g, i, now);
 }
 
 /* Let a message be handed over as soon as its minimum distance allows. */

@@ -39,7 +39,7 @@ from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 ) = range(13)  # fmt: skip
 WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
-ROLLS, CODE_AMID, PLAIN, TABLE, REAL = 1, 2, 4, 8, 16
+ROLLS, CODE_AMID, PLAIN, TABLE, REAL, DIRECT = 1, 2, 4, 8, 16, 32
 EVENT, ON_CHANGE, SILENT, HAS_CRC, OF_THE_GATEWAY, FREE = 1, 2, 4, 8, 16, 32
 ALL_PAGES = 64
 ALL_ESCS = 255
@@ -220,6 +220,8 @@ class Tables:
             mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
             row.mul, row.add, row.div = _reduced(mul, add, 2 * common)
             row.most = _most(row, signal, value)
+        if flags == PLAIN and row.kind == OF_LIVE and not row.not_on:
+            flags |= DIRECT
         row.flags = flags
 
 
