@@ -409,6 +409,21 @@ static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
     return (e->has_info || x) && !(e->had_info && not_on >> (e->info[1] >> 2) & 1);
 }
 
+/* A field of live data or info, or a part of it. */
+static inline int64_t field(const kcg_signal *s, const uint8_t *body)
+{
+    int64_t x = wire(body + s->place, s->wire);
+    return s->mask ? x >> s->shift & s->mask : x;
+}
+
+/* Of live data, whatever sends it; 0 where it is not available. */
+static inline int direct(const kcg *g, const kcg_signal *s, int64_t *x)
+{
+    const kcg_esc *e = &g->esc[s->esc];
+    *x = field(s, e->live);
+    return e->has_live;
+}
+
 /* The steps of a value before its divisor; 0 where it is not available. */
 static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
 {
@@ -416,13 +431,13 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
     case KCG_OF_LIVE:
         if (!e->has_live)
             return 0;
-        *x = wire(e->live + s->place, s->wire);
+        *x = field(s, e->live);
         break;
     case KCG_OF_INFO:
     case KCG_OF_LAST:
         if (!(s->kind == KCG_OF_LAST ? e->had_info : e->has_info))
             return 0;
-        *x = wire(e->info + s->place, s->wire);
+        *x = field(s, e->info);
         break;
     case KCG_OF_POWER:
         *x = e->power;
@@ -440,8 +455,6 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
     case KCG_OF_STATUS: *x = e->link | (g->gateway[KCG_GATEWAY_STATE] == s->place) << 6 | e->has_info << 7; return 1;
     default: *x = floor_div(now - g->gateway[KCG_STARTED], 1000000); return 1; /* a row may be of just before */
     }
-    if (s->mask)
-        *x = *x >> s->shift & s->mask;
     return !s->not_on || supplied(e, s->not_on, *x);
 }
 
@@ -462,7 +475,10 @@ static inline int value_of(const kcg *g, const kcg_signal *s, int64_t now, int64
 
 int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
 {
-    return value_of(g, s, now, x, by, over);
+    if (!(s->flags & KCG_DIRECT))
+        return value_of(g, s, now, x, by, over);
+    *by = *over = 1;
+    return direct(g, s, x);
 }
 
 #if KCG_FLOATS
@@ -546,17 +562,6 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
     return (uint64_t)v;
 }
 
-/* A field of live data as it is. */
-static inline uint64_t direct(const kcg_signal *s, const kcg_esc *e)
-{
-    if (!e->has_live)
-        return s->not_available;
-    int64_t x = wire(e->live + s->place, s->wire);
-    if (s->mask)
-        x = x >> s->shift & s->mask;
-    return x < s->low || x > s->high ? s->error : (uint64_t)x;
-}
-
 static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int alive, uint64_t *bits)
 {
     const kcg_plan *plan = g->plan;
@@ -567,7 +572,14 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
     for (; s < end; s++) {
         if (s->page != KCG_PAGES && s->page != place)
             continue;
-        uint64_t raw = s->flags & KCG_DIRECT ? direct(s, &g->esc[s->esc]) : raw_of(g, s, now, alive);
+        int64_t x;
+        uint64_t raw;
+        if (s->flags != (KCG_DIRECT | KCG_PLAIN))
+            raw = raw_of(g, s, now, alive);
+        else if (direct(g, s, &x))
+            raw = x < s->low || x > s->high ? s->error : (uint64_t)x;
+        else
+            raw = s->not_available;
         const kcg_piece *p = plan->piece + s->first_piece, *last = p + s->pieces;
         do
             bits[WORDS == 1 ? 0 : p->at / 64] |= (raw >> p->shift & (~UINT64_C(0) >> (64 - p->width))) << p->at % 64;

@@ -196,7 +196,7 @@ class Tables:
         self.signal_names.append(f"{plan.name}.{signal.name}")
 
     def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
-        flags = 0
+        flags = row.flags
         if signal.numbers is not None:
             row.first_pair, row.pairs = len(self.pairs), len(signal.numbers)
             self.pairs += [Pair(int(number), raw & _M64) for number, raw in signal.numbers.items()]
@@ -220,8 +220,6 @@ class Tables:
             mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
             row.mul, row.add, row.div = _reduced(mul, add, 2 * common)
             row.most = _most(row, signal, value)
-        if flags == PLAIN and row.kind == OF_LIVE and not row.not_on:
-            flags |= DIRECT
         row.flags = flags
 
 
@@ -250,6 +248,8 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         row.not_on = sum(1 << device for device in value.not_on)
         if value.mask != -1:
             row.shift, row.mask = value.shift, value.mask
+        if row.kind == OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
+            row.flags = DIRECT
     elif value.kind is Kind.PRODUCT:
         row.kind = OF_POWER
     elif value.name == "uptime":
