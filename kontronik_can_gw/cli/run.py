@@ -182,12 +182,15 @@ def _parameter_store(folder: Path) -> "ParameterStore":
 
 
 def settle_memory() -> None:
-    """Freeze all present objects, so that garbage collections never scan them again.
+    """Give back what the start needed, and freeze all present objects, so that garbage collections never scan them again.
 
     The hot path makes no reference cycles (tests/runtime/test_garbage.py), so later collections only scan the young generation; a full
     collection runs only here, at the start.
     """
+    from kontronik_can_gw.native.load import give_back
+
     gc.collect()
+    give_back()
     gc.freeze()
     young, middle, _ = gc.get_threshold()
     gc.set_threshold(young, middle, _NEVER)

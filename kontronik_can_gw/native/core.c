@@ -409,6 +409,21 @@ static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
     return (e->has_info || x) && !(e->had_info && not_on >> (e->info[1] >> 2) & 1);
 }
 
+/* A field of live data or info, or a part of it. */
+static inline int64_t field(const kcg_signal *s, const uint8_t *body)
+{
+    int64_t x = wire(body + s->place, s->wire);
+    return s->mask ? x >> s->shift & s->mask : x;
+}
+
+/* Of live data, whatever sends it; 0 where it is not available. */
+static inline int direct(const kcg *g, const kcg_signal *s, int64_t *x)
+{
+    const kcg_esc *e = &g->esc[s->esc];
+    *x = field(s, e->live);
+    return e->has_live;
+}
+
 /* The steps of a value before its divisor; 0 where it is not available. */
 static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
 {
@@ -416,13 +431,13 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
     case KCG_OF_LIVE:
         if (!e->has_live)
             return 0;
-        *x = wire(e->live + s->place, s->wire);
+        *x = field(s, e->live);
         break;
     case KCG_OF_INFO:
     case KCG_OF_LAST:
         if (!(s->kind == KCG_OF_LAST ? e->had_info : e->has_info))
             return 0;
-        *x = wire(e->info + s->place, s->wire);
+        *x = field(s, e->info);
         break;
     case KCG_OF_POWER:
         *x = e->power;
@@ -440,8 +455,6 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
     case KCG_OF_STATUS: *x = e->link | (g->gateway[KCG_GATEWAY_STATE] == s->place) << 6 | e->has_info << 7; return 1;
     default: *x = floor_div(now - g->gateway[KCG_STARTED], 1000000); return 1; /* a row may be of just before */
     }
-    if (s->mask)
-        *x = *x >> s->shift & s->mask;
     return !s->not_on || supplied(e, s->not_on, *x);
 }
 
@@ -462,7 +475,10 @@ static inline int value_of(const kcg *g, const kcg_signal *s, int64_t now, int64
 
 int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
 {
-    return value_of(g, s, now, x, by, over);
+    if (!(s->flags & KCG_DIRECT))
+        return value_of(g, s, now, x, by, over);
+    *by = *over = 1;
+    return direct(g, s, x);
 }
 
 #if KCG_FLOATS
@@ -550,14 +566,24 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
 {
     const kcg_plan *plan = g->plan;
     const kcg_signal *s = plan->signal + m->first_signal, *end = s + m->signals;
-    memcpy(bits, plan->constant + m->first_word + (size_t)place * WORDS_OF(m), WORDS_OF(m) * sizeof *bits);
+    const uint64_t *constant = plan->constant + m->first_word + (size_t)place * WORDS_OF(m);
+    for (uint32_t k = 0; k < WORDS_OF(m); k++)
+        bits[k] = constant[k];
     for (; s < end; s++) {
         if (s->page != KCG_PAGES && s->page != place)
             continue;
-        uint64_t raw = raw_of(g, s, now, alive);
-        const kcg_piece *p = plan->piece + s->first_piece;
-        for (int i = 0; i < s->pieces; i++, p++)
+        int64_t x;
+        uint64_t raw;
+        if (s->flags != (KCG_DIRECT | KCG_PLAIN))
+            raw = raw_of(g, s, now, alive);
+        else if (direct(g, s, &x))
+            raw = x < s->low || x > s->high ? s->error : (uint64_t)x;
+        else
+            raw = s->not_available;
+        const kcg_piece *p = plan->piece + s->first_piece, *last = p + s->pieces;
+        do
             bits[WORDS == 1 ? 0 : p->at / 64] |= (raw >> p->shift & (~UINT64_C(0) >> (64 - p->width))) << p->at % 64;
+        while (++p < last);
     }
 }
 
@@ -640,18 +666,21 @@ static void turn_page(kcg *g, uint32_t i)
     s->page = (uint8_t)page_after(&g->plan->message[i], s->page);
 }
 
-/* The first page that is to follow, from the one on whose turn it is next. */
-static int next_place(kcg *g, uint32_t i)
+/* Of several pages the first that is to follow, from the one on whose turn it is next. */
+static int next_of_pages(kcg *g, uint32_t i)
 {
     const kcg_message *m = &g->plan->message[i];
-    if (PAGES_OF(m) <= 1)
-        return 0;
     if (!g->sending[i].pages_to_send)
         turn_page(g, i);
     int place = g->sending[i].page;
     while (!(g->page[m->first_page + place] & TO_SEND))
         place = page_after(m, place);
     return place;
+}
+
+static inline int next_place(kcg *g, uint32_t i)
+{
+    return PAGES_OF(&g->plan->message[i]) > 1 ? next_of_pages(g, i) : 0;
 }
 
 static void mark(kcg *g, uint32_t i, int64_t since, int why)
@@ -666,14 +695,12 @@ static void mark(kcg *g, uint32_t i, int64_t since, int why)
     s->why = (uint8_t)(s->why | why);
 }
 
-/* False for a message that is sent on change and has not changed; of several pages those that have follow. */
-static int is_news(kcg *g, uint32_t i, int64_t now)
+/* Of a message that is sent on change: whether it has changed; of several pages those that have follow. */
+static int has_changed(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
     uint64_t bits[WORDS];
     int changed = 0;
-    if (m->flags & KCG_EVENT || !(m->flags & KCG_ON_CHANGE))
-        return 1;
     for (int place = 0; place < PAGES_OF(m); place++) {
         pack(g, m, place, now, 0, bits);
         if (!(g->page[m->first_page + place] & KNOWN) ||
@@ -684,6 +711,11 @@ static int is_news(kcg *g, uint32_t i, int64_t now)
         }
     }
     return changed || g->sending[i].pages_to_send;
+}
+
+static inline int is_news(kcg *g, uint32_t i, int64_t now)
+{
+    return (g->plan->message[i].flags & (KCG_EVENT | KCG_ON_CHANGE)) != KCG_ON_CHANGE || has_changed(g, i, now);
 }
 
 /* Let a message be handed over as soon as its minimum distance allows. */

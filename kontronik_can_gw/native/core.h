@@ -78,7 +78,7 @@ enum {
     KCG_N_NOISE, KCG_N_BAD_CRC, KCG_N_UNKNOWN_KIND, KCG_N_INCOMPLETE, KCG_N_LONG_RUN, KCG_N_LOSSES, KCG_N_LATE, KCG_N_SUSPECT, KCG_COUNTS,
     KCG_N_LINK = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE, KCG_N_INFO, KCG_N_DROPPED /* states, sums */
 };
-enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16 };                             /* of a signal */
+enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16, KCG_DIRECT = 32 }; /* of a signal; DIRECT: of live data, with no divisor, from every device */
 enum { KCG_EVENT = 1, KCG_ON_CHANGE = 2, KCG_SILENT = 4, KCG_HAS_CRC = 8, KCG_OF_THE_GATEWAY = 16, KCG_FREE = 32 }; /* of a message */
 
 typedef struct { uint8_t shift, width; uint16_t at; } kcg_piece; /* (raw >> shift & mask of width) << at; within 64 bits of the frame */

@@ -60,6 +60,17 @@ def make_core(
     return Made(PythonCore(escs, layout, now, silent), why)
 
 
+def give_back() -> None:
+    """Give the system the memory that the C library holds free. Nothing without the core in C, or where the library cannot (musl)."""
+    if library()[0] is None:
+        return
+    import ctypes
+
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
 def in_words(language: str, why: str | None) -> str:
     """One line for people, as ``core: Python (KONTRONIK_PURE is set)``."""
     return f"core: {language} ({why})" if why else f"core: {language}"

@@ -288,22 +288,20 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
 
 /* --- text (twins: can_logs/writer.py, tables/text.py) ---------------------------------------------------------------- */
 
-static const char hex[] = "0123456789ABCDEF";
+typedef struct { char of[256][2]; } kcg_pairs; /* the two hex digits of each byte */
 
-/* Four bytes at once, each nibble in a byte of its own; up to six characters more are written. */
-static char *hex_text(char *p, const uint8_t *data, int count)
+static void make_pairs(kcg_pairs *pairs)
 {
-    for (int at = 0; at < count; at += 4) {
-        uint64_t x = u32(data + at);
-        x = (x | x << 16) & UINT64_C(0x0000FFFF0000FFFF);
-        x = (x | x << 8) & UINT64_C(0x00FF00FF00FF00FF);
-        x = (x >> 4 & UINT64_C(0x000F000F000F000F)) | (x & UINT64_C(0x000F000F000F000F)) << 8;
-        x += UINT64_C(0x3030303030303030) + ((x + UINT64_C(0x0606060606060606)) >> 4 & UINT64_C(0x0101010101010101)) * 7;
-        char *q = p + 2 * at;
-        q[0] = (char)x, q[1] = (char)(x >> 8), q[2] = (char)(x >> 16), q[3] = (char)(x >> 24);
-        q[4] = (char)(x >> 32), q[5] = (char)(x >> 40), q[6] = (char)(x >> 48), q[7] = (char)(x >> 56);
+    for (int k = 0; k < 256; k++) {
+        pairs->of[k][0] = "0123456789ABCDEF"[k >> 4];
+        pairs->of[k][1] = "0123456789ABCDEF"[k & 15];
     }
-    return p + 2 * count;
+}
+
+static inline char *hex_byte(char *p, const kcg_pairs *pairs, uint32_t byte)
+{
+    memcpy(p, pairs->of[byte & 255], 2);
+    return p + 2;
 }
 
 static char *digits(char *p, uint64_t n, int count)
@@ -333,6 +331,8 @@ size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int6
     char *p = out, *head = out;
     size_t head_size = 0, second_size = 0;
     uint64_t second = 0;
+    kcg_pairs pairs;
+    make_pairs(&pairs);
     for (uint32_t k = 0; k < count; k++, f++) {
         if (k && time[k] == time[k - 1]) {
             for (size_t at = 0; at < head_size; at += 16) /* in pieces of which the compiler knows the size; a line is longer */
@@ -354,12 +354,18 @@ size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int6
             *p++ = ' ';
             head_size = (size_t)(p - head);
         }
-        for (int at = f->id >> 31 ? 28 : 8; at >= 0; at -= 4)
-            *p++ = hex[(f->id & 0x7FFFFFFF) >> at & 15];
+        if (f->id >> 31) {
+            for (int at = 24; at >= 8; at -= 8)
+                p = hex_byte(p, &pairs, (f->id & 0x7FFFFFFF) >> at);
+        } else {
+            *p++ = (char)('0' + (f->id >> 8)); /* of 11 bits */
+        }
+        p = hex_byte(p, &pairs, f->id);
         *p++ = '#';
         if (f->flags)
             *p++ = '#', *p++ = '1'; /* CAN FD with a switched bit rate */
-        p = hex_text(p, f->data, f->length);
+        for (int at = 0; at < f->length; at++)
+            p = hex_byte(p, &pairs, f->data[at]);
         *p++ = ' ', *p++ = 'T', *p++ = '\n';
     }
     return (size_t)(p - out);

@@ -162,10 +162,10 @@ class Player(Output):
         self._state.finder = self._finder.core
         self._state.period = period_ns
 
-    def play_bytes(self, data: bytes, ended: bool) -> bool:
-        """The stream from ``position`` on; what is left of it is to be given again. True where there was no room for all of it."""
+    def play_bytes(self, data: bytes, begin: int, ended: bool) -> bool:
+        """The stream from ``begin`` on, which is not after ``position``. True where there was no room for all of it."""
         state = self._state
-        state.base = state.fed
+        state.base = begin
         why = self._library.kcg_play_bytes(c.byref(state), data, len(data), ended)
         state.sure = state.count
         return bool(why == _FULL)

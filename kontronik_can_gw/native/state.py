@@ -1,10 +1,11 @@
 """What others read of the core in C: the state of an ESC and of the gateway, straight from its memory."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, Self
 
-from kontronik_can_gw.esc.decoder import SECOND_NS, Counters, Data
+from kontronik_can_gw.esc.decoder import SECOND_NS, Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState
@@ -14,6 +15,13 @@ _STREAM = COUNTS.index("long_run_bytes") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""
 _PLACES = (("has_live", "live"), ("has_info", "info"), ("had_live", "live"), ("had_info", "info"))
 """Of live data, info, and the newest ever of both: whether there is any, and its bytes."""
+
+
+@cache
+def _forms(protocol: EscProtocol) -> Sequence[tuple[struct.Struct, Any]]:
+    """Of live data and info, for all ESCs of a protocol."""
+    assert protocol.wire is not None
+    return [(struct.Struct("<" + codes), kind) for codes, kind in protocol.wire]
 
 
 class NativeDrawn:
@@ -52,8 +60,7 @@ class NativeEsc(EscTelemetry):
     def __init__(self, settings: EscSettings, state: Any) -> None:
         self._state = state
         self.protocol = protocol_named(settings.protocol)
-        assert self.protocol.wire is not None
-        self._forms = [(struct.Struct("<" + codes), kind) for codes, kind in self.protocol.wire]
+        self._forms = _forms(self.protocol)
         self._generation = -1
         self._readings: dict[int, Data | None] = {}
         self._counters_of = type(self.protocol.make().counters)

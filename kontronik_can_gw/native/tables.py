@@ -39,7 +39,7 @@ from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 ) = range(13)  # fmt: skip
 WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
-ROLLS, CODE_AMID, PLAIN, TABLE, REAL = 1, 2, 4, 8, 16
+ROLLS, CODE_AMID, PLAIN, TABLE, REAL, DIRECT = 1, 2, 4, 8, 16, 32
 EVENT, ON_CHANGE, SILENT, HAS_CRC, OF_THE_GATEWAY, FREE = 1, 2, 4, 8, 16, 32
 ALL_PAGES = 64
 ALL_ESCS = 255
@@ -196,7 +196,7 @@ class Tables:
         self.signal_names.append(f"{plan.name}.{signal.name}")
 
     def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
-        flags = 0
+        flags = row.flags
         if signal.numbers is not None:
             row.first_pair, row.pairs = len(self.pairs), len(signal.numbers)
             self.pairs += [Pair(int(number), raw & _M64) for number, raw in signal.numbers.items()]
@@ -248,6 +248,8 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         row.not_on = sum(1 << device for device in value.not_on)
         if value.mask != -1:
             row.shift, row.mask = value.shift, value.mask
+        if row.kind == OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
+            row.flags = DIRECT
     elif value.kind is Kind.PRODUCT:
         row.kind = OF_POWER
     elif value.name == "uptime":

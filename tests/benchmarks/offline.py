@@ -76,9 +76,11 @@ def convert(
 ) -> Run:
     """One conversion in a process of its own, into ``converted``. ``python``: without the core in C."""
     command = [sys.executable, __file__, form, source, converted(context, form), *options]
-    core = os.environ | {"KONTRONIK_PURE": "1" if python else "0"}
+    # what is compiled at the first run is there from then on
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    environment["KONTRONIK_PURE"] = "1" if python else "0"
     done = subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, timeout=3600, env=core
+        list(map(str, command)), capture_output=True, text=True, timeout=3600, env=environment
     )
     if done.returncode:
         raise RuntimeError(f"{form}: {(done.stderr.strip().splitlines() or ['no word'])[-1]}")

@@ -119,15 +119,13 @@ class DumpInput(Input):
         self.damage = []
         _start(gateway)
         player.set_bytes(self._period_ns)
-        rest = b""
+        rest, begin = b"", 0
         for data in chain(self.esc_bytes(0), (None,)):
-            rest += data or b""
-            is_full = True
-            while is_full:
-                begin = player.position
-                is_full = player.play_bytes(rest, ended=data is None)
-                rest = rest[player.position - begin :]
+            rest = rest[player.position - begin :] + (data or b"")
+            begin = player.position
+            while player.play_bytes(rest, begin, ended=data is None):
                 yield
+            yield
         self._describe_damage(player.counters)
 
     def chunks(self) -> Iterator[tuple[int, bytes]]:

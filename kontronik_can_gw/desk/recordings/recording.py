@@ -16,7 +16,7 @@ from kontronik_can_gw.signals.unpacker import SignalReader
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames
 
-CHUNK = 1 << 18
+CHUNK = 1 << 16
 
 
 class Input(ABC):
