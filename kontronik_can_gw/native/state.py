@@ -72,12 +72,7 @@ class NativeEsc(EscTelemetry):
     def frozen(self) -> Self:
         twin = object.__new__(type(self))
         state = type(self._state).from_buffer_copy(self._state)
-        own = {
-            "_state": state,
-            "drawn": NativeDrawn(state),
-            "_readings": {},
-        }  # read in another thread
-        twin.__dict__ |= self.__dict__ | own
+        vars(twin).update(vars(self), _state=state, drawn=NativeDrawn(state), _readings={})
         return twin
 
     @property

@@ -19,10 +19,6 @@ _FRAME_SIZE = c.sizeof(Frame)
 _u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_int64
 
 
-def _is_plain(frame: CanFrame) -> bool:
-    return not (frame.fd or frame.remote)
-
-
 class Input(c.Structure):
     """kcg_input: as poller.PortInput."""
 
@@ -64,6 +60,9 @@ class _Turns(c.Structure):
     )
 
 
+_FRAMES, _ENTRIES = _Turns.frames.offset, _Turns.ring.offset
+
+
 class Turns:
     """Turns of a loop whose core is in C. ``state``: kcg_turns, of which the owner sets times, socket and limits before ``run``."""
 
@@ -102,19 +101,21 @@ class Turns:
 
     def speak(self, frames: Sequence[CanFrame]) -> bool:
         """Let what outputs have made of an event be sent before the core's frames. False where that is the loop's."""
-        state = self.state
-        count = state.unsent + len(frames)
-        if state.unsent != state.spoken or count > _MADE or not all(map(_is_plain, frames)):
+        state, raw = self.state, self._raw
+        waiting = state.unsent
+        count = waiting + len(frames)
+        if waiting != state.spoken or count > _MADE:
             return False
-        if not state.unsent:  # nothing waits: when the bus was full before says nothing of these
+        at = _FRAMES + waiting * _FRAME_SIZE
+        for can_id, data, extended, fd, _, remote, _ in frames:
+            if fd or remote:
+                return False
+            _CLASSIC.pack_into(raw, at, can_id | EXTENDED if extended else can_id, len(data), data)
+            at += _FRAME_SIZE
+        if not waiting:  # when the bus was full before says nothing of these
             state.full_since = state.now
             self._spoken = []
         self._spoken += frames
-        at = _Turns.frames.offset + state.unsent * _FRAME_SIZE
-        for can_id, data, extended, *_ in frames:
-            number = can_id | EXTENDED if extended else can_id
-            _CLASSIC.pack_into(self._raw, at, number, len(data), data)
-            at += _FRAME_SIZE
         state.unsent = state.spoken = count
         state.taken += len(frames)
         return True
@@ -133,13 +134,13 @@ class Turns:
     def unsent(self) -> list[CanFrame]:
         """The frames that the bus did not take, in their order."""
         state = self.state
-        frames = frames_in(self._raw, _Turns.frames.offset, state.unsent)
+        frames = frames_in(self._raw, _FRAMES, state.unsent)
         spoken = self._spoken[-state.spoken :] if state.spoken else []
         return spoken + frames[state.spoken :]
 
     def entries(self) -> Iterator[tuple[int, int, int, bytes, int | None]]:
         """What was recorded: (time, kind, ESC, data, since when it can have come), in its order."""
-        at, raw = _Turns.ring.offset, self._raw
+        at, raw = _ENTRIES, self._raw
         end = at + self.state.recorded
         while at < end:
             now, came, size, kind, esc = _ENTRY.unpack_from(raw, at)

@@ -152,8 +152,11 @@ class Loop:
         held_up = late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns()
         if held_up:
             self._follow_hold_up(late, now)
-        if held_up or ready or not is_over or now >= self.can.controller.due:
+        if held_up or ready or not is_over:
             now, self._due = self._serve(ready, now), None
+        elif now >= self.can.controller.due:
+            self.can.ask(now)
+            self._due = None
         self._now = now
         if now >= self._housekeeping.due:
             self._housekeeping.run(now)
