@@ -93,6 +93,12 @@ class DronecanSetup:
                 "dronecan: this machine has no id, so unique ids come from the names alone: "
                 "give each gateway on a bus its own dronecan.name"
             )
+        plain = [esc.name for esc in self.escs if esc.pole_pairs == 1]
+        if plain and self.given.table.rpm != "electrical":
+            found.append(
+                f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: set pole_pairs in [[esc]], "
+                'or dronecan.rpm = "electrical" if it is one'
+            )
         return found
 
     def summary(self) -> list[str]:

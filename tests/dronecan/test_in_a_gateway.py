@@ -33,9 +33,11 @@ enabled = true
 [[esc]]
 port = "/dev/ttyUSB0"
 name = "left"
+pole_pairs = 7
 [[esc]]
 port = "/dev/ttyUSB1"
 name = "right"
+pole_pairs = 7
 """
 EXTENDED_DBC = """VERSION ""
 BU_: Gw
@@ -139,15 +141,23 @@ def test_without_an_id_of_the_machine_the_names_have_to_differ(
     assert len({node.unique_id for node in nodes}) == 2
 
 
-def test_nothing_of_it_is_loaded_when_it_is_off() -> None:
+def test_speeds_as_with_one_pole_pair_are_warned_of(tmp_path: Path) -> None:
+    more = "node_id = 42\n[[esc]]\nport = 'c'\nname = 'plain'"
+    warned = "dronecan: rpm of plain is sent as with one pole pair: set pole_pairs in [[esc]]"
+    assert warned in checked(tmp_path, more)[2]
+    assert "pole pair" not in checked(tmp_path, f"rpm = 'electrical'\n{more}")[2]
+
+
+@pytest.mark.parametrize("is_on", [False, True])
+def test_nothing_of_it_is_loaded_when_it_is_off_and_openssl_never(is_on: bool) -> None:
     code = (
         "import sys\nfrom kontronik_can_gw.config.assemble import assemble\nfrom kontronik_can_gw.config.parse import parse\n"
         "import kontronik_can_gw.cli.run, kontronik_can_gw.gateway, kontronik_can_gw.runtime.loop, kontronik_can_gw.capture.setup\n"
-        "assemble(parse({'can': {'interface': 'virtual'}, 'esc': [{'port': '/dev/ttyUSB0'}]}, 'a.toml'))\n"
-        "print([m for m in sys.modules if 'dronecan' in m or m == 'hashlib'])"
+        f"assemble(parse({{'can': {{'interface': 'virtual'}}, 'dronecan': {{'enabled': {is_on}}}, 'esc': [{{'port': 'p'}}]}}, 'a.toml'))\n"
+        "print('hashlib' in sys.modules, any('dronecan' in m for m in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.split() == ["False", str(is_on)]
 
 
 @pytest.mark.parametrize("canopen", [False, True])
