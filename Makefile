@@ -1,7 +1,7 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-all release soak hour bench golden docs wheels deb lint clean
+.PHONY: help demo test test-all release soak hour bench golden docs pictures wheels deb lint clean
 
 help:
 	@echo 'make demo      show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
@@ -15,6 +15,7 @@ help:
 	@echo 'make bench     speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
 	@echo 'make golden    record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
 	@echo 'make docs      write docs/reference from the sources'
+	@echo 'make pictures  draw docs/pictures: live screen and report; all kinds of them by ARGS=FOLDER'
 	@echo 'make wheels    one wheel with the core in C for x86-64, arm64 and armv7, each tried under qemu-user   (ARGS=FOLDER)'
 	@echo 'make deb       Debian packages for amd64, arm64 and armhf, with all libraries   (ARGS=FOLDER)'
 	@echo 'make lint      ruff and mypy only'
@@ -55,6 +56,10 @@ golden:
 docs:
 	@tests/bootstrap.sh lint
 	@.venv/bin/python tests/readme/reference.py
+
+pictures:
+	@tests/bootstrap.sh pictures
+	@PYTHONPATH=tests/cli:tests/report .venv/bin/python tests/readme/pictures.py $(ARGS)
 
 wheels:
 	@tests/bootstrap.sh wheels

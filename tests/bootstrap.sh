@@ -1,17 +1,18 @@
 #!/bin/sh
-# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|test-all|wheels|release
+# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|test-all|pictures|wheels|release
 #   demo      the project
 #   lint      and its test tools
 #   test      and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and small tools that
 #             some tests look through the eyes of
 #   test-all  and User Mode Linux in any case, systemd, a browser, an MQTT broker, the CANopen masters of others (tests/foreign)
+#   pictures  as `lint`, and a browser
 #   wheels    as `lint`, and cross compilers and qemu-user
 #   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB; clang, cross
 #             compilers and their QEMU; debootstrap and lintian
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
-what=${1:?demo, lint, test, test-all, wheels or release}
+what=${1:?demo, lint, test, test-all, pictures, wheels or release}
 cd "$(dirname "$0")/.."
 venv=.venv/bin/python
 new_enough='import sys; sys.exit(sys.version_info < (3, 11))'
@@ -210,8 +211,9 @@ case $what in
         install_other_machines
         install_programs "Debian packages in fresh roots" debootstrap lintian
         ;;
+    pictures) install_project test '.[test]'; install_browser ;;
     wheels) install_project test '.[test]'; install_cross_compilers ;;
-    *) die "$what: demo, lint, test, test-all, wheels or release" ;;
+    *) die "$what: demo, lint, test, test-all, pictures, wheels or release" ;;
 esac
 packages=$(echo "$lacks" | tr -s ' ' '\n' | sort -u | tr '\n' ' ')
 [ -z "$lacks" ] || say "tests are left out, for there is no right to install $left_out. By hand:  sudo apt-get install$packages"

@@ -9,7 +9,10 @@ import zipfile
 from pathlib import Path
 
 import cantools.database
+import pytest
+from pictures import SHOWN, main
 from reference import FOLDER, pages
+from report_browser import MISSING, PROGRAM
 
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.config.export import schema
@@ -136,3 +139,24 @@ def test_pages_by_hand_are_short() -> None:
     for path, text in PAGES.items():
         if path.parent == PROJECT / "docs":
             assert text.count("\n") <= 130, path.name
+
+
+def test_pictures_are_those_that_pages_show_small_and_need_no_server() -> None:
+    shown = {
+        (path.parent / link).resolve()
+        for path, text in PAGES.items()
+        for link in re.findall(r"!\[[^]]+\]\(([^)]+)\)", text)
+    }
+    assert shown == set((PROJECT / "docs/pictures").iterdir())
+    assert shown == {PROJECT / "docs/pictures" / name for name in SHOWN}
+    for path in shown:
+        assert path.stat().st_size < 150_000, path.name
+        assert path.suffix == ".png" or "url(http" not in path.read_text(encoding="utf-8")
+
+
+@pytest.mark.extended
+def test_pictures_can_be_made_anew(tmp_path: Path) -> None:
+    if PROGRAM is None:
+        pytest.skip(MISSING)
+    main(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} >= set(SHOWN)

@@ -1,0 +1,108 @@
+"""Pictures of the live screen and of a report, for the pages: python tests/readme/pictures.py [FOLDER]
+
+Without FOLDER those that pages show, in docs/pictures; else all kinds, to look at. Run by `make pictures`, which has the path.
+"""
+
+import base64
+import io
+import re
+import sys
+import tempfile
+from pathlib import Path
+
+from command_line import run
+from report_browser import MISSING, PROGRAM, Browser
+from rich.console import Console
+from simulated_bus import FLYING, flight, layout_of, write_log
+
+from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.desk.monitor.screen import screen
+from kontronik_can_gw.desk.sources import Source
+from kontronik_can_gw.esc.kontronik.simulator import (
+    SECOND_NS,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    OperatingError,
+)
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
+SIZES = ((80, 24), (120, 40))
+VIEWS = {
+    "desktop": (1280, 900, {}),
+    "dark": (1280, 900, {"dark": True}),
+    "phone": (390, 844, {"phone": True}),
+}
+SHOWN = ("monitor_1_80.svg", "monitor_4_80.svg", "report_desktop.png")
+
+
+def option(first_error_s: float) -> EscOptions:
+    """An ESC in flight whose battery is empty for a while."""
+    begin, length = int(first_error_s * SECOND_NS), 4 * SECOND_NS
+    window = ErrorWindow(OperatingError.UNDERVOLTAGE, begin, length)
+    return EscOptions(profile=FLYING, faults=Faults(errors=(window,)))
+
+
+def monitors(folder: Path) -> None:
+    """One and four ESCs after half a minute."""
+    for count in (1, 4):
+        bus = layout_of([f"esc{number + 1}" for number in range(count)])
+        monitor, source = Monitor(bus), Source("can0", bus)
+        monitor.advance(0)
+        for now, frame in flight(bus, 31, [option(28)]):
+            monitor.take(frame, now)
+            monitor.advance(now)
+        for size in SIZES:
+            console = Console(
+                record=True,
+                file=io.StringIO(),
+                width=size[0],
+                force_terminal=True,
+                color_system="truecolor",
+            )
+            for line in screen(monitor, source, size, 0):
+                console.print(line, no_wrap=True)
+            picture = console.export_svg(title="kontronik-can-gw monitor", unique_id="m")
+            # letters of the reader's own machine, not from a server
+            picture = re.sub(r"@font-face \{.*?\}\s*", "", picture, flags=re.DOTALL)
+            picture = picture.replace(
+                "font-family: Fira Code", "font-family: Fira Code, DejaVu Sans Mono"
+            )
+            (folder / f"monitor_{count}_{size[0]}.svg").write_text(picture, encoding="utf-8")
+
+
+def reports(folder: Path) -> None:
+    """Two ESCs, on a desktop, in the dark and on a phone."""
+    with tempfile.TemporaryDirectory() as scratch:
+        log, page = Path(scratch, "flight.log"), Path(scratch, "flight.html")
+        toml = Path(scratch, "gateway.toml")
+        escs = [
+            f'[[esc]]\nname = "{name}"\nport = "/dev/tty{name}"\npole_pairs = 7\ngear = 9.8\n'
+            for name in ("left", "right")
+        ]
+        toml.write_text("".join(escs))
+        write_log(log, flight(layout_of(["left", "right"]), 120, [option(70)]))
+        done = run("report", log, "-c", toml, "-o", page)
+        assert done.code == 0, done.err
+        with Browser(Path(scratch, "profile")) as browser:
+            for name, (width, height, how) in VIEWS.items():
+                browser.open(page, width, height, **how)
+                shot = browser.call("Page.captureScreenshot", format="png")["data"]
+                (folder / f"report_{name}.png").write_bytes(base64.b64decode(shot))
+
+
+def main(folder: Path) -> None:
+    if PROGRAM is None:
+        sys.exit(MISSING)
+    with tempfile.TemporaryDirectory() as scratch:
+        made = Path(scratch)
+        monitors(made)
+        reports(made)
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in sorted(made.iterdir()):
+            if folder != FOLDER or path.name in SHOWN:
+                (folder / path.name).write_bytes(path.read_bytes())
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER)
