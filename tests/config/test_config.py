@@ -305,6 +305,12 @@ def test_no_removed_key_is_in_use_and_each_says_what_to_do_instead() -> None:
         assert advice.endswith("."), key
 
 
+def test_a_byte_order_mark_and_windows_line_ends_do_not_matter(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_bytes(b'\xef\xbb\xbf[[esc]]\r\nport = "COM3"\r\n')
+    assert load(file).esc[0].port == "COM3"
+
+
 # --- files
 
 
