@@ -465,3 +465,11 @@ def test_no_content_of_a_file_makes_anything_but_a_user_error(
     file.write_bytes(content)
     with pytest.raises(UserError):
         load(file)
+
+
+@pytest.mark.parametrize(
+    "names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")]
+)
+def test_names_that_begin_alike_but_can_be_distinguished_are_taken(names: tuple[str, ...]) -> None:
+    config = parse(named(*names), "a.toml")
+    assert [esc.name for esc in config.escs] == list(names)
