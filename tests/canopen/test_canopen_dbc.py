@@ -1,5 +1,6 @@
 """The DBC of the CANopen side: what it decodes from the nodes' own frames is what the telemetry says, in every tool."""
 
+import re
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -450,11 +451,59 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
     assert "VAL_ 641" not in text
 
 
+def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
+    escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
+    text = written(escs)
+    db = parse(text.encode())
+    for rule in ("names_are_unique", "everything_has_one_comment", "every_line_is_understood"):
+        assert list(RULES[rule](db)) == []
+    read(text)
+    names = [message.name for message in db.messages] + [signal.name for signal in db.signals]
+    assert max(map(len, names)) == 32
+    assert all(re.fullmatch("PortOuter[12][A-Z][A-Za-z0-9]*", name) for name in names)
+    assert "PortOuter1LimitBatteryVoltageMin" in names
+
+
 def test_one_cob_id_for_two_messages_is_refused_by_name() -> None:
     eds = reader.load(EDS_TEXT.replace("$NODEID+0x80\r", "0xA0\r").encode(), "mine.eds")
     said = r"RightREmergency and LeftEmergency have the same COB-ID 0A0h\. Give one of them another"
     with pytest.raises(UserError, match=said):
         written(PAIR, eds=eds)
+
+
+def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_text(
+        '[can]\ninterface = "virtual"\n[dbc]\nenabled = false\n[canopen]\nenabled = true\n'
+        '[[esc]]\nname = "left"\nport = "/dev/ttyUSB0"\n'
+        '[[esc]]\nname = "right_r"\nport = "/dev/ttyUSB1"\nnode_id = 255\n'
+    )
+    assert main(["dbc", "--canopen", "-c", str(file)]) == 0
+    text, said = capsys.readouterr()
+    assert (
+        said
+        == "kontronik-can-gw: warning: right_r: no node-ID yet (LSS gives one), so no frames to describe\n"
+    )
+    db = parse(text.encode())
+    assert {message.name for message in db.messages} == {
+        f"Left{stem}" for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat", "Emergency")
+    }
+    assert "Waiting for a node-ID by LSS, so without frames: right_r." in dict(db.comments)[("",)]
+    assert read(written(node_ids=(255,))).messages == []
+
+
+def test_a_word_that_ends_in_bits_without_a_name_keeps_its_length() -> None:
+    bench = Bench()
+    assert bench.write(0x1803, 1, 0xC0000481, size=4) is None
+    remap(bench, 4, 0x501, [0x20000F08, 0x20000E20])
+    bench.describe_anew()
+    assert bench.database.get_message_by_name("EscTpdo5").length == 5
+    assert not any(message.name == "EscTpdo4" for message in bench.database.messages)
+    bench.start()
+    bench.run(SECOND)
+    assert bench.seen["EscTpdo5"][-1]["ProgrammingAllowed"] in (0, 1)
 
 
 # --- the command ---------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.check import check_eds
+from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -217,3 +218,52 @@ def test_a_text_is_not_mapped() -> None:
     text = SHIPPED.replace("PDOMapping=0", "PDOMapping=1")
     found = problems(text.replace("DefaultValue=0x20000120", "DefaultValue=0x20100600"))
     assert any("[1A00sub1]" in each and "2010h:06 cannot be sent" in each for each in found)
+
+
+def entry_of(text: str, index: int = 0x2200, sub: int = 0) -> Entry:
+    """One entry of an EDS that is accepted."""
+    eds = reader.load(text.encode("ascii"), "mine.eds")
+    return next(entry for entry in eds.entries if (entry.index, entry.sub) == (index, sub))
+
+
+def test_a_missing_object_type_is_a_variable() -> None:
+    assert (
+        entry_of(with_object(variable(0x06).replace("ObjectType=0x7\r\n", ""))).object_type
+        == data_types.VAR
+    )
+
+
+def test_a_compact_error_history_begins_empty() -> None:
+    text = dcf.without(SHIPPED.encode(), {0x1003}).decode()
+    count = int(text.split("[OptionalObjects]\r\nSupportedObjects=")[1].split("\r\n")[0])
+    text = text.replace(
+        f"[OptionalObjects]\r\nSupportedObjects={count}",
+        f"[OptionalObjects]\r\nSupportedObjects={count + 1}\r\n{count + 1}=0x1003",
+    )
+    text += f"\r\n[1003]\r\n{variable(0x07, 'ro')}CompactSubObj=4\r\n".replace(
+        "ObjectType=0x7", "ObjectType=0x8"
+    )
+    assert (entry_of(text, 0x1003, 0).default, entry_of(text, 0x1003, 0).access) == (0, "rw")
+    assert entry_of(text, 0x1003, 4).access == "ro"
+
+
+def test_signed_limits_in_twos_complement() -> None:
+    entry = entry_of(
+        with_object(variable(0x02, LowLimit="0x9C", HighLimit="0x64", DefaultValue="-100"))
+    )
+    assert (entry.low, entry.high, entry.default) == (-100, 100, -100)
+
+
+def test_keys_without_a_value_are_not_there_as_editors_write_them() -> None:
+    entry = entry_of(
+        with_object(variable(0x06, LowLimit="", HighLimit="", DefaultValue="", PDOMapping=""))
+    )
+    assert (entry.low, entry.high, entry.default, entry.mappable) == (None, None, None, False)
+
+
+def test_dropping_an_object_that_a_pdo_carries_is_told() -> None:
+    found = problems(dcf.without(SHIPPED.encode(), {0x2020}))
+    assert [problem.split("] ")[0] for problem in found] == [
+        "mine.eds: [1A03sub4",
+        "mine.eds: [1A03sub5",
+    ]

@@ -155,3 +155,10 @@ def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -
         match="2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says",
     ):
         check_eds(eds, [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
+
+
+def test_the_session_hears_every_service() -> None:
+    heard = {line.split()[1] for line in whole()}
+    assert heard == {"701", "081", "181", "281", "381", "481", "7E4"}
+    codes = {line.split()[2][:4] for line in whole() if line.split()[1] == "081"}
+    assert codes == {"0000", "2032", "4081", "4082", "1075"}

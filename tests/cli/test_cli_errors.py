@@ -258,3 +258,8 @@ def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -
 def test_a_reader_that_goes_away_gets_no_message() -> None:
     done = shell("PROGRAM dbc --esc 8 | head -c 10")
     assert (done.stdout, done.stderr) == ('VERSION ""', "")
+
+
+def test_a_file_may_have_the_name_of_a_removed_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(REMOVED_OPTIONS, ("decode", "--tape"), "Type -o x.")
+    assert "No such file" in refused(1, "decode", "--", "--tape")

@@ -14,6 +14,7 @@ from kontronik_can_gw.esc.kontronik import (
     Device,
     Frame,
     InfoData,
+    Layout,
     LiveData,
     OperatingError,
 )
@@ -106,3 +107,15 @@ def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
     assert "exists and is not a symbolic link" in said
     assert [file.name for file in tmp_path.iterdir()] == ["esc2"]
     assert link.read_text() == "precious"
+
+
+def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None:
+    words = ["--esc", "3", "--layout", "mixed", "--seconds", "2s", "--out"]
+    assert run("simulate", *words, tmp_path / "esc{n}.bin").code == 0
+    files = [tmp_path / f"esc{n}.bin" for n in (1, 2, 3)]
+    layouts = [{frame.layout for frame in frames_of(file.read_bytes())} for file in files]
+    assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
+
+
+def test_what_is_lost_and_disturbed_is_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:
+    assert 150 < len(written(tmp_path, "--seconds 3 --flip-bits 3e-4 --dropout 500ms/2s")) < 253

@@ -1,6 +1,7 @@
 """``eds``: the EDS byte for byte, and DCFs that read back with the values of the node."""
 
 import io
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -167,3 +168,12 @@ def test_a_node_id_that_no_node_has_is_refused_with_the_one_there_is(tmp_path: P
     file = configuration(tmp_path, "enabled = true\nnode_id = 20", right="node_id = 255")
     said = refused(2, "eds", "-c", file, "--node-id", 5)
     assert said == "--node-id 5: no node of the configuration has it. There is 20."
+
+
+def test_without_a_node_id_the_shipped_eds_is_written_byte_for_byte(tmp_path: Path) -> None:
+    out = tmp_path / "out.eds"
+    assert command("-o", out) == (0, "", f"kontronik-can-gw: {out} written\n")
+    assert out.read_bytes() == EDS.read_bytes()
+    assert os.listdir(tmp_path) == ["out.eds"]
+    code, text, said = command()
+    assert (code, text.encode(), said) == (0, EDS.read_bytes(), "")

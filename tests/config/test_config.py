@@ -305,6 +305,12 @@ def test_no_removed_key_is_in_use_and_each_says_what_to_do_instead() -> None:
         assert advice.endswith("."), key
 
 
+def test_a_byte_order_mark_and_windows_line_ends_do_not_matter(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_bytes(b'\xef\xbb\xbf[[esc]]\r\nport = "COM3"\r\n')
+    assert load(file).esc[0].port == "COM3"
+
+
 # --- files
 
 
@@ -459,3 +465,11 @@ def test_no_content_of_a_file_makes_anything_but_a_user_error(
     file.write_bytes(content)
     with pytest.raises(UserError):
         load(file)
+
+
+@pytest.mark.parametrize(
+    "names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")]
+)
+def test_names_that_begin_alike_but_can_be_distinguished_are_taken(names: tuple[str, ...]) -> None:
+    config = parse(named(*names), "a.toml")
+    assert [esc.name for esc in config.escs] == list(names)

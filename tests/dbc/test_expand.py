@@ -262,3 +262,30 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
         compile_layout(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after)
     )
     assert plain_plans(new) == plain_plans(old)
+
+
+def test_extended_multiplexing_of_one_level_comes_through() -> None:
+    page, timing = Sig("Page", 0, 4, mux="M"), Sig("Timing", 32, 8, mux="m2")
+    text = dbc_text([Msg("EscX", 5, 8, [page, Sig("BatteryVoltage", 8, 16, mux="m0"), timing])])
+    text += "SG_MUL_VAL_ 5 BatteryVoltage Page 0-1, 3-3;\nSG_MUL_VAL_ 5 Timing Page 2-2;\n"
+    after, _ = multiplied(text, PAIR)
+    voltage = after.get_message_by_name("RightX").get_signal_by_name("RightBatteryVoltage")
+    assert voltage.multiplexer_ids == [0, 1, 3]
+    assert voltage.multiplexer_signal == "RightPage"
+
+
+def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_they_were() -> None:
+    more = (
+        'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_DEF_ "SystemSignalLongSymbol" "";\n'
+        'BA_ "SystemSignalLongSymbol" SG_ 5 U "BatteryVoltage";'
+    )
+    after, text = multiplied(dbc_text([Msg("EscX", 5, 8, [Sig("U", 0, 16, unit="V")])], more), PAIR)
+    names = [signal.name for message in after.messages for signal in message.signals]
+    assert names == ["LeftBatteryVoltage", "RightBatteryVoltage"]
+    assert 'BA_ "SystemSignalLongSymbol"' not in text
+
+
+def test_two_messages_that_would_get_one_name_are_refused() -> None:
+    voltage = [Sig("BatteryVoltage", 0, 16)]
+    text = dbc_text(Msg(n, i, 8, voltage) for i, n in enumerate(("EscPower", "Power"), 0x100))
+    assert "LeftPower" in refused(text)

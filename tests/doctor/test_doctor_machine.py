@@ -171,3 +171,18 @@ def test_the_real_machine_is_looked_at_without_an_exception() -> None:
     assert root is not None and root.uid == 0
     assert root.groups >= {0, grp.getgrnam("tty").gr_gid}
     assert machine.user_named("no such user") is None
+
+
+def test_the_services_own_folder_is_made_by_systemd(tree: Tree) -> None:
+    tree.systemd()
+    tree.folder("/var/lib")
+    tree.closed.add("/var/lib")
+    assert "systemd" in folder(tree).text
+    assert folder(tree, f"{STORE}-left", "/etc/kontronik-can-gw/left.toml").severity is OK
+
+
+def test_a_service_that_does_not_start_with_the_machine_is_noted(tree: Tree) -> None:
+    tree.systemd(UnitFileState="disabled")
+    found = only(service(tree), "machine.service_enabled")
+    command = "sudo systemctl enable kontronik-can-gw.service"
+    assert (found.severity, found.command) == (NOTE, command)

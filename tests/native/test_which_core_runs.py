@@ -224,3 +224,27 @@ def test_a_compiler_that_fails_is_said_in_one_line(
     monkeypatch.setattr(compiling, "compiler", lambda: None)
     assert compile_core(target) == "there was no C compiler at the installation"
     assert not target.exists()
+
+
+@pytest.mark.usefixtures("built")
+@pytest.mark.parametrize("bits", [64, 65, 300])
+def test_a_signal_of_more_than_64_bits_runs_in_python(bits: int) -> None:
+    signal = f'BatteryVoltage : 0|{bits}@1+ (0.01,0) [0|0] "V"'
+    text = HEAD.format(signal).replace("M: 8", "M: 64")
+    database = parse_database(text.encode(), "t.dbc")
+    layout = prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)[1]
+    found = Gateway([EscSettings()], layout, 0).why_python
+    assert found == ("" if bits == 64 else f"M.BatteryVoltage: {bits} bits")
+
+
+def test_what_the_installation_said_is_why_there_is_no_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(load, "shared_object", lambda: tmp_path / "core-other.so")
+    monkeypatch.setattr(objects, "NOT_BUILT", tmp_path / "not_built.txt")
+    (tmp_path / "not_built.txt").write_text("there was no C compiler at the installation\n")
+    found = why()
+    assert (
+        load.in_words("Python", found)
+        == "core: Python (there was no C compiler at the installation)"
+    )

@@ -516,3 +516,10 @@ def test_a_node_belongs_to_one_gateway_until_that_closes(tmp_path: Path) -> None
     first.close(1)
     second.lock("esc1")
     second.close(1)
+
+
+def test_where_no_lock_can_be_made_the_gateway_runs_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    store = ParameterStore(tmp_path / "file" / "store")
+    store.lock("esc1")
+    store.close(1)

@@ -222,6 +222,17 @@ def test_a_full_disk_leaves_the_old_document_and_no_half_one(
     put(statistics, file, 3)
 
 
+def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "device"
+    os.mkfifo(target)
+    statistics = Statistics(target)
+    publish(statistics, 1)
+    (report,) = reports(statistics, 1)
+    assert report.begins and "no plain file" in report.text
+    statistics.close()
+    assert stat.S_ISFIFO(target.stat().st_mode)
+
+
 def test_all_signals_are_blocked_in_the_thread_and_in_no_other(file: Path) -> None:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
     statistics = Statistics(file)

@@ -69,6 +69,12 @@ def test_a_status_cannot_carry_a_message_of_its_own(manager: Manager) -> None:
     assert manager.told() == [["STATUS=bus-off STOPPING=1 MAINPID=1"]]
 
 
+def test_a_long_status_fits_what_systemd_reads(manager: Manager) -> None:
+    Notifier(manager.environment).status("\N{GRINNING FACE}" * 5000)
+    [[line]] = manager.told()
+    assert 3000 < len(line.encode()) <= 4096
+
+
 def test_without_a_manager_nothing_happens() -> None:
     for address in ("", "vsock:2:1", "@"):
         notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"})
@@ -109,6 +115,24 @@ def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None
     manager.told()
     notifier.stopping()
     assert manager.told() == [["STOPPING=1"]]
+
+
+def test_a_manager_that_comes_back_is_reported_again(tmp_path: Path) -> None:
+    path = tmp_path / "notify"
+    first = Manager(str(path))
+    notifier = Notifier(first.environment)
+    notifier.status("one")
+    assert first.told() == [["STATUS=one"]]
+    first.socket.close()
+    path.unlink()
+    notifier.status("two")
+    second = Manager(str(path))
+    with second.socket:
+        notifier.status("two")
+        assert second.told() == []
+        notifier.status("three")
+        assert second.told() == [["STATUS=three"]]
+    notifier.close()
 
 
 @pytest.mark.parametrize(

@@ -332,3 +332,16 @@ def test_status_is_systemds_account_of_the_services_in_use(
     assert (done.code, done.err) == (code, "")
     lines = done.out.splitlines()
     assert [line[: len(head)] for line, head in zip(lines, heads, strict=True)] == heads
+
+
+@pytest.mark.parametrize("kind", ["metrics", "mqtt"])
+def test_what_stands_by_the_gateway_is_a_service_of_its_own(root: Path, kind: str) -> None:
+    install(root, f"--{kind}")
+    edit(root, before='[mqtt]\nbroker = "broker.example"\n')
+    assert f"kontronik-can-gw-{kind}.service is enabled" in install(root, f"--{kind}").err
+    unit = root / UNITS / f"kontronik-can-gw-{kind}.service"
+    assert f"ExecStart={EXECUTABLE} {kind} -c /etc/" in unit.read_text()
+    link = root / UNITS / f"multi-user.target.wants/kontronik-can-gw-{kind}.service"
+    assert str(link.readlink()) == f"/{UNITS}/{unit.name}"
+    uninstall(root)
+    assert not unit.exists() and not link.is_symlink()
