@@ -33,6 +33,13 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
     ("mqtt", "--remove-discovery"):
         "Type mosquitto_sub -h BROKER -W 2 --remove-retained -t homeassistant/device/kontronik_GATEWAY/config, and for "
         "each ESC -t homeassistant/device/kontronik_GATEWAY_ESC/config.",
+    ("convert", "--to mf4"):
+        "Type --to parquet (or csv) for a table, or --to mf4-log for the CAN frames, of which asammdf makes signals by the DBC.",
+    ("convert", "--frames"): "Type kontronik-can-gw convert IN flight.log; cantools decode esc.dbc < flight.log.",
+    ("convert", "--units-line"): "Type --to csv or --to parquet, which have the units; docs/reference/values.md lists them.",
+    ("decode", "--stats"): "Type kontronik-can-gw convert FILE flight.csv --signals 'live_frames,crc_errors,dropped_bytes'.",
+    ("report", "--points"): "Leave it out: a line has 20000 points, and every peak and gap.",
+    ("report", "--title"): "Rename FILE: the page has its name.",
     ("report", "--to"): "Type --until S.",
     ("replay", "--to"): "Type --on can or --on pty; a log is made by kontronik-can-gw convert FILE flight.log.",
 }

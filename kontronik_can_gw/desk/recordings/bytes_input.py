@@ -1,41 +1,41 @@
 """The UART bytes of one ESC, which have no times: their live frames are taken to come at a fixed rate."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core import PythonCore
 from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.desk.recordings.blocks import NO_MESSAGES, RowBlock, player_of
-from kontronik_can_gw.desk.recordings.can_logs import UART_MAGIC
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
-from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
+from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.gateway import Gateway, MakeOutput
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.transmit_queue import TransmitQueue
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames
     from kontronik_can_gw.native.player import Player
 
+CHUNK = 1 << 18
 LIVE_RATE = 100.0
 """Live frames a second that plain bytes are taken to have come at."""
+UART_MAGIC = b"KOD"
+"""What a telemetry frame begins with."""
 _UNDECIDED = len(UART_MAGIC) - 1
 """Bytes at the end of a read that may begin a header."""
 
 
-class DumpInput(Input):
+class BytesInput(PlayedInput):
     """The bytes of one ESC, without times."""
 
     def __init__(
@@ -46,100 +46,33 @@ class DumpInput(Input):
             raise UserError(
                 f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}"
             )
-        super().__init__(str(path), layout, path.stat().st_size)
-        self.times_assumed = True
         self._path = path
         self._period_ns = max(1, round(SECOND / live_rate))
-        esc = replace(
-            layout.escs[0], timeout_ns=max(layout.escs[0].timeout_ns, 3 * self._period_ns)
-        )
-        self.setup = CaptureSetup((esc,), (str(path),), None, DbcSettings(), False, False, None)
+        timeout_ns = max(layout.escs[0].timeout_ns, 3 * self._period_ns)
+        escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
+        setup = CaptureSetup(escs, (str(path),), None, DbcSettings(), False, False, None)
+        try:
+            size = path.stat().st_size
+        except OSError as error:
+            raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
+        super().__init__(str(path), layout, size, setup)
+        self.times_assumed = True
         self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
         if layout.config is None:
             self.provenance["motor"] = (
                 "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
             )
 
-    def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
-        found = player_of(self._gateway, None, (), 0)
-        if found is not None:
-            for _ in self._steps(*found):
-                yield found[0].take_frames()
-            return
-        gateway, waiting = self._gateway(), TransmitQueue()
-        for now in self._play(gateway):
-            yield [TimedFrame(now, one) for one in in_order(gateway.take_frames(now), waiting)]
-
-    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        fields = [self.fields[index] for index in self._chosen(chosen)]
-        makers: list[RowMaker] = []
-
-        def make(*of_gateway: Any) -> RowMaker:
-            makers.append(RowMaker(fields, *of_gateway))
-            return makers[0]
-
-        for _ in self._play(self._gateway((make,), NO_MESSAGES)):
-            yield from makers[0].take_rows()
-        yield from makers[0].finish()
-
-    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:
-        fields = [self.fields[index] for index in self._chosen(chosen)]
-        make = partial(self._gateway, layout=NO_MESSAGES)
-        found = player_of(make, fields, self.bus.escs, 0)
-        return None if found is None else self._blocks_of(*found)
-
-    def _gateway(self, further: Sequence[MakeOutput] = (), layout: Layout | None = None) -> Gateway:
-        return Gateway(self.setup.escs, layout or self.bus.layout, 0, further=further)
-
-    def _play(self, gateway: Gateway) -> Iterator[int]:
-        """Give all frames to a gateway with the core in Python; the times at which it may have something to send."""
-        core, now = cast(PythonCore, gateway.core), 0
-        _start(gateway)
-        for now, reading in self._found(core.escs[0].decoder):
-            while (due := gateway.next_deadline()) < now:
-                gateway.advance(due)
-                yield due
-            core.accept(0, reading, now)
-            gateway.advance(now)
-            gateway.take_link_changes()
-            yield now
-        gateway.advance(now)
-        yield now
-
-    def _blocks_of(self, player: "Player", gateway: Gateway) -> Iterator[RowBlock]:
-        for _ in self._steps(player, gateway):
-            if player.is_full:
-                rows = player.take_rows()
-                yield RowBlock(rows, 0, rows.count)
-        rows = player.take_rows(final=True)
-        yield RowBlock(rows, 0, rows.count)
-
-    def _steps(self, player: "Player", gateway: Gateway) -> Iterator[None]:
-        """Give all bytes to the player, which does what ``_play`` and ``_found`` do."""
-        self.damage = []
-        _start(gateway)
-        player.set_bytes(self._period_ns)
-        rest = b""
-        for data in chain(self.esc_bytes(0), (None,)):
-            rest += data or b""
-            is_full = True
-            while is_full:
-                begin = player.position
-                is_full = player.play_bytes(rest, ended=data is None)
-                rest = rest[player.position - begin :]
-                yield
-        self._describe_damage(player.counters)
-
-    def chunks(self) -> Iterator[tuple[int, bytes]]:
+    def entries(self) -> Iterator[Entry]:
         """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period after it."""
         now = 0
         with self._path.open("rb") as file:
             for now, reading in self._found(PROTOCOLS[0].make()):
                 end = reading.offset + reading.form.length
                 while data := file.read(min(CHUNK, end - file.tell())):
-                    yield now, data
+                    yield Entry(now, Kind.BYTES, data=data)
             while data := file.read(CHUNK):
-                yield now, data
+                yield Entry(now, Kind.BYTES, data=data)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         if esc:
@@ -155,6 +88,55 @@ class DumpInput(Input):
 
     def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
         return None
+
+    def _play_frames(
+        self, gateway: Gateway, player: "Player | None", marked: bool
+    ) -> "Iterator[list[TimedFrame] | Frames]":
+        waiting = TransmitQueue()
+        for now in self._play(gateway, player, marked):
+            if player is not None:
+                yield player.take_frames()
+            else:
+                yield [TimedFrame(now, one) for one in in_order(gateway.take_frames(now), waiting)]
+
+    def _play(
+        self, gateway: Gateway, player: "Player | None" = None, marked: bool = False
+    ) -> Iterator[int]:
+        """Give all frames to a gateway; the times at which it may have something to send, of a player 0."""
+        # it runs before the first byte
+        gateway.port(0, True, 0)
+        gateway.start(0)
+        if marked:
+            gateway.status.state = GatewayState.REPLAY
+        if player is not None:
+            yield from self._play_in_c(player)
+            return
+        core, now = cast(PythonCore, gateway.core), 0
+        for now, reading in self._found(core.escs[0].decoder):
+            while (due := gateway.next_deadline()) < now:
+                gateway.advance(due)
+                yield due
+            core.accept(0, reading, now)
+            gateway.advance(now)
+            gateway.take_link_changes()
+            yield now
+        gateway.advance(now)
+        yield now
+
+    def _play_in_c(self, player: "Player") -> Iterator[int]:
+        """The same, and what ``_found`` does."""
+        self.damage = []
+        player.set_bytes(self._period_ns)
+        rest = b""
+        for data in chain(self.esc_bytes(0), (None,)):
+            rest += data or b""
+            is_full = True
+            while is_full:
+                begin = player.position
+                is_full = player.play_bytes(rest, ended=data is None)
+                rest = rest[player.position - begin :]
+                yield 0
+        self._describe_damage(player.counters)
 
     def _found(self, decoder: Any) -> Iterator[tuple[int, Reading]]:
         """Each frame at its time. The decoder is given the bytes up to the next header with it: its counters are of that time."""
@@ -189,9 +171,3 @@ class DumpInput(Input):
             yield from filter(None, pieces)
         if rest:
             yield rest
-
-
-def _start(gateway: Gateway) -> None:
-    """It runs before the first byte."""
-    gateway.port(0, True, 0)
-    gateway.start(0)
