@@ -32,7 +32,7 @@ bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). For a CAN log give the DBC of
 The page is one file that needs no network: plots with zoom, the operating states, errors with meaning and remedy, and the
 numbers (energy, charge, extremes with their time, cell voltage sag, quality of the data). Several ESCs share the plots.
 Numbers and events are from every row. Lines are reduced to 20 000 points in a way that keeps every peak and every gap.
-The same recording gives the same page, byte for byte. A file that exists is only replaced with --force.
+The same recording gives the same page, byte for byte (where the same core plays it). A file that exists is only replaced with --force.
 
 examples:
   kontronik-can-gw report flight.kcap -o flight.html
@@ -99,11 +99,10 @@ def _analysed(recording: Input, args: argparse.Namespace) -> Flight | None:
         )
     try:
         with Progress(recording.name, recording.size or None, args.output == "-") as progress:
-            for count, sample in enumerate(recording.samples(chosen)):
-                if not analysis.take(sample.time_ns, sample.values):
+            for block in filter(len, recording.blocks(chosen)):
+                if not analysis.take(block):
                     break
-                if not count & 1023:
-                    progress.reach(recording.position)
+                progress.reach(recording.position)
     except KeyboardInterrupt:
         return None
     return analysis.finish()

@@ -44,7 +44,8 @@ STREAMS = (*ON_SCREEN, BYTES)
 """What may go through a pipe."""
 _BY_PATH = ("parquet", "mf4-log")
 """What a library writes that opens the file itself."""
-_CLOCK_SET_NS = 1_000_000_000
+_CLOCK_SET_NS = _DISORDER_NS = 1_000_000_000
+"""How far a clock must be set to be worth a word; how far frames of several interfaces may stand out of order."""
 
 
 class Output:
@@ -209,10 +210,8 @@ def _cut(
     batches: "Iterator[Frames | list[TimedFrame]]", low_ns: int, high_ns: int
 ) -> "Iterator[Frames | list[TimedFrame]]":
     """The frames from one time to another, both included. No batch is empty."""
-    from kontronik_can_gw.desk.recordings.tables.rows import DISORDER_NS
-
     for frames in batches:
-        if _time_at(frames, 0) > high_ns + DISORDER_NS:
+        if _time_at(frames, 0) > high_ns + _DISORDER_NS:
             return
         if isinstance(frames, list):
             found: Any = [one for one in frames if low_ns <= one.time_ns <= high_ns]

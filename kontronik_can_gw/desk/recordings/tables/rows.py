@@ -14,8 +14,6 @@ from kontronik_can_gw.esc.telemetry import SECOND
 
 LATEST_NS = 1 << 63
 """Later than any time of a recording."""
-DISORDER_NS = SECOND
-"""What was recorded of several interfaces may stand a little out of order."""
 T = TypeVar("T")
 
 
