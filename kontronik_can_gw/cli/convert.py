@@ -11,7 +11,7 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
+from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, number_from, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.progress import Progress
@@ -29,9 +29,10 @@ from kontronik_can_gw.desk.recordings.convert import (
     to_log,
     to_table,
 )
-from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput, Input, open_input
-from kontronik_can_gw.desk.recordings.spool import is_stream
-from kontronik_can_gw.desk.recordings.tables.rows import Choice, fields_of_frames
+from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, Input, open_input
+from kontronik_can_gw.desk.recordings.log_input import CanLogInput
+from kontronik_can_gw.desk.recordings.spool import is_stream, spooled
+from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.errors import RunError, UserError
 
 
@@ -71,8 +72,6 @@ OPTIONS = (
     "tables",
     option("--signals A,B*", "only these signals, in this order; * and ? stand for others", type=_names, default=[]),
     option("--rate HZ", "rows a second at most, the newest of each period", type=_RATE),
-    option("--frames", "a row for each CAN frame, with its own signals only"),
-    option("--units-line", "jsonl: a first line with the units"),
 )
 # fmt: on
 EPILOG = """\
@@ -80,16 +79,16 @@ IN is a capture of this gateway (.kcap; a folder of captures for all parts of a 
 BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
 IN may be a pipe, or - for standard input: it is first read to its end, into a temporary file (in TMPDIR, else /tmp).
 
-OUT is a table of all values (csv, jsonl, parquet, mf4), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
-bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .mf4 .log .candump .asc .blf .trc .bin; --to where it
-does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, MF4 needs asammdf; they are named
+OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
+bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .log .candump .asc .blf .trc .bin; --to where it
+does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, mf4-log needs asammdf; they are named
 where they are missing.
 
 Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
 Columns are values by name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]): of captures and bytes all of them in full
 resolution, of CAN logs those that the DBC has.
-Time [s] counts from the recording's first row, with --frames from its first frame; Utc is there where the recording knows
-the time of day. What is not available is empty in CSV, null in JSON lines and Parquet, NaN or NotAvailable in MF4.
+Time [s] counts from the recording's first row; Utc is there where the recording knows the time of day. What is not
+available is empty in CSV, null in JSON lines and Parquet.
 Flags are 0 and 1.
 
 Of a damaged recording everything that is intact is converted, and a summary says what is not.
@@ -100,15 +99,15 @@ library is missing; 2 wrong usage, or IN is no recording
 """
 
 
-def main(args: argparse.Namespace) -> int:
-    """Convert args.input. UserError for wrong usage, RunError where something cannot be read or written."""
+def main(args: argparse.Namespace, opened_by: Callable[..., Input] = open_input) -> int:
+    """Convert args.input, which ``opened_by`` opens. UserError for wrong usage, RunError where something cannot be read or written."""
     if args.output != "-" and Path(args.output).is_dir():
         raise UserError(f"{args.output}: is a directory. Give a file.")
     form = _format(args)
     _check(args, form)
     try:
         with _ended_by_signals():
-            _convert(args, form)
+            _convert(args, form, opened_by)
     except KeyboardInterrupt as end:
         _say("stopped: nothing is written" if args.output != "-" else "stopped")
         return 143 if isinstance(end, _Ended) else 130
@@ -138,10 +137,10 @@ def _ended_by_signals() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
 
 
-def _convert(args: argparse.Namespace, form: str) -> None:
+def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input]) -> None:
     target = None if args.output == "-" else Path(args.output)
     begun = time.monotonic()
-    with _opened(args) as recording:
+    with _opened(args, opened_by) as recording:
         if args.live_rate is not None and not recording.times_assumed:
             raise UserError(
                 f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
@@ -163,21 +162,19 @@ def _report(
     args: argparse.Namespace, form: str, recording: Input, summary: str | None, seconds: float
 ) -> None:
     """Say what was written, and what of the recording was not intact. RunError where there was nothing."""
-    damage = [line for line in recording.damage if line not in recording.notes]
-    damage = [f"{args.input}: damaged: {line}" for line in damage]
+    damage = [f"{args.input}: damaged: {line}" for line in recording.damage]
     if summary is None:
         raise RunError(*damage, f"{args.input}: {_nothing(args, recording)}")
-    notes = recording.notes if form in TABLES else []
     if not args.quiet:
-        others = recording.others if isinstance(recording, CanLogInput) else 0
-        if form in TABLES and not notes and others:
-            summary += f", {others} other frames left out"
+        if form in TABLES and recording.others:
+            file = Path(recording.bus.layout.file).name
+            summary += f", {recording.others} frames left out that {file} does not have (-c or --dbc gives another)"
         where = "standard output" if args.output == "-" else args.output
         _say(f"{where}: {summary}, in {seconds:.1f} s")
         if recording.times_assumed and form != BYTES:
             live_rate = args.live_rate or LIVE_RATE
             _say(f"times are assumed: {live_rate:g} live frames a second (--live-rate)")
-    for line in (*(f"{args.input}: {note}" for note in notes), *damage):
+    for line in damage:
         _say(line)
 
 
@@ -192,13 +189,13 @@ def _nothing(args: argparse.Namespace, recording: Input) -> str:
     return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
 
 
-def _opened(args: argparse.Namespace) -> Input:
+def _opened(args: argparse.Namespace, opened_by: Callable[..., Input]) -> Input:
     """The recording; of a pipe with a bar while it is read into a file."""
     source, layout, rate = Path(args.input), given_layout(args), args.live_rate or LIVE_RATE
-    if not is_stream(source):
-        return open_input(source, layout, rate)
-    with Progress(f"reading {source}", None, args.output == "-") as progress:
-        return open_input(source, layout, rate, progress.reach)
+    if is_stream(source):
+        with Progress(f"reading {source}", None, args.output == "-") as progress:
+            source = spooled(source, progress.reach)
+    return opened_by(source, layout, rate)
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
@@ -208,10 +205,8 @@ def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callab
     if form in LOGS:
         return partial(to_log, form=LOGS[form], start_ns=args.start, end_ns=args.end)
     times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
-    fields = fields_of_frames(recording) if args.frames else recording.fields
-    choice = Choice.of(fields, args.signals, _esc(args, recording), **times)
-    more = {"by_frame": args.frames, "units_line": args.units_line}
-    return partial(to_table, form=form, choice=choice, **more)
+    choice = Choice.of(recording.fields, args.signals, _esc(args, recording), **times)
+    return partial(to_table, form=form, choice=choice)
 
 
 def _format(args: argparse.Namespace) -> str:
@@ -222,6 +217,8 @@ def _format(args: argparse.Namespace) -> str:
             f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}; bin through a pipe"
         )
     suffix = Path(args.output).suffix.lower()
+    if suffix == ".mf4":
+        raise UserError(f"{args.output}: {REMOVED_OPTIONS['convert', '--to mf4']}")
     if suffix not in SUFFIXES:
         raise UserError(
             f"{args.output}: its suffix tells no format. Give --to, or one of these suffixes: {' '.join(SUFFIXES)}"
@@ -241,8 +238,6 @@ def _check(args: argparse.Namespace, form: str) -> None:
         (to_screen and is_bytes and sys.stdout.isatty(), "bin cannot go to a terminal. Give a file, or a pipe behind it."),
         (args.signals and not has_rows, f"--signals {only_rows}"),
         (args.rate and not has_rows, f"--rate {only_rows}"),
-        (args.frames and not has_rows, f"--frames {only_rows}"),
-        (args.units_line and form != "jsonl", f"--units-line is for jsonl, not for {form}"),
         (args.esc is not None and form in LOGS, f"--esc is for tables and bin: {form} holds the frames as they are"),
         (is_bytes and not (start is None and end is None), "--from and --until are not for bin, which has no times"),
         (is_bytes and args.live_rate is not None, "--live-rate is not for bin, which has no times"),

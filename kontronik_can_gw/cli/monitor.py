@@ -92,5 +92,5 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
                 f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out."
             )
         yield Recording(opened, args.speed or 1.0, at_once=args.once)
-        for line in dict.fromkeys([*opened.damage, *opened.notes]):
+        for line in dict.fromkeys(opened.damage):
             say(f"warning: {line}")

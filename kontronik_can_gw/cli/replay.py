@@ -2,7 +2,6 @@
 
 import argparse
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +11,9 @@ from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.terminals import terminals
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput, Input, open_input
-from kontronik_can_gw.desk.recordings.marking import Marker
+from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.pacing import Pace
+from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
@@ -22,7 +21,6 @@ from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.locks import Locks, ids_lock, in_use, messages_lock, node_lock
 from kontronik_can_gw.runtime.open_can import check_interface, open_can
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.transmit_queue import Sent
 
@@ -51,14 +49,13 @@ OPTIONS = (
 # fmt: on
 _ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}
 EPILOG = """\
-FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
-bytes, or a CAN log (candump, ASC, BLF, TRC, MF4); a pipe, or - for standard input, is read to its end first. A capture
-is replayed through the gateway's core with the recorded clock: frames and times equal those of the live gateway bit for
-bit.
+FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run) or a file of plain UART
+bytes; a pipe, or - for standard input, is read to its end first. A capture is replayed through the gateway's core with the
+recorded clock: frames and times equal those of the live gateway bit for bit.
 
 --on can  sends the frames on a CAN bus. The gateway's state in them is set to Replay (GatewayState), since they are old;
           with --unmarked they are sent exactly as recorded. Refused while a gateway on this machine sends the same messages.
-          Frames that the gateway had received are not sent; of a CAN log all frames are.
+          Frames that the gateway had received are not sent. A CAN log is sent by canplayer of can-utils.
 --on pty  plays an ESC's bytes on a pseudo terminal, one for each ESC, for a gateway to read: prints "esc1 /dev/pts/5".
 
 A log of the frames is made by kontronik-can-gw convert FILE flight.log.
@@ -79,6 +76,11 @@ def main(args: argparse.Namespace) -> int:
             raise UserError(f"--{given[0]} is for --on {place}")
     pace = Pace(args.speed)
     with open_input(args.file, given_layout(args)) as recording, stopping_on_signals(pace.stop):
+        if not isinstance(recording, PlayedInput):
+            raise UserError(
+                f"{args.file}: is a log of CAN frames, which has no bytes of ESCs. Type canplayer -I FILE (of can-utils) to send "
+                "a candump log; kontronik-can-gw convert makes one of other logs."
+            )
         play = {"can": _on_can, "pty": _on_pty}[args.on]
         text = play(args, recording, pace)
         if recording.times_assumed:
@@ -90,31 +92,21 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _on_can(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
-    capture = recording if isinstance(recording, CaptureInput) else None
-    layout = recording.bus.layout if capture is None else capture.sent_layout
-    can = _bus(args, recording, fd=any(plan.fd for plan in layout.messages))
+def _on_can(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str:
+    can = _bus(args, recording, fd=any(plan.fd for plan in recording.sent_layout.messages))
     check_interface(can)
-    marker = Marker(layout)
-    if not args.unmarked and not marker.can_mark:
-        say(
-            "warning: no message of this DBC has the gateway's state, so receivers cannot recognize the replay"
-        )
     locks = Locks()
     if can.interface != "virtual":
-        _hold(locks, can.channel, layout, capture)
+        _hold(locks, can.channel, recording)
     port = open_can(can)
     count = 0
     try:
-        # the core marks the frames of a capture itself; those of a log are changed one by one
-        frames = recording.frames() if capture is None else capture.frames(marked=not args.unmarked)
-        changed = capture is None and not args.unmarked
-        for time_ns, frame, received in frames:
-            if received and capture is not None:
+        for time_ns, frame, received in recording.frames(marked=not args.unmarked):
+            if received:
                 continue
             if not pace.wait(time_ns):
                 break
-            _send(port, marker.mark(frame) if changed else frame, can.channel, pace)
+            _send(port, frame, can.channel, pace)
             count += 1
     finally:
         port.close()
@@ -123,7 +115,7 @@ def _on_can(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
     return f"{count} frames to {can.channel}{late}"
 
 
-def _bus(args: argparse.Namespace, recording: Input, fd: bool) -> CanConfig:
+def _bus(args: argparse.Namespace, recording: PlayedInput, fd: bool) -> CanConfig:
     """The interface of the options, else of the configuration. UserError where none is named."""
     if args.config and recording.bus.config:
         return replace(can_config(recording.bus, args.interface, args.channel), fd=fd)
@@ -134,16 +126,16 @@ def _bus(args: argparse.Namespace, recording: Input, fd: bool) -> CanConfig:
     return CanConfig(args.interface or "socketcan", args.channel, fd=fd)
 
 
-def _hold(locks: Locks, channel: str, layout: Layout, capture: CaptureInput | None) -> None:
+def _hold(locks: Locks, channel: str, recording: PlayedInput) -> None:
     """Lock messages and nodes against a gateway that sends the same. RunError where one does."""
-    names = [messages_lock(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
-    if capture is not None and capture.setup.canopen is not None:
-        for node in capture.setup.canopen.settings:
+    keys = sorted(SignalReader(recording.sent_layout).keys)
+    names = [messages_lock(channel, key) for key in keys[:1]]
+    if recording.setup.canopen is not None:
+        for node in recording.setup.canopen.settings:
             if node.node_id != UNCONFIGURED:
                 names.append(node_lock(channel, node.node_id))
-    if capture is not None:
-        for output in capture.setup.outputs:
-            names += [ids_lock(channel, key) for key in output.taken_ids() if key >> 32]
+    for output in recording.setup.outputs:
+        names += [ids_lock(channel, key) for key in output.taken_ids() if key >> 32]
     for taken in locks.hold(names):
         raise in_use(taken)
 
@@ -163,20 +155,19 @@ def _send(port: CanPort, frame: CanFrame, channel: str, pace: Pace) -> None:
         time.sleep(_BUSY_S)
 
 
-def _on_pty(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
-    chunks = _chunks(recording)
-    names = []
-    if isinstance(recording, (CaptureInput, DumpInput)):
-        names = [esc.name for esc in recording.setup.escs]
+def _on_pty(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str:
+    names = [esc.name for esc in recording.setup.escs]
     total = 0
     with terminals(names, args.link) as opened:
         pace.pause(args.delay)
-        for time_ns, esc, data in chunks:
-            if not pace.wait(time_ns):
+        for entry in recording.entries():
+            if entry.kind != Kind.BYTES:
+                continue
+            if not pace.wait(entry.time_ns):
                 break
-            if esc < len(opened):
-                opened[esc].write(data)
-                total += len(data)
+            if entry.esc < len(opened):
+                opened[entry.esc].write(entry.data)
+                total += len(entry.data)
         pace.pause(_DRAIN_S)
         for terminal in opened:
             terminal.check()
@@ -187,14 +178,3 @@ def _on_pty(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
     dropped = sum(terminal.dropped_bytes for terminal in opened)
     lost = f", {dropped} of them dropped (nobody read)" if dropped else ""
     return f"{total} bytes to {len(names)} pseudo terminals{lost}"
-
-
-def _chunks(recording: Input) -> Iterator[tuple[int, int, bytes]]:
-    """(time, ESC, bytes) of a capture or of plain bytes."""
-    if isinstance(recording, CaptureInput):
-        return ((e.time_ns, e.esc, e.data) for e in recording.entries() if e.kind == Kind.BYTES)
-    if isinstance(recording, DumpInput):
-        return ((time_ns, 0, data) for time_ns, data in recording.chunks())
-    raise UserError(
-        f"{recording.name}: is a log of CAN frames, which has no bytes of ESCs. --on can is possible."
-    )

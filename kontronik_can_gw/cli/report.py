@@ -14,7 +14,6 @@ from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
 from kontronik_can_gw.errors import RunError, UserError
 
-_POINTS = number_from(100, 1_000_000, kind=int, problem="is not a number of points, 100 to 1000000")
 _SECONDS = number_from(0, 1e9)
 # fmt: off
 OPTIONS = (
@@ -22,8 +21,6 @@ OPTIONS = (
     option("-o --output FILE", "page to write, or - for standard output", required=True),
     option("--force", "replace FILE if it exists"),
     LAYOUT,
-    option("--points N", "points of a line, 100 to 1000000 (default 20000)", type=_POINTS, default=20_000),
-    option("--title TEXT", "the page's title (default: the name of IN)"),
     option("--from S", "begin at this time in seconds after the start", type=_SECONDS, dest="start"),
     option("--until S", "end at this time in seconds after the start", type=_SECONDS, dest="end"),
 )
@@ -34,12 +31,12 @@ bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). For a CAN log give the DBC of
 
 The page is one file that needs no network: plots with zoom, the operating states, errors with meaning and remedy, and the
 numbers (energy, charge, extremes with their time, cell voltage sag, quality of the data). Several ESCs share the plots.
-Numbers and events are from every row. Lines are reduced to --points points in a way that keeps every peak and every gap.
-The same recording gives the same page, byte for byte. A file that exists is only replaced with --force.
+Numbers and events are from every row. Lines are reduced to 20 000 points in a way that keeps every peak and every gap.
+The same recording gives the same page, byte for byte (where the same core plays it). A file that exists is only replaced with --force.
 
 examples:
   kontronik-can-gw report flight.kcap -o flight.html
-  kontronik-can-gw report bus.log -c gateway.toml -o climb.html --title "Climb with 6S"
+  kontronik-can-gw report bus.log -c gateway.toml -o bus.html
   kontronik-can-gw report flight.kcap -o part.html --from 60 --until 90
 
 exit codes: 0 done, 1 something cannot be read or written, or has no values; 2 wrong usage, or a file that is no recording
@@ -65,14 +62,13 @@ def main(args: argparse.Namespace) -> int:
             raise RunError(*damage, f"{args.input}: no values {where}")
         page = render(
             flight,
-            title=source.name if args.title is None else args.title,
             source=source.name,
             provenance=recording.provenance,
             wall_ns=recording.wall_ns(flight.origin_ns),
             damage=recording.damage,
         )
         write_output(args.output, page)
-    for line in (*(f"{args.input}: {note}" for note in recording.notes), *damage):
+    for line in damage:
         say(line, "report")
     return 0
 
@@ -96,18 +92,17 @@ def _analysed(recording: Input, args: argparse.Namespace) -> Flight | None:
     """The flight of all rows; None if the user stopped it. UserError where nothing could be shown."""
     chosen = needed_columns(recording.fields)
     fields = [recording.fields[index] for index in chosen]
-    analysis = Analysis(recording.bus.escs, fields, args.points, (args.start, args.end))
+    analysis = Analysis(recording.bus.escs, fields, window=(args.start, args.end))
     if not analysis.has_anything:
         raise UserError(
             f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
         )
     try:
         with Progress(recording.name, recording.size or None, args.output == "-") as progress:
-            for count, sample in enumerate(recording.samples(chosen)):
-                if not analysis.take(sample.time_ns, sample.values):
+            for block in filter(len, recording.blocks(chosen)):
+                if not analysis.take(block):
                     break
-                if not count & 1023:
-                    progress.reach(recording.position)
+                progress.reach(recording.position)
     except KeyboardInterrupt:
         return None
     return analysis.finish()

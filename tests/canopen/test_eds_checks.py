@@ -227,10 +227,8 @@ def entry_of(text: str, index: int = 0x2200, sub: int = 0) -> Entry:
 
 
 def test_a_missing_object_type_is_a_variable() -> None:
-    assert (
-        entry_of(with_object(variable(0x06).replace("ObjectType=0x7\r\n", ""))).object_type
-        == data_types.VAR
-    )
+    entry = entry_of(with_object(variable(0x06).replace("ObjectType=0x7\r\n", "")))
+    assert (entry.sub, entry.data_type) == (0, 0x06)
 
 
 def test_a_compact_error_history_begins_empty() -> None:

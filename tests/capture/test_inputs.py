@@ -11,9 +11,9 @@ from simulated_bus import write_log
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.inputs import (
+    BytesInput,
     CanLogInput,
     CaptureInput,
-    DumpInput,
     Input,
     open_input,
 )
@@ -111,7 +111,7 @@ def test_the_bytes_of_an_esc_come_out_as_they_went_in(tmp_path: Path) -> None:
         dump = tmp_path / f"{index}.bin"
         dump.write_bytes(data)
         with open_input(dump) as plain:
-            assert isinstance(plain, DumpInput)
+            assert isinstance(plain, BytesInput)
             assert plain.times_assumed
             assert b"".join(plain.esc_bytes(0)) == data
 

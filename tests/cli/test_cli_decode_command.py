@@ -1,32 +1,34 @@
-"""``kontronik-can-gw decode`` as a process: streams, files, exit codes, one clear line per mistake."""
+"""``kontronik-can-gw decode``: the table that ``convert`` makes of recorded UART bytes, on standard output."""
 
-import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
-from command_line import refused, run
+import pytest
+from command_line import refused, run, written
+
+from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
 
 # Recorded from a JIVE PRO 120, firmware 1.14, idle.
 LIVE = bytes.fromhex("4B4F444C000000008A0900000000000000000000581FE90300001D20000002000C0039234C14")
-COMMAND = [sys.executable, "-m", "kontronik_can_gw", "decode"]
 
 
-def test_a_stream_is_decoded_as_it_comes() -> None:
-    with subprocess.Popen(
-        [*COMMAND, "-"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as process:
-        assert process.stdin
-        assert process.stdout
-        for number in range(3):
-            process.stdin.write(LIVE)
-            process.stdin.flush()
-            # while the input is still open
-            assert json.loads(process.stdout.readline())["offset"] == number * 38
-        process.stdin.close()
-        assert process.stdout.read() == b""
-    assert process.returncode == 0
+@pytest.mark.parametrize(("option", "form"), [([], "jsonl"), (["--csv"], "csv")])
+def test_it_gives_what_convert_gives(tmp_path: Path, option: list[str], form: str) -> None:
+    flight = b"".join(sent.wire for sent in SimulatedEsc().frames_until(20 * 10**9))
+    file = written(tmp_path / "flight.bin", flight)
+    decoded = run("decode", file, *option)
+    assert decoded.code == 0
+    assert decoded.out == run("convert", file, "-", "--to", form).out
+    assert decoded.out.count("\n") == 2001 + (form == "csv")
+    assert "2001 rows" in decoded.err
+
+
+def test_every_file_is_taken_for_bytes_and_a_line_says_what_they_look_like(tmp_path: Path) -> None:
+    inverted = bytes(255 - byte for byte in LIVE) * 9
+    done = run("decode", written(tmp_path / "a.log", inverted))
+    assert (done.code, done.out) == (1, "")
+    assert "bytes but never KOD" in done.err
+    assert "24.42" in run("decode", written(tmp_path / "b.log", b"(1.5) can0 123#00\n" + LIVE)).out
 
 
 def test_an_unreadable_file_gives_one_clear_line_and_exit_code_1(tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ def test_a_name_that_is_too_long_is_one_line(
 # --- CAN interface
 
 
-@pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.log --on can"])
+@pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.bin --on can"])
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,7 +193,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     monkeypatch.chdir(tmp_path)
     port = tmp_path / "ttyESC"
     port.touch()
-    (tmp_path / "x.log").write_text("(1.000000) can0 681#0011\n")
+    (tmp_path / "x.bin").write_bytes(b"KODL")
     file = configuration(tmp_path, port)
     adapter = ["--interface", "slcan", "--channel", f"{port}@115200"]
     assert "nothing may be sent to an ESC" in refused(2, *words.split(), "-c", file, *adapter)

@@ -4,7 +4,6 @@ import struct
 
 import pytest
 
-from kontronik_can_gw.desk.recordings.decode import physical_fields
 from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
 from kontronik_can_gw.esc.kontronik import (
     Device,
@@ -181,27 +180,3 @@ def test_a_device_or_variant_that_does_not_fit_is_refused(device: int, variant: 
 )
 def test_the_firmware_is_main_and_sub_version(word: int, text: str) -> None:
     assert KONTRONIK.firmware_text(InfoData(firmware_word=word)) == text
-
-
-@pytest.mark.parametrize(
-    ("field", "raw", "physical"),
-    [
-        ("battery_voltage", 2442, 24.42),
-        ("battery_voltage", 10_000, 100.0),
-        ("battery_voltage", 65_535, 655.35),
-        ("battery_current", -10_000, -1000.0),
-        ("battery_current", -1, -0.1),
-        ("battery_current", -32_768, -3276.8),
-        ("peak_current", 1650, 165.0),
-        ("bec_current", 1234, 1.234),
-        ("bec_voltage", 8024, 8.024),
-        ("power_stage_temperature", -13, -13),
-        ("electrical_speed", 4_294_967_295, 4_294_967_295),
-        ("throttle", -100, -100),
-    ],
-)
-def test_a_value_in_its_unit_is_the_nearest_float_and_is_not_clipped(
-    field: str, raw: int, physical: float
-) -> None:
-    found = physical_fields(KONTRONIK, False, LiveData(**{field: raw}))[field]
-    assert (found, str(found)) == (physical, str(physical))

@@ -1,12 +1,11 @@
 """Reads what the commands wrote, by libraries that are not ours, and compares every value of every row with what must be there.
 
-Tables: pandas, json, pyarrow, asammdf. CAN logs: python-can's readers and cantools. The comparisons are whole columns by numpy.
+Tables: pandas, json, pyarrow. CAN logs: python-can's readers and cantools. The comparisons are whole columns by numpy.
 """
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import numpy as np
 from hour_recording import MS, SECOND, Times
 from hour_truth import (
     ALIVE,
-    INFO,
     JIVEPRO,
     LIVE,
     OPERATING_ERRORS,
@@ -113,8 +111,6 @@ def check_table(truth: Truth, path: Path) -> Verdict:
     """A table of the recording."""
     chunks = READERS[path.suffix](path, truth)
     wall_ns = truth.recording.wall_ns(truth.row_ns)
-    if path.suffix == ".mf4":  # it has one start, and goes on with the clock as it began
-        wall_ns = wall_ns[0] + truth.row_ns - truth.row_ns[0]
     return check_rows(
         path, chunks, truth.row_ns, truth.rows(), wall_ns, WALL_TOLERANCE[path.suffix]
     )
@@ -254,45 +250,15 @@ def parquet_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
         yield Chunk(_ns(batch.column("Time [s]").to_numpy()), wall, values)
 
 
-def mf4_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
-    """By asammdf, signal by signal."""
-    from asammdf import MDF
-
-    values: dict[str, Floats] = {}
-    with MDF(path) as mdf:
-        times: Any = None
-        start = int(mdf.header.start_time.astimezone(UTC).timestamp() * 1e6) * 1000
-        for name, places in mdf.channels_db.items():
-            if name.lower() == "time":
-                continue
-            assert len(places) == 1, f"{name} is there {len(places)} times"
-            signal = mdf.get(name)
-            if signal.unit != truth.value_units[name]:
-                raise AssertionError(
-                    f"{name}: unit {signal.unit!r}, must be {truth.value_units[name]!r}"
-                )
-            times = signal.timestamps
-            if signal.samples.dtype.kind in "SUO":
-                kinds, at = np.unique(signal.samples, return_inverse=True)
-                words = [kind.decode() if isinstance(kind, bytes) else str(kind) for kind in kinds]
-                values[name] = _texts(
-                    [None if w == "NotAvailable" else w for w in words], truth.value_texts[name]
-                )[at]
-            else:
-                values[name] = signal.samples.astype(np.float64)
-    yield Chunk(_ns(times), _ns(times) + start, values)
-
-
-TABLES = {"csv": "pandas", "jsonl": "json, pandas", "parquet": "pyarrow", "mf4": "asammdf"}
+TABLES = {"csv": "pandas", "jsonl": "json, pandas", "parquet": "pyarrow"}
 """Forms, and by what they are read."""
 READERS = {
     ".csv": csv_chunks,
     ".jsonl": jsonl_chunks,
     ".parquet": parquet_chunks,
-    ".mf4": mf4_chunks,
 }
-# text cuts at a microsecond, Parquet keeps nanoseconds, MF4 counts on from a start in microseconds
-WALL_TOLERANCE = {".csv": 999, ".jsonl": 999, ".parquet": 0, ".mf4": 1500}
+# text cuts at a microsecond, Parquet keeps nanoseconds
+WALL_TOLERANCE = {".csv": 999, ".jsonl": 999, ".parquet": 0}
 
 
 # --- CAN logs
@@ -486,44 +452,28 @@ def check_bytes(truth: Truth, esc: int, path: Path) -> Verdict:
     return verdict
 
 
-_WIRE_STEPS = dict([*LIVE.values(), *INFO.values(), ("bec_current", 1000)])
+_WIRE_STEPS = dict([*LIVE.values(), ("bec_current", 1000)])
 _WIRE_NAMES = {"operating_state": "operating_state_raw"}
 
 
 def check_decoded(truth: Truth, esc: int, path: Path) -> Verdict:
-    """The JSON lines of ``decode``: frames in their order, every field as meant."""
+    """The JSON lines of ``decode``: live frames in their order, every field as meant."""
     verdict = Verdict()
     one = truth.escs[esc]
-    kinds: dict[str, list[dict[str, Any]]] = {"live": [], "info": []}
     with path.open(encoding="utf-8") as file:
-        for line in file:
-            record = json.loads(line)
-            kinds[record["kind"]].append(record)
-    for kind, fields in (("live", one.live), ("info", one.info)):
-        records = kinds[kind]
-        verdict.rows += len(records)
-        count = len(next(iter(fields.values())))
-        if len(records) != count:
-            verdict.say(1, f"{kind}: {len(records)} frames, must be {count}")
-            continue
-        for name, raw in fields.items():
-            if name in ("device_and_variant", "firmware_word"):
-                continue
-            key = _WIRE_NAMES.get(name, name)
-            got = np.array(
-                [np.nan if r[key] is None else r[key] for r in records], dtype=np.float64
-            )
-            wanted = raw / _WIRE_STEPS.get(name, 1)
-            if name == "bec_current":
-                # of a JIVEPro none, as soon as an info frame has told what it is
-                wanted = np.where((one.devices == JIVEPRO) & np.isnan(got), np.nan, wanted)
-            elif name == "max_bec_current":
-                wanted = np.where(fields["device_and_variant"] >> 10 == JIVEPRO, np.nan, wanted)
-            verdict.column(name, got, wanted, wanted, 0)
-        if kind == "info":
-            pair = np.array([r["device_raw"] << 10 | r["variant"] for r in records], np.float64)
-            meant = fields["device_and_variant"].astype(np.float64)
-            verdict.column("device", pair, meant, meant, 0)
+        rows = [json.loads(line) for line in file]
+    verdict.rows, count = len(rows), len(next(iter(one.live.values())))
+    if len(rows) != count:
+        verdict.say(1, f"{len(rows)} rows, must be {count}")
+        return verdict
+    for name, raw in one.live.items():
+        key = _WIRE_NAMES.get(name, name)
+        got = np.array([np.nan if r[key] is None else r[key] for r in rows], dtype=np.float64)
+        wanted = raw / _WIRE_STEPS.get(name, 1)
+        if name == "bec_current":
+            # of a JIVEPro none, as soon as an info frame has told what it is
+            wanted = np.where((one.devices == JIVEPRO) & np.isnan(got), np.nan, wanted)
+        verdict.column(name, got, wanted, wanted, 0)
     return verdict
 
 

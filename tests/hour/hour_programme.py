@@ -3,7 +3,7 @@
     python tests/hour/hour_programme.py [--minutes 60] [--escs 1] [--folder DIR]
 
 Makes a capture of so many minutes without waiting (hour_recording.py), converts, decodes and reports it by the real commands as
-processes of their own, converts the CAN logs back, reads every file by pandas, pyarrow, asammdf, python-can and cantools (hour_check.py),
+processes of their own, converts the CAN logs back, reads every file by pandas, pyarrow, python-can and cantools (hour_check.py),
 and compares every value of every row with what the simulated ESCs meant (hour_truth.py). Prints a table of times and peak memory.
 Exits with 1 and the first differences where anything is not equal.
 """

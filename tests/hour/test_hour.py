@@ -193,7 +193,6 @@ def test_a_mutilated_file_is_found_out(
 def test_a_mutilated_file_of_libraries_and_of_bytes_is_found_out(
     minute: Minute, tmp_path: Path
 ) -> None:
-    from asammdf import MDF
     from pyarrow import compute, parquet  # type: ignore[import-untyped]
 
     found = parquet.read_table(minute.folder / "hour.parquet")
@@ -201,8 +200,6 @@ def test_a_mutilated_file_of_libraries_and_of_bytes_is_found_out(
     other = compute.add(found.column(place), 0.1)
     changed = found.set_column(place, found.schema.field(place), other)
     parquet.write_table(changed, tmp_path / "hour.parquet")
-    with MDF(minute.folder / "hour.mf4") as mdf:
-        mdf.cut(start=10, stop=50).save(tmp_path / "hour.mf4")
     data = bytearray((minute.folder / "esc1.bin").read_bytes())
     data[5000] ^= 1
     (tmp_path / "esc1.bin").write_bytes(data)

@@ -10,9 +10,10 @@ import equality
 from capture_bench import START, Bench, made
 
 from kontronik_can_gw.capture.format import Entry, Kind, block, data_payload, json_payload
-from kontronik_can_gw.desk.recordings import dump_input
+from kontronik_can_gw.desk.recordings import bytes_input
 from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
+from kontronik_can_gw.desk.recordings.recording import PlayedBlock
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.native import load
@@ -122,7 +123,7 @@ def run(library: Any, seed: int, folder: Path) -> int:
     write = write_capture if chance.random() < 0.6 else write_bytes
     path = write(chance, folder / f"{seed}.kcap")
     path = path if write is write_capture else path.rename(path.with_suffix(".bin"))
-    setattr(dump_input, "CHUNK", chance.choice((7, 100, 5000, 1 << 18)))  # noqa: B010
+    setattr(bytes_input, "CHUNK", chance.choice((7, 100, 5000, 1 << 18)))  # noqa: B010
     found = []
     part = {"start_ns": chance.choice((None, SECOND)), "end_ns": chance.choice((None, 3 * SECOND))}
     fields = range(len(open_input(path).fields))
@@ -130,7 +131,8 @@ def run(library: Any, seed: int, folder: Path) -> int:
     for which in (None, library):
         with core(which):
             recording = open_input(path)
-            assert (recording.blocks() is None) is (which is None)
+            played = all(isinstance(block, PlayedBlock) for block in recording.blocks())
+            assert played is (which is not None)
             read_once = read(recording, chosen)
             files = [
                 converted(recording, Choice(chosen, **part), form, folder / f"{seed}.{form}")

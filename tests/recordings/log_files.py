@@ -1,11 +1,15 @@
 """Logs of random CAN frames for the tests, written by our writer or by python-can's."""
 
 import random
+from functools import cache
 from pathlib import Path
 
 import can
 
-from kontronik_can_gw.desk.recordings.can_logs import CanLog, CanLogWriter
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.desk.recordings.log_input import CanLogInput
 from kontronik_can_gw.frames import CanFrame
 
 Item = tuple[int, CanFrame, bool]
@@ -56,11 +60,21 @@ def write_log(
         writer.close()
 
 
+@cache
+def _layout() -> BusLayout:
+    return layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+
+
+def opened(path: Path) -> CanLogInput:
+    """By our reader."""
+    return CanLogInput(path, _layout())
+
+
 def read_log(path: Path) -> tuple[list[Item], list[str]]:
-    """By our reader: frames with Unix times (if the log has them), and the damage."""
-    with CanLog(path) as log:
+    """Frames with Unix times (if the log has them), and the damage."""
+    with opened(path) as log:
         items = [
-            ((log.wall_start_ns or 0) + time_ns, frame, received)
+            ((log.wall_ns(0) or 0) + time_ns, frame, received)
             for time_ns, frame, received in log.frames()
         ]
         return items, log.damage

@@ -11,14 +11,15 @@ from log_files import (
     SUFFIX,
     Item,
     at_wall,
+    opened,
     read_by_library,
     read_log,
     some_frames,
     write_log,
 )
 
-from kontronik_can_gw.desk.recordings.can_logs import CanLog, CanLogWriter
 from kontronik_can_gw.desk.recordings.can_logs.log import log_format
+from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 
@@ -104,7 +105,7 @@ def test_a_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
         "(1700000000.000006) vcan0 123#1122334455667788_E T\n"
         "(1700000000.000007) can0 7FF#AA R"
     )
-    with CanLog(path) as log:
+    with opened(path) as log:
         found = list(log.frames())
         assert log.damage == []
     at = 1_700_000_000_000_000_000
@@ -128,9 +129,9 @@ def test_what_candump_shows_on_the_screen_is_read(tmp_path: Path) -> None:
         " (1700000000.000006)  can0  123   [0] \n"
         " (1700000000.000007)  can0  123   [3]  00 11\n"
     )
-    with CanLog(path) as log:
+    with opened(path) as log:
         found = list(log.frames())
-        assert log.wall_start_ns == 0
+        assert log.wall_ns(0) == 0
         assert log.damage == ["1 damaged line: 7"]
     at = 1_700_000_000_000_000_000
     assert found == [
@@ -157,11 +158,11 @@ def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> Non
         "   0.000500 1  291             Rx   r\n"
         "End TriggerBlock\n"
     )
-    with CanLog(path) as log:
+    with opened(path) as log:
         found = list(log.frames())
         assert log.damage == []
-        assert log.wall_start_ns is not None
-        assert log.wall_start_ns % 1_000_000_000 == 250_000_000
+        assert log.wall_ns(0) is not None
+        assert (log.wall_ns(0) or 0) % 1_000_000_000 == 250_000_000
     assert found == [
         (10_000_000, CanFrame(1665, b"\x00\x11\xff"), True),
         (30_000_000, CanFrame(291, b"", True), False),
@@ -214,11 +215,11 @@ def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
     rubbish.write_text("no log\n")
     assert log_format(rubbish) is None
     with pytest.raises(UserError, match="is no CAN log that is known"):
-        CanLog(rubbish)
+        opened(rubbish)
     with pytest.raises(RunError, match="cannot be opened: No such file"):
-        CanLog(tmp_path / "missing.log")
+        opened(tmp_path / "missing.log")
     with pytest.raises(RunError, match="cannot be opened: Is a directory"):
-        CanLog(tmp_path)
+        opened(tmp_path)
 
 
 def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:

@@ -64,17 +64,17 @@ def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_err
     assert "times are assumed: 50 live frames a second" in done.err
 
 
-@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "mf4", "candump", "blf", "mf4-log"])
+@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "candump", "blf", "mf4-log"])
 def test_nothing_to_convert_leaves_nothing(
     tmp_path: Path, form: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = tmp_path / "other.log"
     source.write_text(
-        "(1700000000.000000) can0 123#00\n" if form in ("csv", "jsonl", "parquet", "mf4") else "\n"
+        "(1700000000.000000) can0 123#00\n" if form in ("csv", "jsonl", "parquet") else "\n"
     )
     said = refused(1, "convert", source, tmp_path / "out", "--to", form)
     assert f"{source}: nothing in it can be converted" in said
-    assert "--dbc" in said or form not in ("csv", "jsonl", "parquet", "mf4")
+    assert "--dbc" in said or form not in ("csv", "jsonl", "parquet")
     assert [path.name for path in tmp_path.iterdir()] == ["other.log"]
 
 
@@ -83,7 +83,7 @@ def test_nothing_to_convert_leaves_nothing(
 
 @pytest.mark.parametrize(
     ("module", "form", "extra"),
-    [("pyarrow", "parquet", "parquet"), ("asammdf", "mf4", "mf4"), ("asammdf", "mf4-log", "mf4")],
+    [("pyarrow", "parquet", "parquet"), ("asammdf", "mf4-log", "mf4")],
 )
 def test_a_missing_library_is_named_with_its_extra(
     dump: Path,
@@ -103,7 +103,7 @@ def test_a_missing_library_is_named_with_its_extra(
 # --- when it cannot go on
 
 
-@pytest.mark.parametrize("form", ["csv", "parquet", "mf4", "asc", "blf", "mf4-log"])
+@pytest.mark.parametrize("form", ["csv", "parquet", "asc", "blf", "mf4-log"])
 def test_a_full_disk_is_one_line_and_leaves_nothing(dump: Path, tmp_path: Path, form: str) -> None:
     def small() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))

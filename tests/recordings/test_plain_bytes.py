@@ -11,8 +11,9 @@ from esc.sheet import LIVE_STRUCT
 from esc.streams import random_stream
 from recordings import convert, dump_bytes
 
-from kontronik_can_gw.desk.recordings import dump_input
-from kontronik_can_gw.desk.recordings.dump_input import DumpInput
+from kontronik_can_gw.capture.format import Kind
+from kontronik_can_gw.desk.recordings import bytes_input
+from kontronik_can_gw.desk.recordings.bytes_input import BytesInput
 
 NAMES = ("electrical_speed", "battery_voltage", "battery_current")
 PERIOD_NS = 20_000_000
@@ -28,10 +29,10 @@ STREAMS: dict[str, Callable[[random.Random], bytes]] = {
 }
 
 
-def recording(tmp_path: Path, stream: bytes, live_rate: float) -> DumpInput:
+def recording(tmp_path: Path, stream: bytes, live_rate: float) -> BytesInput:
     path = tmp_path / "esc.bin"
     path.write_bytes(stream)
-    return DumpInput(path, None, live_rate)
+    return BytesInput(path, None, live_rate)
 
 
 def assumed_times(found: list[Found]) -> list[int]:
@@ -54,17 +55,18 @@ def test_rows_are_the_frames_that_brute_force_finds(
 ) -> None:
     """However the file is read: small reads put every limit of a read anywhere in a frame and in rubbish."""
     source = random.Random(f"{kind} {seed}")
-    monkeypatch.setattr(dump_input, "CHUNK", source.choice([1, 7, 44, 100, 5000, 1 << 18]))
+    monkeypatch.setattr(bytes_input, "CHUNK", source.choice([1, 7, 44, 100, 5000, 1 << 18]))
     stream = STREAMS[kind](source)
     dump = recording(tmp_path, stream, live_rate=1e9 / PERIOD_NS)
     found = frames_of(stream)
     times = assumed_times(found)
 
     at, ends = 0, {}
-    for time_ns, data in dump.chunks():
-        assert data
-        at += len(data)
-        ends[at] = time_ns
+    for entry in dump.entries():
+        if entry.kind == Kind.BYTES:
+            assert entry.data
+            at += len(entry.data)
+            ends[at] = entry.time_ns
     assert at == len(stream)
     assert [ends[frame.end] for frame in found] == times
 

@@ -6,14 +6,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import asammdf
+import numpy as np
 import pytest
 from command_line import refused, run
-from log_files import SUFFIX, some_frames, write_log
+from log_files import SUFFIX
 from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
 from simulated_bus import flight, layout_of
 from simulated_bus import write_log as write_bus_log
 
-from kontronik_can_gw.desk.recordings.can_logs import NAMES, CanLog
+from kontronik_can_gw.desk.recordings.can_logs.log import NAMES
 
 
 def program(
@@ -87,10 +89,13 @@ def test_a_stream_without_a_recording_is_one_line(tmp_path: Path, command: str, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_log_of_several_escs_by_the_dbc_of_one_is_told(tmp_path: Path) -> None:
+def test_frames_that_the_dbc_does_not_have_are_counted_and_the_remedy_is_said(
+    tmp_path: Path,
+) -> None:
     log = write_bus_log(tmp_path / "bus.log", flight(layout_of(["a", "b", "c"]), 2))
-    assert "those of 3 ESCs" in run("convert", log, tmp_path / "o.csv").err
-    assert "look like" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
+    said = run("convert", log, tmp_path / "o.csv").err
+    assert "frames left out that kontronik_esc.dbc does not have (-c or --dbc gives" in said
+    assert "left out" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
 
 
 # --- content before names
@@ -112,21 +117,6 @@ def test_rubbish_with_the_name_of_a_log_is_one_line(
     assert said == f"{path}: is no {NAMES[format_]}, whatever its name says, and no other recording"
 
 
-@pytest.mark.parametrize("format_", ["candump", "asc"])
-def test_a_log_whose_beginning_is_damaged_is_read_from_where_it_is_whole(
-    tmp_path: Path, format_: str
-) -> None:
-    items = some_frames(20_000)
-    path = tmp_path / f"x{SUFFIX[format_]}"
-    write_log(path, format_, items)
-    content = bytearray(path.read_bytes())
-    content[: 1 << 16] = bytes(n % 251 | 128 for n in range(1 << 16))
-    path.write_bytes(content)
-    with CanLog(path) as log:
-        assert len(list(log.frames())) > 3000
-        assert log.damage
-
-
 def test_a_huge_hole_is_refused_without_reading_it(tmp_path: Path) -> None:
     path = tmp_path / "hole.log"
     with path.open("wb") as file:
@@ -135,12 +125,23 @@ def test_a_huge_hole_is_refused_without_reading_it(tmp_path: Path) -> None:
 
 
 def test_a_table_in_mf4_is_told_from_a_log(tmp_path: Path) -> None:
-    log = write_candump(tmp_path / "bus.log", candump_lines(300))
     table = tmp_path / "table.mf4"
-    for more in ([], ["--frames", "--force"]):
-        assert convert(log, table, *more) == 0
-        said = refused(2, "convert", table, tmp_path / "o.csv")
-        assert "table.mf4: is a table of values (an MF4 measurement), no log of a CAN bus." in said
+    values = np.array([1.0, 2.0])
+    with asammdf.MDF() as mdf:
+        mdf.append(asammdf.Signal(values, timestamps=values, name="BatteryVoltage"))
+        mdf.save(table)
+    said = refused(2, "convert", table, tmp_path / "o.csv")
+    assert "table.mf4: is a table of values (an MF4 measurement), no log of a CAN bus." in said
 
 
-# --- options, channel, signals
+@pytest.mark.parametrize(
+    ("words", "remedy"),
+    [
+        (["o.mf4"], "Type --to parquet (or csv) for a table, or --to mf4-log for the CAN frames"),
+        (["o.x", "--to", "mf4"], "Type --to parquet (or csv) for a table, or --to mf4-log"),
+        (["o.csv", "--frames"], "cantools decode"),
+        (["o.jsonl", "--units-line"], "Type --to csv or --to parquet, which have the units"),
+    ],
+)
+def test_what_was_removed_says_what_to_type(words: list[str], remedy: str) -> None:
+    assert remedy in refused(2, "convert", "flight.kcap", *words)

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,17 +21,17 @@ from recordings import (
     capture_bytes,
     convert,
     dump_bytes,
-    shipped_database,
     write_candump,
 )
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.columns import fields_of_values
+from kontronik_can_gw.desk.recordings.convert import _table_writer
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table, distinct
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
+from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.desk.recordings.tables.rows import Choice, Row, thinned
-from kontronik_can_gw.desk.recordings.tables.writers import open_table
+from kontronik_can_gw.desk.recordings.tables.rows import Choice, thinned
 from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.stream import EscStream
@@ -60,7 +59,7 @@ def read_csv(path: Path, fields: dict[str, Any]) -> Cells:
         cells: dict[str, Any] = {}
         for header, text in record.items():
             name = _unit(str(header))
-            is_text = name in ("Utc", "Id", "Message") or (name in fields and fields[name].texts)
+            is_text = name == "Utc" or (name in fields and fields[name].texts)
             cells[name] = None if text == "" else text if is_text else float(text)
         rows.append(cells)
     return rows
@@ -82,33 +81,10 @@ def read_parquet(path: Path, _: dict[str, Any]) -> Cells:
     return rows
 
 
-def read_mf4(path: Path, fields: dict[str, Any]) -> Cells:
-    mdf = asammdf.MDF(path)
-    signals = {name: mdf.get(name) for name in fields}
-    start = mdf.header.start_time.timestamp()
-    first = next(iter(signals.values()))
-    rows: Cells = []
-    for index, stamp in enumerate(first.timestamps):
-        cells: dict[str, Any] = {"Time": float(stamp)}
-        if start:
-            moment = datetime.fromtimestamp(start, UTC) + pd.Timedelta(seconds=float(stamp))
-            cells["Utc"] = moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
-        for name, signal in signals.items():
-            value = signal.samples[index]
-            if isinstance(value, bytes):
-                cells[name] = None if value == b"NotAvailable" else value.decode()
-            else:
-                cells[name] = None if math.isnan(value) else float(value)
-        rows.append(cells)
-    mdf.close()
-    return rows
-
-
 READ: dict[str, Callable[[Path, dict[str, Any]], Cells]] = {
     "csv": read_csv,
     "jsonl": read_jsonl,
     "parquet": read_parquet,
-    "mf4": read_mf4,
 }
 
 
@@ -152,94 +128,7 @@ def test_every_format_reads_back_equal(tmp_path: Path, recording: Path, form: st
     found = READ[form](out, fields)
     assert len(found) == len(expected) > 100
     for one, other in zip(found, expected, strict=True):
-        if form == "mf4" and "Utc" in one:  # a float of seconds behind the start
-            apart = abs(pd.Timestamp(one["Utc"]) - pd.Timestamp(other["Utc"]))
-            assert apart < pd.Timedelta(microseconds=2)
-            one["Utc"] = other["Utc"]
         assert one == other
-
-
-_BESIDE_FLAGS = {
-    "EscStatus": ("OperatingState", "OperatingStateRaw", "PowerStageTemperature"),
-    "EscInfo": ("Variant", "FirmwareMain", "FirmwareSub", "Device", "DeviceRaw"),
-}
-"""A flag has no code for not available: it is that where all that is of the same ESC's frame in its message is."""
-
-
-def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
-    """A row for each frame, by cantools."""
-    database = shipped_database()
-    rows: Cells = []
-    for us, can_id, data in lines:
-        message = database.get_message_by_frame_id(can_id)
-        values = message.decode(data, decode_choices=True)
-        assert isinstance(values, dict)
-        gone: set[str] = set()
-        cells: dict[str, Any] = {
-            "Time": (us - lines[0][0]) / 1e6,
-            "Id": f"{can_id:03X}",
-            "Message": message.name,
-        }
-        for signal in message.signals:
-            value: Any = values[signal.name]
-            if str(value) == "NotAvailable":
-                gone.add(signal.name)
-            choices = {number: str(text) for number, text in (signal.choices or {}).items()}
-            if isinstance(value, cantools.database.namedsignalvalue.NamedSignalValue):
-                value = None if str(value) in ("NotAvailable", "Error") else str(value)
-            elif set(choices.values()) - {"NotAvailable", "Error"}:
-                value = None  # a number that the DBC has no text for
-            cells[signal.name] = value
-        witnesses = _BESIDE_FLAGS.get(message.name)
-        if witnesses and gone.issuperset(witnesses):
-            cells |= {signal.name: None for signal in message.signals if signal.length == 1}
-        rows.append(cells)
-    return rows
-
-
-def equal(found: Any, expected: Any) -> bool:
-    return bool(
-        found == (pytest.approx(expected, abs=1e-9) if isinstance(expected, float) else expected)
-    )
-
-
-@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet"])
-def test_rows_of_frames_are_what_cantools_reads(tmp_path: Path, form: str) -> None:
-    lines = candump_lines(1000, seed=4)
-    source = write_candump(tmp_path / "bus.log", lines)
-    out = tmp_path / f"out.{form}"
-    assert convert(source, out, "--frames") == 0
-    with open_input(source) as opened:
-        fields = {column.name: column for column in opened.reader.columns}
-    found = READ[form](out, fields)
-    expected = decoded(lines)
-    assert len(found) == len(expected)
-    for one, other in zip(found, expected, strict=True):
-        of_message = {name for name in other if name in fields}
-        for name in ("Time", "Id", "Message", *of_message):
-            assert equal(one[name], other[name]), name
-        others = {name: one[name] for name in one.keys() & fields.keys() - of_message}
-        assert not others if form == "jsonl" else set(others.values()) <= {None}
-
-
-def test_mf4_of_frames_has_a_group_for_each_message(tmp_path: Path) -> None:
-    lines = candump_lines(1000, seed=5)
-    out = tmp_path / "out.mf4"
-    assert convert(write_candump(tmp_path / "bus.log", lines), out, "--frames") == 0
-    with asammdf.MDF(out) as mdf:
-        messages = [m for m in shipped_database().messages if any(s.name in mdf for s in m.signals)]
-        groups: list[Any] = list(mdf.groups)
-        assert [group.channel_group.acq_name for group in groups] == [m.name for m in messages]
-        for message in messages:
-            rows = [row for row in decoded(lines) if row["Message"] == message.name]
-            for signal in (one for one in message.signals if one.name in mdf):
-                found = mdf.get(signal.name)
-                assert found.unit == (signal.unit or "")
-                assert all(map(equal, found.timestamps.tolist(), [row["Time"] for row in rows]))
-                for sample, row in zip(found.samples, rows, strict=True):
-                    value = sample.decode() if isinstance(sample, bytes) else float(sample)
-                    missing = value == "NotAvailable" or value != value
-                    assert equal(None if missing else value, row[signal.name])
 
 
 def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
@@ -250,7 +139,6 @@ def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
     with (tmp_path / "out.csv").open() as file:
         heads = next(csv.reader(file))
     schema = parquet.read_schema(tmp_path / "out.parquet")
-    mdf = asammdf.MDF(tmp_path / "out.mf4")
     with open_input(source) as opened:
         fields = opened.fields
         provenance = opened.provenance
@@ -266,21 +154,18 @@ def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
     }
     assert {name: schema.field(name).type for name in types} == types
     for one, head in zip(fields, expected[2:], strict=True):
-        assert schema.field(head).metadata[b"unit"].decode() == mdf.get(one.name).unit == one.unit
+        assert schema.field(head).metadata[b"unit"].decode() == one.unit
     assert json.loads(schema.metadata[b"kontronik_can_gw"]) == provenance
-    assert all(f"{key}: {value}" in mdf.header.comment for key, value in provenance.items())
-    assert 0 <= mdf.header.start_time.timestamp() - WALL_NS / 1e9 < 0.1
-    mdf.close()
 
 
 def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_path: Path) -> None:
     source = tmp_path / "learnt.kcap"
     source.write_bytes(capture_bytes(devices=("KOSMIK",)))
-    for arguments in ((), ("--to", "mf4-log")):
-        assert convert(source, tmp_path / "out.mf4", *arguments, "--force") == 0
-        with asammdf.MDF(tmp_path / "out.mf4") as mdf:
-            assert "e0: KOSMIK 200, firmware 1.2, V4 layout, at /dev/ttyUSB0" in mdf.header.comment
-            assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
+    assert convert(source, tmp_path / "out.mf4", "--to", "mf4-log") == 0
+    with asammdf.MDF(tmp_path / "out.mf4") as mdf:
+        assert "e0: KOSMIK 200, firmware 1.2, V4 layout, at /dev/ttyUSB0" in mdf.header.comment
+        assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
+        assert 0 <= mdf.header.start_time.timestamp() - WALL_NS / 1e9 < 0.1
 
 
 # --- what is wanted of it
@@ -316,12 +201,14 @@ def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Pa
 def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(
     times: list[int], rate: float
 ) -> None:
-    rows = [Row(time_ns, None, (index,)) for index, time_ns in enumerate(sorted(times))]
-    thin = list(thinned(iter(rows), rate))
-    assert thin[-1:] == rows[-1:]
-    assert all(row in rows for row in thin)
+    rows = [*enumerate(sorted(times))]
+    blocks = [rows[at : at + 7] for at in range(0, len(rows), 7)]
+    made = (Block([at for _, at in some], [[n for n, _ in some]], None) for some in blocks)
+    thin = [row for block in thinned(made, rate, 0) for row in block.rows()]
+    assert [(row.values[0], row.time_ns) for row in thin][-1:] == rows[-1:]
+    assert all((row.values[0], row.time_ns) in rows for row in thin)
     slots = [int(row.time_ns // (1e9 / rate)) for row in thin]
-    assert len(slots) == len(set(slots)) == len({int(row.time_ns // (1e9 / rate)) for row in rows})
+    assert len(slots) == len(set(slots)) == len({int(at // (1e9 / rate)) for _, at in rows})
 
 
 def test_names_that_are_there_twice_get_their_message_in_front() -> None:
@@ -346,7 +233,7 @@ FIELDS = (
 )
 ROW = st.tuples(
     st.integers(0, 10**13),
-    st.one_of(st.none(), st.integers(0, 4 * 10**18)),
+    st.integers(0, 4 * 10**18),
     st.tuples(
         st.sampled_from((None, 0, 1)),
         st.one_of(st.none(), st.integers(-(1 << 52), 1 << 52)),
@@ -367,17 +254,19 @@ def test_any_values_read_back_equal(
     rows.sort(key=lambda row: row[0])
     path = tmp_path / f"any.{form}"
     table = Table(FIELDS, has_utc)
-    with path.open("wb") as file:
-        by_path = form in ("parquet", "mf4")
-        with open_table(path if by_path else file, form, table) as writer:
-            for time_ns, wall_ns, values in rows:
-                writer.write(Row(time_ns, wall_ns, values))
+    with (
+        path.open("wb") as file,
+        _table_writer(path if form == "parquet" else file, form, table) as writer,
+    ):
+        for time_ns, wall_ns, values in rows:
+            columns = [[value] for value in values]
+            writer.write(Block([time_ns], columns, wall_ns - time_ns))
     found = READ[form](path, {field.name: field for field in FIELDS})
     assert len(found) == len(rows)
     for cells, (time_ns, wall_ns, values) in zip(found, rows, strict=True):
         assert round(cells["Time"] * 1e9) == time_ns
-        if has_utc and form != "mf4":
-            assert cells["Utc"] == (None if wall_ns is None else utc_text(wall_ns))
+        if has_utc:
+            assert cells["Utc"] == utc_text(wall_ns)
         assert tuple(cells[field.name] for field in FIELDS) == values
 
 

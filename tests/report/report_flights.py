@@ -4,12 +4,14 @@ import base64
 import gzip
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any
 
 from simulated_bus import flight, layout_of
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
 from kontronik_can_gw.desk.report.analysis import Analysis
 from kontronik_can_gw.desk.report.flight import Flight
@@ -44,8 +46,10 @@ def analysis_of(
 
 def analysed(analysis: Analysis, rows: Iterable[Row]) -> Flight:
     """The flight of these rows."""
-    for time_ns, values in rows:
-        if not analysis.take(time_ns, values):
+    every = iter(rows)
+    while some := list(islice(every, 100)):
+        times, values = zip(*some, strict=True)
+        if not analysis.take(Block(times, [*zip(*values, strict=True)], None)):
             break
     return analysis.finish()
 

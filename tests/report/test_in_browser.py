@@ -54,7 +54,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory, one: Flight) -> dict[str, Pa
     written = {}
     for name, flight, title in (("one", one, "One"), ("two", flown("left", "right"), EVIL)):
         written[name] = folder / f"{name}.html"
-        html = render(flight, title=title, source="flight.kcap", provenance={EVIL: EVIL}, wall_ns=S)
+        html = render(flight, source=title, provenance={EVIL: EVIL}, wall_ns=S)
         written[name].write_text(html, encoding="utf-8")
     return written
 

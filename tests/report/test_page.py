@@ -54,7 +54,7 @@ class Tags(HTMLParser):
 
 
 def test_the_page_asks_for_nothing_and_its_policy_names_what_may_run(flight: Flight) -> None:
-    html = render(flight, title="x", source="y")
+    html = render(flight, source="y")
     tags = Tags(html)
     for tag, attributes in tags.found:
         assert tag not in ("link", "img", "iframe", "object", "embed", "base", "form"), tag
@@ -81,7 +81,7 @@ def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
     flight.missing.append(EVIL)
     flight.events[0].text = flight.events[0].remedy = EVIL
     known = {EVIL: EVIL, "program": EVIL}
-    html = render(flight, title=EVIL, source=EVIL, provenance=known, wall_ns=1, damage=[EVIL])
+    html = render(flight, source=EVIL, provenance=known, wall_ns=1, damage=[EVIL])
     tags = Tags(html)
     assert [t for t, _ in tags.found].count("script") == 3
     assert "img" not in [t for t, _ in tags.found]
@@ -94,7 +94,7 @@ def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
 
 
 def test_the_data_in_the_page_are_those_of_the_lines(flight: Flight) -> None:
-    found = data_of(render(flight, title="x", source="y"))
+    found = data_of(render(flight, source="y"))
     assert found["times"] == [round((t - flight.origin_ns) / S, 6) for t in flight.times]
     written = [
         (series["esc"], plot["title"], plot["lines"][series["line"]], series["values"])
@@ -125,7 +125,7 @@ def test_what_the_dbc_does_not_have_is_left_out_and_reported(tmp_path: Path) -> 
     bus = layout_of_dbc(file)
     found = analysed(analysis_of(bus), simulated(bus, 12))
     assert found.missing == ["BEC current", "BEC voltage"]
-    html = render(found, title="x", source="y")
+    html = render(found, source="y")
     assert "Not in the DBC, so not here: BEC current, BEC voltage." in html
 
 
@@ -134,7 +134,7 @@ def test_infinite_values_of_float_signals_are_not_drawn() -> None:
     rows = list(simulated(bus, 1))
     at = column(bus, "bec_voltage")
     rows[50][1][at] = math.inf
-    found = data_of(render(analysed(analysis_of(bus), rows), title="x", source="y"))
+    found = data_of(render(analysed(analysis_of(bus), rows), source="y"))
     (plot,) = (plot for plot in found["plots"] if plot["key"] == "bec_voltage")
     assert plot["series"][0]["values"][50] is None
     assert plot["series"][0]["values"][51] is not None

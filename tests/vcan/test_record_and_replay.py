@@ -106,18 +106,16 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
         was, is_now = by_id(on_bus), by_id(logged)
         assert was == is_now or "suspended" in gateway.log
         assert all(is_part(data, is_now[can_id]) for can_id, data in was.items())
-        # on another bus, in real time times three; and the log itself likewise
-        for source, marked in ((folder, False), (log, False), (folder, True)):
+        # on another bus, in real time times three
+        for marked in (False, True):
             with Candump(second_vcan) as replayed:
                 words = f"--on can --channel {second_vcan} --speed 3".split()
-                done = program("replay", source, *words, *([] if marked else ["--unmarked"]))
+                done = program("replay", folder, *words, *([] if marked else ["--unmarked"]))
                 assert done.returncode == 0, done.stderr
                 assert f"{len(logged)} frames to {second_vcan}" in done.stderr
                 wait_for(lambda r=replayed: len(r.frames) >= len(logged), "all frames")  # type: ignore[misc]
             if not marked:
                 assert by_id(frames_of(replayed)) == by_id(logged)
-                if source is log:
-                    assert frames_of(replayed) == logged
                 continue
             state = shipped_message("GatewayStatus")
             shown, were = by_id(frames_of(replayed)), by_id(logged)

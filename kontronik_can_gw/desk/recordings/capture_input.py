@@ -1,78 +1,122 @@
-"""Captures of one run, as a recording."""
+"""Captures of one run, in the order of their parts: header, data blocks, the wall clock, and an account of what is damaged."""
 
 import re
 import tomllib
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
+from kontronik_can_gw.capture.format import Block as DataBlock
 from kontronik_can_gw.capture.format import (
+    Damage,
+    Entry,
     Kind,
+    Scanner,
     entry_at,
+    read_entries,
+    read_json,
+    read_number,
 )
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.blocks import NO_MESSAGES, RowBlock, player_of, timed
-from kontronik_can_gw.desk.recordings.capture_files import CaptureFiles
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
-from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
-from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.gateway import Gateway, MakeOutput
+from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
+from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock, timed
+from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
+    from kontronik_can_gw.gateway import Gateway
     from kontronik_can_gw.native.offline import Frames, Rows
     from kontronik_can_gw.native.player import Player
 
+Damaged = Callable[[str], None]
+CHUNK = 1 << 18
 _PLAYED = frozenset({Kind.BYTES, Kind.ADVANCE, Kind.COUNTERS})
 """What a player plays, and by which frames of the turn before are certain."""
+_LOOK_FOR_HEADER = 1 << 25
+_MAX_DAMAGE = 50
+_LATEST_NS = 1 << 62
 
 
-class CaptureInput(CaptureFiles):
-    """Captures of one run, in the order of their parts, played through the gateway's core."""
+class CaptureInput(PlayedInput):
+    """Captures of one run, played through the gateway's core."""
 
     def __init__(self, paths: Sequence[Path], layout: BusLayout | None = None) -> None:
-        size = self._open(paths)
+        self._paths = list(paths)
+        self._headerless: list[str] = []
+        self._file: IO[bytes] | None = None
+        self.position = 0
+        self.header = self._first_header()
         first = self._paths[0]
         try:
-            self.setup = CaptureSetup.of(self.header)
-            found = self.setup.database()
-            self.setup.gateway(NO_MESSAGES if found is None else found[1], 0)
+            setup = CaptureSetup.of(self.header)
+            found = setup.database()
+            setup.gateway(NO_MESSAGES if found is None else found[1], 0)
         except Exception as error:  # a header may hold anything
             problems = error.problems if isinstance(error, UserError) else [str(error)]
             raise UserError(*(f"{first}: {problem[:400]}" for problem in problems)) from None
         name = str(first)
         if len(self._paths) > 1:
             name = f"{first.parent}/{first.stem.rpartition('-')[0]}"
-        self.sent_layout = NO_MESSAGES if found is None else found[1]
-        """Of the frames; that of the rows, ``bus``, may be another one."""
         if layout is not None:
-            layout = shown_by(layout, self.setup.escs)
+            layout = shown_by(layout, setup.escs)
         elif found is not None:
-            layout = BusLayout(found[0], found[1], self.setup.escs)
+            layout = BusLayout(found[0], found[1], setup.escs)
         else:
-            layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), self.setup.escs)
-        super().__init__(name, layout, size)
-        self._devices = list(self.header.get("devices") or [])
+            layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), setup.escs)
+        try:
+            size = sum(path.stat().st_size for path in self._paths)
+        except OSError as error:
+            raise RunError(f"{error.filename}: cannot be read: {error.strerror}.") from None
+        super().__init__(name, layout, size, setup)
+        self.sent_layout = NO_MESSAGES if found is None else found[1]
+        self.created_ns = int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
+        self._last_ns = self._impossible = 0
+        self._offsets: list[tuple[int, int]] = []
+        self._devices: list[Any] = list(self.header.get("devices") or [])
         self._describe()
 
-    def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
-        for frames in self.batches(marked):
-            yield from timed(frames)
+    def wall_ns(self, time_ns: int) -> int | None:
+        header = self.header
+        begun = int(header.get("wall_ns") or 0) - int(header.get("monotonic_ns") or 0)
+        offsets = (offset for since, offset in reversed(self._offsets) if since <= time_ns)
+        return time_ns + next(offsets, begun)
 
-    def batches(self, marked: bool = False) -> "Iterator[list[TimedFrame] | Frames]":
-        """``marked``: the gateway's state in the frames is REPLAY."""
-        found, player, now = None, None, self._created_ns
-        has_frames_of_its_own = self.setup.canopen is not None or self.setup.outputs
-        if self.setup.version > 1 and not has_frames_of_its_own:
-            found = player_of(lambda _: self.setup.gateway(self.sent_layout, now), None, (), now)
-        if found is None:
-            gateway = self.setup.gateway(self.sent_layout, now)
-        else:
-            player, gateway = found
+    @property
+    def channel(self) -> str:
+        try:
+            channel = str(tomllib.loads(self.setup.configuration)["can"]["channel"])
+        except (ValueError, LookupError, TypeError, RecursionError):
+            channel = ""
+        return channel if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII) else "can0"
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def entries(self) -> Iterator[Entry]:
+        """All entries. What is damaged is left out, and reported in ``damage``."""
+        for payload, damaged in self._data():
+            yield from self._entries_of(payload, damaged)
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        for entry in self.entries():
+            if entry.kind == Kind.BYTES and entry.esc == esc:
+                yield entry.data
+
+    def _play(self, gateway: "Gateway", player: "Player | None" = None) -> Iterator[object]:
+        replay = Replay(gateway, self.header.get("state"))
+        yield from self._steps(replay, player)
+        self._add_losses(replay)
+
+    def _play_frames(
+        self, gateway: "Gateway", player: "Player | None", marked: bool
+    ) -> "Iterator[list[TimedFrame] | Frames]":
         replay = Replay(gateway, self.header.get("state"), marked)
         for frames in self._steps(replay, player):
             if player is not None and len(sent := player.take_frames()):
@@ -83,58 +127,15 @@ class CaptureInput(CaptureFiles):
         yield replay.finish()
         self._add_losses(replay)
 
-    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        fields = [self.fields[index] for index in self._chosen(chosen)]
-        makers: list[RowMaker] = []
-
-        def make(*of_gateway: Any) -> RowMaker:
-            makers.append(RowMaker(fields, *of_gateway))
-            return makers[0]
-
-        replay = Replay(self._silent_gateway((make,)), self.header.get("state"))
-        for _ in self._steps(replay):
-            yield from makers[0].take_rows()
-        yield from makers[0].finish()
-        self._add_losses(replay)
-
-    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:
-        fields = [self.fields[index] for index in self._chosen(chosen)]
-        found = None
-        if self.setup.version > 1:
-            now = self._created_ns
-            found = player_of(self._silent_gateway, fields, self.bus.escs, now)
-        return None if found is None else self._blocks_of(*found)
-
-    def _blocks_of(self, player: "Player", gateway: Gateway) -> Iterator[RowBlock]:
-        replay = Replay(gateway, self.header.get("state"))
-        is_first = True
-        for _ in self._steps(replay, player):
-            if player.is_full or (is_first and player.has_rows):
-                is_first = False
-                yield from self._timed(player.take_rows())
-        yield from self._timed(player.take_rows(final=True))
-        self._add_losses(replay)
-
-    def _timed(self, rows: "Rows") -> Iterator[RowBlock]:
+    def _timed(self, rows: "Rows") -> Iterator[Block]:
         """Blocks of rows in which the wall clock goes on as it began."""
         times = rows.times
         cuts = {bisect_left(times, since) for since, _ in self._offsets}
         for begin, end in pairwise(sorted({0, rows.count, *cuts})):
             wall_ns = self.wall_ns(times[begin])
-            yield RowBlock(rows, begin, end, wall_ns=(wall_ns or 0) - times[begin])
+            yield PlayedBlock(rows, begin, end, None if wall_ns is None else wall_ns - times[begin])
 
-    def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
-        """Without messages; nodes are there, because they may change pole pairs and gear."""
-        # the caller shows names, pole pairs and gears
-        escs = [
-            replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
-            for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
-        ]
-        return Gateway(
-            *(escs, NO_MESSAGES, self._created_ns), canopen=self.setup.canopen, further=further
-        )
-
-    def _steps(self, replay: Replay, player: "Player | None" = None) -> Iterator[list[TimedFrame]]:
+    def _steps(self, replay: Replay, player: "Player | None") -> Iterator[list[TimedFrame]]:
         """Give all entries to a replay's gateway; the frames that Python made of each, or nothing where ``player`` gave some.
 
         The player plays what comes all the time. Any other entry, and the rest of its turn, is played here.
@@ -161,13 +162,27 @@ class CaptureInput(CaptureFiles):
                     if here:
                         replay.go_on(list(timed(player.take_frames(final=True))))
 
-    @property
-    def channel(self) -> str:
+    def _entries_of(self, payload: bytes, damaged: Damaged) -> Iterator[Entry]:
         try:
-            channel = str(tomllib.loads(self.setup.configuration)["can"]["channel"])
-        except (ValueError, LookupError, TypeError, RecursionError):
-            channel = ""
-        return channel if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII) else "can0"
+            for entry in read_entries(payload, self.setup.version):
+                if (found := self._checked(entry)) is not None:
+                    yield found
+        except ValueError as error:
+            damaged(str(error))
+
+    def _checked(self, entry: Entry) -> Entry | None:
+        """The entry; not before the one before. None where it has no possible time."""
+        time_ns, is_clock = entry.time_ns, entry.kind == Kind.CLOCK
+        if time_ns > _LATEST_NS or (is_clock and len(entry.data) != 8):
+            self._impossible += 1
+            return None
+        if is_clock:
+            # it stands after what was written by the clock before
+            self._offsets.append((time_ns + 1, read_number(entry.data) - time_ns))
+        if time_ns < self._last_ns:
+            return entry._replace(time_ns=self._last_ns)
+        self._last_ns = time_ns
+        return entry
 
     def _add_losses(self, replay: Replay) -> None:
         if replay.lost:
@@ -195,3 +210,84 @@ class CaptureInput(CaptureFiles):
             if isinstance(device, dict):
                 known = f"{device.get('device')} {device.get('variant')}, firmware {device.get('firmware')}, {device.get('layout')} layout"
             self.provenance[esc.name] = f"{known}, at {port}"
+
+    def _first_header(self) -> Mapping[str, Any]:
+        """The header of the first part that has one; those before it are left out."""
+        while True:
+            path = self._paths[0]
+            for found in self._blocks(path):
+                if isinstance(found, DataBlock) and found.kind == b"H":
+                    with suppress(ValueError):
+                        return read_json(found.payload)
+                if self.position > _LOOK_FOR_HEADER:
+                    break
+            self.close()
+            if len(self._paths) == 1:
+                raise UserError(
+                    f"{path}: has no header that could be read, so nothing is known of what was recorded"
+                )
+            self._headerless.append(f"{path.name}: has no header that could be read")
+            del self._paths[0]
+
+    def _blocks(self, path: Path) -> Iterator[DataBlock | Damage]:
+        scanner = Scanner()
+        try:
+            with path.open("rb") as self._file:
+                while data := self._file.read(CHUNK):
+                    self.position += len(data)
+                    yield from scanner.feed(data)
+        except OSError as error:
+            raise RunError(f"{path}: cannot be read: {error.strerror}.") from None
+        yield from scanner.flush()
+
+    def _data(self) -> Iterator[tuple[bytes, Damaged]]:
+        self.position = self._last_ns = self._impossible = 0
+        self.damage = list(self._headerless)
+        self._offsets = []
+        for number, path in enumerate(self._paths):
+            yield from self._data_of(path, number)
+        if self._impossible:
+            self.damage.append(f"{self._impossible} entries have no possible time")
+
+    def _data_of(self, path: Path, part: int) -> Iterator[tuple[bytes, Damaged]]:
+        expected, ended = 0, False
+
+        def damaged(text: str) -> None:
+            if len(self.damage) <= _MAX_DAMAGE:
+                is_last = len(self.damage) == _MAX_DAMAGE
+                self.damage.append("and more of that kind" if is_last else f"{path.name}: {text}")
+
+        for found in self._blocks(path):
+            if isinstance(found, Damage):
+                damaged(f"{found.length} bytes at {found.offset} are damaged")
+                continue
+            if missing := max(0, found.number - expected):
+                damaged(f"{missing} blocks in front of byte {found.offset} are missing")
+            expected, ended = found.number + 1, found.kind == b"E"
+            try:
+                if found.kind == b"D":
+                    begin = f"the block at {found.offset} "
+                    yield found.payload, lambda text, begin=begin: damaged(begin + text)  # type: ignore[misc]
+                elif found.kind == b"I":
+                    self._devices = read_json(found.payload).get("devices", self._devices)
+                    self._describe()
+                elif found.kind == b"H":
+                    self._check_part(read_json(found.payload), path, part)
+            except ValueError as error:
+                damaged(f"the block at {found.offset} {error}")
+        if not ended:
+            damaged("was not closed: up to the last second before its end may be missing")
+
+    def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
+        if header.get("run") != self.header.get("run"):
+            raise UserError(
+                f"{path}: is of another run than {self._paths[0]}. Convert each run by itself."
+            )
+        now, wall = header.get("monotonic_ns"), header.get("wall_ns")
+        if all(isinstance(at, int) and 0 <= at <= _LATEST_NS for at in (now, wall)):
+            self._offsets.append((int(now or 0), int(wall or 0) - int(now or 0)))
+        missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
+        if missing > 0:
+            self.damage.append(
+                f"{path.name}: {missing} parts of the run in front of it are not given"
+            )

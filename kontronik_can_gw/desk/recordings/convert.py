@@ -7,18 +7,22 @@ import gc
 import os
 import re
 import sys
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Self
+from typing import IO, TYPE_CHECKING, Any, Self
 
 from kontronik_can_gw.errors import RunError
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.capture.replay import TimedFrame
+    from kontronik_can_gw.desk.recordings.fields import Table
+    from kontronik_can_gw.desk.recordings.recording import Input
     from kontronik_can_gw.desk.recordings.tables.rows import Choice
+    from kontronik_can_gw.native.offline import Frames
 
-TABLES = ("csv", "jsonl", "parquet", "mf4")
+TABLES = ("csv", "jsonl", "parquet")
 LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
 BYTES = "bin"
 FORMATS = (*TABLES, *LOGS, BYTES)
@@ -27,7 +31,6 @@ SUFFIXES = {
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
     ".parquet": "parquet",
-    ".mf4": "mf4",
     ".log": "candump",
     ".candump": "candump",
     ".asc": "asc",
@@ -39,10 +42,10 @@ ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """What may go to standard output: it is text, and is written from its beginning to its end."""
 STREAMS = (*ON_SCREEN, BYTES)
 """What may go through a pipe."""
-_BY_PATH = ("parquet", "mf4", "mf4-log")
+_BY_PATH = ("parquet", "mf4-log")
 """What a library writes that opens the file itself."""
-_TURN = 256
-_CLOCK_SET_NS = 1_000_000_000
+_CLOCK_SET_NS = _DISORDER_NS = 1_000_000_000
+"""How far a clock must be set to be worth a word; how far frames of several interfaces may stand out of order."""
 
 
 class Output:
@@ -111,41 +114,43 @@ Reached = Callable[[int], None]
 
 
 def to_table(
-    recording: "Input",
-    out: Output,
-    reached: Reached,
-    form: str,
-    choice: "Choice",
-    by_frame: bool = False,
-    units_line: bool = False,
+    recording: "Input", out: Output, reached: Reached, form: str, choice: "Choice"
 ) -> str | None:
     """To a table."""
-    from kontronik_can_gw.desk.recordings.blocks import RowBlock
     from kontronik_can_gw.desk.recordings.tables.rows import rows_of
-    from kontronik_can_gw.desk.recordings.tables.writers import open_table
 
-    table, rows = rows_of(recording, choice, by_frame)
+    table, blocks = rows_of(recording, choice)
     if table is None:
         return None
     count, last_ns = 0, 0
-    with open_table(out.open(), form, table, units_line) as writer, _settled():
-        write = writer.write
-        for row in rows:
-            if isinstance(row, RowBlock):
-                writer.write_block(row)
-                count += len(row)
-                last_ns = row.times[-1] - row.origin_ns
-                reached(recording.position)
-                continue
-            write(row)
-            count += 1
-            last_ns = row.time_ns
-            if not count % _TURN:
-                reached(recording.position)
-        reached(recording.position)
+    with _table_writer(out.open(), form, table) as writer, _settled():
+        for block in blocks:
+            writer.write(block)
+            count += len(block)
+            last_ns = block.times[-1] - table.origin_ns
+            reached(recording.position)
     out.is_whole = True
-    columns = _many(len(choice.columns), "signal" if by_frame else "value")
-    return f"{_many(count, 'row')} of {columns}, up to {last_ns / 1e9:.3f} s"
+    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {last_ns / 1e9:.3f} s"
+
+
+@contextmanager
+def _table_writer(target: IO[bytes] | Path, form: str, table: "Table") -> Iterator[Any]:
+    """What has ``write`` for blocks of rows; RunError where a library is missing."""
+    writer: Any
+    if isinstance(target, Path):
+        from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
+
+        writer = ParquetTable(target, table)
+    else:
+        from kontronik_can_gw.desk.recordings.tables.text import TextTable
+
+        writer = TextTable(target, table, is_json=form == "jsonl")
+    try:
+        yield writer
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
 
 
 def to_log(
@@ -157,19 +162,18 @@ def to_log(
     end_ns: int | None = None,
 ) -> str | None:
     """To a log of CAN frames (a format of can_logs), from ``start_ns`` to ``end_ns`` after the recording's first frame."""
-    from kontronik_can_gw.desk.recordings.blocks import cut, time_at
-    from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
-    from kontronik_can_gw.desk.recordings.tables.rows import first_of
+    from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
+    from kontronik_can_gw.desk.recordings.tables.rows import first_of, limits
 
     first, batches = first_of(filter(len, recording.batches()))
     if first is None:
         return None
-    origin_ns = time_at(first, 0)
+    origin_ns = _time_at(first, 0)
     wall_ns = recording.wall_ns(origin_ns)
-    first, batches = first_of(cut(batches, start_ns, end_ns, origin_ns))
+    first, batches = first_of(_cut(batches, *limits(start_ns, end_ns, origin_ns)))
     if first is None:
         return None
-    begins, channel = time_at(first, 0) - origin_ns, recording.channel
+    begins, channel = _time_at(first, 0) - origin_ns, recording.channel
     writer = CanLogWriter(
         out.open(), form, wall_ns, begins, channel, out.name, recording.provenance
     )
@@ -178,7 +182,7 @@ def to_log(
         for frames in batches:
             writer.write_all(frames, origin_ns)
             count += len(frames)
-            last_ns = time_at(frames, -1)
+            last_ns = _time_at(frames, -1)
             reached(recording.position)
         reached(recording.position)
         writer.close()
@@ -195,6 +199,27 @@ def to_log(
     if abs(moved) > _CLOCK_SET_NS:
         summary += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
     return summary
+
+
+def _time_at(frames: "Frames | list[TimedFrame]", index: int) -> int:
+    found: int = frames[index].time_ns if isinstance(frames, list) else frames.times[index]
+    return found
+
+
+def _cut(
+    batches: "Iterator[Frames | list[TimedFrame]]", low_ns: int, high_ns: int
+) -> "Iterator[Frames | list[TimedFrame]]":
+    """The frames from one time to another, both included. No batch is empty."""
+    for frames in batches:
+        if _time_at(frames, 0) > high_ns + _DISORDER_NS:
+            return
+        if isinstance(frames, list):
+            found: Any = [one for one in frames if low_ns <= one.time_ns <= high_ns]
+        else:
+            begin = bisect_left(frames.times, low_ns)
+            found = frames.part(begin, max(begin, bisect_right(frames.times, high_ns)))
+        if len(found):
+            yield found
 
 
 def to_bytes(recording: "Input", out: Output, reached: Reached, esc: int) -> str | None:

@@ -2,16 +2,15 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
-from kontronik_can_gw.signals.unpacker import Column, Value
+from kontronik_can_gw.signals.unpacker import Column
 
 TIME = "Time"
 UTC = "Utc"
-ID, MESSAGE = "Id", "Message"
-_OWN = (TIME, UTC, ID, MESSAGE)
+_OWN = (TIME, UTC)
 
 
 class Kind(Enum):
@@ -78,13 +77,6 @@ def distinct(fields: Sequence[Field]) -> list[Field]:
     return [replace(one, name=name_of(one)) for one in fields]
 
 
-def frame_fields(names: Collection[tuple[str, str]]) -> tuple[Field, Field]:
-    """``Id`` and ``Message`` of a table of CAN frames. ``names``: each id and its message."""
-    ids = tuple(enumerate(dict.fromkeys(name for name, _ in names)))
-    messages = tuple(enumerate(dict.fromkeys(message for _, message in names)))
-    return Field(ID, "", Kind.TEXT, "", ids), Field(MESSAGE, "", Kind.TEXT, "", messages)
-
-
 def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | None:
     """Index of the first field with a value of values.py; None where there is none."""
     places = (i for i, one in enumerate(fields) if (one.source, one.esc) == (source, esc))
@@ -93,24 +85,9 @@ def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | No
 
 @dataclass(frozen=True)
 class Table:
-    """The frame of a table. ``has_utc``: its rows have Unix times. ``by_frame``: its first fields are Id and Message."""
+    """The frame of a table. ``has_utc``: its rows have Unix times. ``origin_ns``: the recording's time at the table's time 0."""
 
     fields: Sequence[Field]
     has_utc: bool
-    by_frame: bool = False
-    start_wall_ns: int | None = None
-    """Unix time in ns of time 0."""
+    origin_ns: int = 0
     provenance: Mapping[str, str] = field(default_factory=dict)
-
-    def by_message(self) -> dict[str, Sequence[int]]:
-        """The fields of each message of a table of CAN frames; else all of them under an empty name."""
-        if not self.by_frame:
-            return {"": range(len(self.fields))}
-        found: dict[str, list[int]] = {}
-        for index, one in enumerate(self.fields[2:], 2):
-            found.setdefault(one.message, []).append(index)
-        return dict(found)
-
-    def message_of(self, values: Sequence[Value]) -> str:
-        """The message of a row, as by_message has it."""
-        return str(values[1]) if self.by_frame else ""

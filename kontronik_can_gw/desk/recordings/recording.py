@@ -1,29 +1,95 @@
-"""What every recording is: CAN frames in order of time, and rows of values by name."""
+"""What every recording is: CAN frames in order of time, and rows of values by name, many at once."""
 
 from abc import ABC, abstractmethod
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from itertools import groupby, islice
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.blocks import RowBlock, timed
-from kontronik_can_gw.desk.recordings.columns import fields_of_values
+from kontronik_can_gw.desk.recordings.columns import Values, fields_of_values
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.samples import Sample
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.native.offline import Frames
+    from kontronik_can_gw.native.offline import Frames, Rows
 
-CHUNK = 1 << 16
+ROWS = 1024
+"""Rows that Python makes a block of."""
+
+
+class Sample(NamedTuple):
+    """A row. ``values``: in the order of the columns."""
+
+    time_ns: int
+    values: Values
+
+
+class Block:
+    """Rows as columns. ``times``: ns of the recording's clock, which do not decrease; with ``wall_ns`` added they are Unix times."""
+
+    def __init__(
+        self, times: Sequence[int], columns: Sequence[Sequence[Any]], wall_ns: int | None
+    ) -> None:
+        self.times = times
+        self.wall_ns = wall_ns
+        self._columns = columns
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def columns(self) -> Sequence[Sequence[Any]]:
+        """Values of each column, None where not available."""
+        return self._columns
+
+    def part(self, begin: int, end: int) -> "Block":
+        """Some of the rows."""
+        columns = [column[begin:end] for column in self._columns]
+        return Block(self.times[begin:end], columns, self.wall_ns)
+
+    def between(self, low_ns: int, high_ns: int) -> "Block":
+        """The rows from one time to another, both included."""
+        begin = bisect_left(self.times, low_ns)
+        return self.part(begin, max(begin, bisect_right(self.times, high_ns)))
+
+    def pick(self, rows: Sequence[int]) -> "Block":
+        """The rows with these numbers."""
+        columns = [[column[row] for row in rows] for column in self.columns]
+        return Block([self.times[row] for row in rows], columns, self.wall_ns)
+
+    def rows(self) -> Iterator[Sample]:
+        """The rows one by one."""
+        return map(Sample, self.times, zip(*self.columns, strict=True))
+
+
+class PlayedBlock(Block):
+    """Rows ``begin`` to ``end`` of what the core in C made."""
+
+    def __init__(self, rows: "Rows", begin: int, end: int, wall_ns: int | None) -> None:
+        super().__init__(rows.times[begin:end], (), wall_ns)
+        self.made, self.begin, self.end = rows, begin, end
+
+    @cached_property
+    def columns(self) -> Sequence[Sequence[Any]]:
+        found: list[Sequence[Any]] = []
+        for number, (value, _) in enumerate(self.made.columns):
+            numbers: list[Any] = self.made.numbers(number, self.begin, self.end)
+            found.append([*map(value.names.get, numbers)] if value.names else numbers)
+        return found
+
+    def part(self, begin: int, end: int) -> "PlayedBlock":
+        return PlayedBlock(self.made, self.begin + begin, self.begin + end, self.wall_ns)
 
 
 class Input(ABC):
-    """A recording. Each of ``frames``, ``samples``, ``esc_bytes`` reads it from its beginning.
+    """A recording. Each of ``frames``, ``blocks``, ``esc_bytes`` reads it from its beginning.
 
-    ``position``: bytes read so far, of ``size``. ``damage`` (what was not intact) and ``notes`` (what the person should know of how
-    it was read) have a line each and are complete when it was read to the end.
+    ``position``: bytes read so far, of ``size``. ``damage`` (what was not intact) has a line each and is complete when it was read to
+    the end.
     """
 
     def __init__(self, name: str, bus: BusLayout, size: int) -> None:
@@ -34,9 +100,10 @@ class Input(ABC):
         self.provenance: dict[str, str] = {}
         """What is known of where it came from, in words."""
         self.damage: list[str] = []
-        self.notes: list[str] = []
         self.times_assumed = False
         """True where the recording has no times."""
+        self.others = 0
+        """CAN frames that the layout does not have; complete when it was read to the end."""
 
     @property
     def channel(self) -> str:
@@ -50,7 +117,7 @@ class Input(ABC):
 
     @cached_property
     def fields(self) -> Sequence[Field]:
-        """The columns of the samples: values by name."""
+        """The columns of the rows: values by name."""
         return fields_of_values(self.bus.escs)
 
     def frames(self) -> Iterator[TimedFrame]:
@@ -62,22 +129,23 @@ class Input(ABC):
     def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
         """The same frames, many at once; ``Frames`` were all sent."""
 
-    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
         """Rows of the values of ``chosen`` fields, in that order; None: of all."""
-        blocks = self.blocks(chosen)
-        if blocks is None:
-            yield from self.samples_in_python(chosen)
-        else:
-            for block in blocks:
-                yield from map(Sample._make, block.values())
+        samples = self.samples_in_python(self._chosen(chosen))
+        found = ((self._wall_of(row), *row) for row in samples)
+        while some := list(islice(found, ROWS)):
+            for wall_ns, rows in groupby(some, itemgetter(0)):
+                _, times, values = zip(*rows, strict=True)
+                yield Block(times, [*zip(*values, strict=True)], wall_ns)
+
+    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        """The rows one by one."""
+        for block in self.blocks(chosen):
+            yield from block.rows()
 
     @abstractmethod
-    def samples_in_python(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        """The rows of ``samples``, whatever core there is."""
-
-    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock] | None:  # noqa: ARG002
-        """The rows of ``samples``, many at once; None where they can only be had one by one."""
-        return None
+    def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
+        """The rows one by one, whatever core there is."""
 
     @abstractmethod
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
@@ -98,3 +166,14 @@ class Input(ABC):
 
     def _chosen(self, chosen: Sequence[int] | None) -> Sequence[int]:
         return range(len(self.fields)) if chosen is None else chosen
+
+    def _wall_of(self, row: Sample) -> int | None:
+        wall_ns = self.wall_ns(row.time_ns)
+        return None if wall_ns is None else wall_ns - row.time_ns
+
+
+def timed(frames: "Frames | list[TimedFrame]") -> Iterator[TimedFrame]:
+    """The frames one by one."""
+    if isinstance(frames, list):
+        return iter(frames)
+    return (TimedFrame(time_ns, frame) for time_ns, frame in frames)

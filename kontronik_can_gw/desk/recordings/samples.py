@@ -7,12 +7,12 @@ message, within 5 ms goes into the same row.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.recordings.columns import Read, Values, reader_of, values_of_fields
+from kontronik_can_gw.desk.recordings.columns import Read, reader_of, values_of_fields
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
+from kontronik_can_gw.desk.recordings.recording import Sample
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.esc.values import Kind as How
@@ -26,13 +26,6 @@ GATEWAY_NS = 100 * MS
 """The gateway's own values are read so often."""
 _DIGITS = 9
 """Decimals of a value that was in another unit."""
-
-
-class Sample(NamedTuple):
-    """A row. ``values``: in the order of the columns."""
-
-    time_ns: int
-    values: Values
 
 
 # --- from bytes

@@ -11,6 +11,8 @@ from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
+from kontronik_can_gw.desk.recordings.recording import Block
+from kontronik_can_gw.desk.recordings.tables.rows import LATEST_NS
 from kontronik_can_gw.desk.report.decimate import Decimator
 from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Flight
 from kontronik_can_gw.desk.report.ledger import Counter, Ledger, Load
@@ -19,10 +21,7 @@ from kontronik_can_gw.desk.report.trackers import Device, Errors, Events, Link, 
 from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayState
-from kontronik_can_gw.signals.unpacker import Value
 
-CHUNK = 4096
-"""Rows that are processed together."""
 COUNTERS = ("consumed_charge", "energy_used", "losses", "crc_errors", "dropped_bytes")
 SPEEDS = ("electrical_speed", "motor_speed", "output_speed")
 SAME_SPEED = 0.005
@@ -50,7 +49,7 @@ def needed_columns(fields: Sequence[Field]) -> list[int]:
 
 
 class Analysis:
-    """Takes the rows of a recording. ``window``: seconds after the first row, (from, to); None: no limit."""
+    """Takes the rows of a recording in blocks. ``window``: seconds after the first row, (from, to); None: no limit."""
 
     def __init__(
         self,
@@ -67,9 +66,7 @@ class Analysis:
         self._start_ns: int | None = None
         self._last_ns = 0
         self._rows = 0
-        self._times: list[int] = []
-        self._pending: list[Sequence[Value]] = []
-        self._blank: Sequence[Value] = (None,) * len(fields)
+        self._blank = ((None,),) * len(fields)
         self._gateway_state = column_of(fields, "gateway_state", None)
         self._replayed = False
         self._events = Events()
@@ -82,29 +79,27 @@ class Analysis:
         """True if the fields have a value that can be drawn."""
         return bool(self._drawn)
 
-    def take(self, time_ns: int, values: Sequence[Value]) -> bool:
-        """Take a row; False where it and all following rows are after the window."""
+    def take(self, block: Block) -> bool:
+        """Take rows; False where all that follow are after the window."""
         if self._origin_ns is None:
-            self._origin_ns = time_ns
-        since_ns = time_ns - self._origin_ns
-        if since_ns < self._from_ns:
-            return True
-        if self._to_ns is not None and since_ns > self._to_ns:
-            return False
-        if self._start_ns is None:
-            self._start_ns = self._last_ns = time_ns
-        elif time_ns - self._last_ns > self._gap_ns:
-            self._append(self._last_ns, self._blank)
-        self._last_ns = max(time_ns, self._last_ns)  # loggers' clocks can step back
-        self._rows += 1
-        self._append(self._last_ns, values)
-        if len(self._times) >= CHUNK:
-            self._flush()
-        return True
+            self._origin_ns = block.times[0]
+        high = LATEST_NS if self._to_ns is None else self._origin_ns + self._to_ns
+        rows = block.between(self._origin_ns + self._from_ns, high)
+        begin = 0
+        for row, time_ns in enumerate(rows.times):
+            if self._start_ns is None:
+                self._start_ns = self._last_ns = time_ns
+            elif time_ns - self._last_ns > self._gap_ns:
+                self._analyse(rows.part(begin, row))
+                self._analyse(Block([self._last_ns], self._blank, None))
+                begin = row
+            self._last_ns = time_ns
+        self._rows += len(rows)
+        self._analyse(rows.part(begin, len(rows)))
+        return block.times[-1] <= high
 
     def finish(self) -> Flight:
         """Return the flight after the last row."""
-        self._flush()
         for esc in self._escs:
             esc.finish(self._last_ns)
         lines = {}
@@ -144,16 +139,10 @@ class Analysis:
                 found.append(slow)
         return found
 
-    def _append(self, time_ns: int, values: Sequence[Value]) -> None:
-        self._times.append(time_ns)
-        self._pending.append(values)
-
-    def _flush(self) -> None:
-        if not self._times:
+    def _analyse(self, rows: Block) -> None:
+        if not len(rows):
             return
-        times, self._times = self._times, []
-        columns: list[tuple[Any, ...]] = list(zip(*self._pending, strict=True))
-        self._pending = []
+        times, columns = rows.times, rows.columns
         if self._gateway_state is not None:
             replay = GatewayState.REPLAY
             for value in set(columns[self._gateway_state]):

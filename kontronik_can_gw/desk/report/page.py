@@ -26,7 +26,6 @@ APART = 4
 def render(
     flight: Flight,
     *,
-    title: str,
     source: str,
     provenance: Mapping[str, str] | None = None,
     wall_ns: int | None = None,
@@ -40,7 +39,7 @@ def render(
     data = json.dumps(_data(flight, wall_ns), separators=(",", ":"), allow_nan=False)
     parts = {
         "policy": escape(policy),
-        "title": escape(title),
+        "title": escape(source),
         "style": style,
         "head": _head(flight, source, provenance or {}, wall_ns) + _damage(damage),
         "tiles": tiles(flight),

@@ -1,7 +1,7 @@
-"""Readers of BLF, TRC and MF4 by python-can (MF4: and asammdf, an extra), with an account of what it cannot read.
+"""Readers of BLF and MF4 by python-can (MF4: and asammdf, an extra), with an account of what it cannot read.
 
-python-can ends at the first damage, and reads a BLF object of size 0 for ever (its issue 1584): here it is asked again from the next line
-or container on, and is not given such an object. Its times are floats: here they count from the log's start, or are whole microseconds.
+python-can ends at the first damage, and reads a BLF object of size 0 for ever (its issue 1584): here it is asked again from the next
+container on, and is not given such an object. Its times are floats: here they count from the log's start.
 """
 
 import gc
@@ -16,21 +16,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.can_logs.mf4 import asammdf_module, quiet, short
 from kontronik_can_gw.desk.recordings.can_logs.text import (
-    LONGEST_LINE,
     OLDEST_WALL_S,
     SECOND_NS,
-    TRC_LINE,
     Damage,
     is_possible,
 )
-from kontronik_can_gw.desk.recordings.mf4 import asammdf_module, quiet, short
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
 with without_asammdf():
-    from can import BLFReader, TRCReader
+    from can import BLFReader
     from can.io.blf import BLFParseError
 
 if TYPE_CHECKING:
@@ -67,13 +65,10 @@ class LibraryReader:
             if is_cut or not is_possible(frame):
                 self._damaged()
             else:
-                yield TimedFrame(self._time_ns(message.timestamp), frame, message.is_rx)
+                yield TimedFrame(round(message.timestamp * SECOND_NS), frame, message.is_rx)
 
     def _messages(self) -> "Iterator[Message]":
         raise NotImplementedError
-
-    def _time_ns(self, seconds: float) -> int:
-        return round(seconds * SECOND_NS)
 
     def close(self) -> None:
         """Release what the library holds."""
@@ -155,72 +150,6 @@ class BlfReader(LibraryReader):
             if found >= 0 or len(data) < _BLOCK:
                 return found >= 0
         return False
-
-
-class _TrcLines:
-    """What python-can reads as a TRC file: its comments, and the lines that look like one of a frame; others are damaged."""
-
-    def __init__(self, file: BinaryIO, damage: Damage) -> None:
-        self._file = file
-        self._damage = damage
-        self._number = 1
-        self._of_last = 0
-        """Number of the line that was given last; 0: it was a comment."""
-
-    def __iter__(self) -> Iterator[str]:
-        while line := self._file.readline(LONGEST_LINE):
-            number = self._number
-            self._number += line.endswith(b"\n")
-            is_comment = line.lstrip()[:1] in (b"", b";")
-            self._of_last = 0 if is_comment else number
-            if is_comment or TRC_LINE.match(line):
-                yield line.decode("latin-1")
-            else:
-                self.damaged()
-        self._of_last = 0
-
-    def damaged(self) -> None:
-        """The line that was given last is no line of a frame."""
-        if self._of_last:
-            self._damage.line(self._of_last)
-
-    def close(self) -> None:
-        """The one who opened the file closes it."""
-
-
-class TrcReader(LibraryReader):
-    """PEAK TRC, file versions 1.0 to 2.1."""
-
-    def __init__(self, file: BinaryIO, damage: Damage) -> None:
-        super().__init__(file, damage)
-        self._lines = _TrcLines(file, damage)
-        self._damaged = self._lines.damaged  # type: ignore[method-assign]
-
-    def _messages(self) -> "Iterator[Message]":
-        reader = TRCReader(self._lines)  # type: ignore[arg-type]
-        watch = logging.Handler(logging.WARNING)
-        watch.emit = lambda record: self._damaged()  # type: ignore[method-assign]  # noqa: ARG005
-        logger = logging.getLogger("can.io.trc")
-        logger.addHandler(watch)
-        logger.setLevel(logging.WARNING)
-        logger.propagate = False
-        try:
-            read = -1
-            while read < (read := self._file.tell()):  # each turn ends a line further
-                try:
-                    for message in reader:
-                        self.position = self._file.tell()
-                        if message.timestamp >= OLDEST_WALL_S:
-                            self.wall_start_ns = 0
-                        yield message
-                    return
-                except (ValueError, LookupError, OverflowError, NotImplementedError):
-                    self._damaged()
-        finally:
-            logger.removeHandler(watch)
-
-    def _time_ns(self, seconds: float) -> int:
-        return round(seconds * 1e6) * 1000
 
 
 class Mf4Reader(LibraryReader):

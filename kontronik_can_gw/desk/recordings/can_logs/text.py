@@ -1,4 +1,4 @@
-"""Readers of candump logs and Vector ASC. A line that cannot be read is counted, the next one is read again.
+"""Readers of candump logs, Vector ASC and PEAK TRC. A line that cannot be read is counted, the next one is read again.
 
 Times stay whole numbers of nanoseconds. ASC, which has no public specification, is read as python-can reads it. Error and remote frames
 and other events are left out.
@@ -6,7 +6,7 @@ and other events are left out.
 
 import re
 from collections.abc import Iterator
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from typing import BinaryIO
 
 from kontronik_can_gw.capture.replay import TimedFrame
@@ -17,11 +17,6 @@ OLDEST_WALL_S = 631_152_000
 """1990: what is earlier is no Unix time but seconds since a start."""
 LONGEST_LINE = 4096
 """Bytes; a line of any of these formats is far shorter."""
-TRC_HEAD = re.compile(
-    rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE
-)
-TRC_LINE = re.compile(rb"\s*\d{1,10}\)?\s+\d{1,12}(?:\.\d{1,6})?\s+\w+\s+\w+(?:\s|$)")
-"""How a line of any version of PEAK's TRC begins; it could be another format's."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _HEAD_LINES = 200
 """Lines in which a log's head is looked for."""
@@ -244,3 +239,70 @@ def asc_time(words: list[str]) -> int | None:
         return int(moment.timestamp()) * SECOND_NS + int(fraction.ljust(9, "0")[:9])
     except (ValueError, LookupError, OverflowError, OSError):
         return None
+
+
+# --- PEAK TRC
+
+_TRC_COLUMNS = {"1.0": "NOIlD", "1.1": "NOdIlD", "1.3": "NOBdIRlD", "2.0": "NOTIdlD"}
+"""By version, in the letters of $COLUMNS; later ones say them."""
+_TRC_FRAMES = {"DT": False, "FD": True, "FB": True, "FE": True, "BI": True}
+"""Types of lines with a frame; True: one of CAN FD."""
+_TRC_HEAD = re.compile(
+    rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE
+)
+_DAY_ZERO = datetime(1899, 12, 30, tzinfo=UTC)
+
+
+def trc_line(line: bytes) -> "re.Match[bytes] | None":
+    """A line of the head."""
+    return _TRC_HEAD.match(line)
+
+
+class TrcReader(TextReader):
+    """PEAK TRC, file versions 1.0 to 2.1."""
+
+    _columns = "NOIlD"
+
+    def _read_head(self, lines: list[bytes]) -> None:
+        for line in lines:
+            key, _, value = line.decode("latin-1").strip().partition("=")
+            if key == ";$FILEVERSION":
+                self._columns = _TRC_COLUMNS.get(value, "NOTBIdRLD")
+            elif key == ";$COLUMNS":
+                self._columns = value.replace(",", "")
+            elif key == ";$STARTTIME":
+                try:
+                    started = _DAY_ZERO + timedelta(days=float(value))
+                except (ValueError, OverflowError):
+                    continue
+                if started.timestamp() >= OLDEST_WALL_S:
+                    since = started - datetime(1970, 1, 1, tzinfo=UTC)
+                    self.wall_start_ns = since // timedelta(microseconds=1) * 1000
+
+    def _frame(self, line: bytes) -> TimedFrame | None:
+        text = line.decode("ascii").strip()
+        if text.startswith(";"):
+            return None
+        words = text.split(maxsplit=len(self._columns) - 1)
+        found = {"T": "DT", "d": "Rx", "D": ""} | dict(zip(self._columns, words, strict=False))
+        int(found["N"].removesuffix(")"))
+        kind, direction = found["T"], found["d"]
+        if not (kind.isalpha() and kind.isupper() and len(kind) == 2):
+            raise ValueError
+        if kind not in _TRC_FRAMES or found["I"] == "FFFFFFFF" or found["D"] == "RTR":
+            return None
+        if direction not in ("Rx", "Tx"):
+            if direction.isalpha():  # Warng and the like
+                return None
+            raise ValueError
+        is_fd = _TRC_FRAMES[kind]
+        size = FD_LENGTHS[int(found["L"])] if "L" in found else int(found["l"])
+        size = size if is_fd else min(size, 8)
+        data = bytes.fromhex("".join(found["D"].split()[:size]))
+        if len(data) != size:
+            raise ValueError
+        milliseconds = found["O"] if "." in found["O"] else found["O"] + ".0"
+        frame = CanFrame(int(found["I"], 16), data, len(found["I"]) > 4, is_fd)
+        return TimedFrame(
+            _nanoseconds(milliseconds.encode()) // 1_000_000 * 1000, frame, direction == "Rx"
+        )

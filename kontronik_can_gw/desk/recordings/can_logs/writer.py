@@ -9,8 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from kontronik_can_gw.desk.recordings.blocks import timed
-from kontronik_can_gw.desk.recordings.can_logs.text import FD_LENGTHS, SECOND_NS
+from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
+from kontronik_can_gw.desk.recordings.recording import timed
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
@@ -22,20 +22,6 @@ if TYPE_CHECKING:
 
 _MS = 1_000_000
 _LATEST_NS = 1 << 61
-_MF4 = "CAN_DataFrame"
-_MF4_COLUMNS = {
-    "BusChannel": "<u1",
-    "ID": "<u4",
-    "IDE": "<u1",
-    "DLC": "<u1",
-    "DataLength": "<u1",
-    "DataBytes": "S64",
-    "Dir": "<u1",
-    "EDL": "<u1",
-    "BRS": "<u1",
-    "ESI": "<u1",
-}
-"""As python-can has them."""
 
 
 class CanLogWriter:
@@ -167,31 +153,13 @@ class CanLogWriter:
         self.close = self.discard = text.detach
 
     def _mf4(self, path: Path, start_ns: int, provenance: Mapping[str, str]) -> None:
-        """By asammdf alone, many at once: python-can's writer takes thirty times as long."""
-        import numpy as np
+        from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Log
 
-        from kontronik_can_gw.desk.recordings.mf4 import Mf4File
-
-        out = Mf4File(path, start_ns, provenance)
-        kind = np.dtype(
-            [
-                (f"{_MF4}.{name}", kind.replace("S64", "(64,)u1"))
-                for name, kind in _MF4_COLUMNS.items()
-            ]
+        log = Mf4Log(path, start_ns, provenance)
+        base_ns, self.close, self.discard = self._base_ns, log.save, log.discard
+        self.write = lambda time_ns, frame, received: log.write(
+            max(0, time_ns - base_ns), frame, received
         )
-        # a bus, CAN
-        source = out.module.blocks.v4_blocks.SourceInformation(source_type=2, bus_type=2)
-        nothing, no_times = np.array([], dtype=kind), np.array([], dtype="<f8")
-        signal = out.module.Signal(name=_MF4, samples=nothing, timestamps=no_times, source=source)
-        group = out.structure(signal, np.dtype(",".join(_MF4_COLUMNS.values())))
-
-        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
-            size, fd = len(frame.data), int(frame.fd)
-            head = (1, frame.can_id, int(frame.extended), FD_LENGTHS.index(size), size)
-            row = (*head, frame.data, int(not received), fd, fd, 0)
-            group.write(max(0, time_ns - self._base_ns), (row,))
-
-        self.write, self.close, self.discard = write, out.save, out.discard
 
     def _through(self, take: "Callable[[Message], None]", more_ns: float = 0.0) -> None:
         """Write by one of python-can's writers. Times go in seconds since the start, for which a float is exact enough."""

@@ -1,29 +1,18 @@
 """Tables as Parquet by pyarrow (an extra): typed columns, units and provenance in the metadata."""
 
 import json
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.desk.recordings.blocks import RowBlock
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
-from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row, rows_of_block
+from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.signals.unpacker import Value
+from kontronik_can_gw.esc.telemetry import SECOND
 
-ROWS = 4096
-"""Rows that gather as such."""
 _FAR = 1 << 63
-_EXACT = 1 << 53
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
-
-
-def _is_exact(block: RowBlock) -> bool:
-    """True where times are within what a float and an int64 hold."""
-    last: int = block.times[-1]
-    return last - block.origin_ns < _EXACT and abs(last + (block.wall_ns or 0)) < _FAR
 
 
 class ParquetTable:
@@ -32,19 +21,16 @@ class ParquetTable:
     def __init__(self, path: Path, table: Table) -> None:
         try:
             import pyarrow as pa  # type: ignore[import-untyped]
-            from pyarrow import parquet
+            from pyarrow import compute, parquet
         except ImportError:
             raise RunError(
                 "Parquet needs pyarrow: pip install 'kontronik-can-gw[parquet]'"
             ) from None
         self._pa: Any = pa
+        self._compute: Any = compute
         self._table = table
         # the same text may stand for several numbers
-        self._codes: list[dict[Value, int]] = [
-            {text: code for code, text in enumerate(dict.fromkeys(text for _, text in one.texts))}
-            for one in table.fields
-        ]
-        self._rows: list[Row] = []
+        self._texts = [list(dict.fromkeys(text for _, text in one.texts)) for one in table.fields]
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
             heads.append(pa.field(UTC, pa.timestamp("ns", tz="UTC")))
@@ -60,60 +46,45 @@ class ParquetTable:
         self._schema = pa.schema(heads, metadata={"kontronik_can_gw": provenance})
         # a dictionary costs more than it saves where every value is another one, or takes one byte
         plain = [f"{TIME} [s]", *(one.header for one in table.fields if one.kind is Kind.FLAG)]
-        with_dictionary = [name for name in self._schema.names if name not in plain]
         self._writer: Any = parquet.ParquetWriter(
             str(path),
             self._schema,
-            use_dictionary=with_dictionary,
+            use_dictionary=[name for name in self._schema.names if name not in plain],
             memory_pool=pa.system_memory_pool(),  # the others keep what they were given once
             write_statistics=[name for name in (f"{TIME} [s]", UTC) if name in self._schema.names],
         )
         self._batches: list[Any] = []
         self._held = 0
 
-    def write(self, row: Row) -> None:
-        """Add a row."""
-        self._rows.append(row)
-        if len(self._rows) >= ROWS:
-            self._gather()
-
-    def write_block(self, block: RowBlock) -> None:
-        """Add many rows."""
-        if not _is_exact(block):
-            for row in rows_of_block(block):
-                self.write(row)
-            return
-        self._gather()
-        pa, begin, count = self._pa, block.begin, len(block)
-        from pyarrow import compute
-
-        def array(kind: Any, values: Any, valid: Any = None) -> Any:
-            buffers = [None if valid is None else pa.py_buffer(valid), pa.py_buffer(values)]
-            return pa.Array.from_buffers(kind, begin + count, buffers)[begin:]
-
-        times = array(pa.int64(), block.rows.times)
-        since = compute.subtract(times, block.origin_ns).cast(pa.float64())
-        arrays = [compute.divide(since, float(SECOND_NS))]
+    def write(self, block: Block) -> None:
+        """Add rows."""
+        pa, compute, wall_ns = self._pa, self._compute, block.wall_ns or 0
+        if isinstance(block, PlayedBlock):
+            buffers = [None, pa.py_buffer(block.times)]
+            times = pa.Array.from_buffers(pa.int64(), len(block), buffers)
+        else:
+            times = pa.array(block.times, pa.int64())
+        since = compute.subtract(times, self._table.origin_ns).cast(pa.float64(), safe=False)
+        arrays = [compute.divide(since, float(SECOND))]
         if self._table.has_utc:
-            wall = compute.add(times, block.wall_ns)
+            if block.times[0] + wall_ns >= -_FAR and block.times[-1] + wall_ns < _FAR:
+                wall = compute.add(times, wall_ns)
+            else:  # of a damaged clock
+                wall = pa.nulls(len(block), pa.int64())
             arrays.append(wall.cast(pa.timestamp("ns", tz="UTC")))
-        for index, one in enumerate(self._table.fields):
-            values, valid = block.rows.values(index), block.rows.valid[index]
-            is_real = block.rows.is_real[index]
-            found = array(pa.float64() if is_real else pa.int64(), values, valid)
-            if one.kind is Kind.TEXT:
-                numbers = pa.array([number for number, _ in one.texts], pa.int64())
-                codes = pa.array([self._codes[index][text] for _, text in one.texts], pa.int32())
-                found = codes.take(compute.index_in(found, numbers))
-                found = pa.DictionaryArray.from_arrays(found, self._texts(index))
-            elif one.kind is Kind.FLAG:
-                found = found.cast(pa.int8(), safe=False)
-            arrays.append(found)
-        self._hold(arrays)
+        arrays += [
+            self._played(block, index, one)
+            if isinstance(block, PlayedBlock)
+            else self._plain(block, index, one)
+            for index, one in enumerate(self._table.fields)
+        ]
+        self._batches.append(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+        self._held += len(block)
+        if self._held >= GROUP:
+            self._write_group()
 
     def close(self) -> None:
         """Write the rest and the end."""
-        self._gather()
         self._write_group()
         self._writer.close()
 
@@ -122,39 +93,32 @@ class ParquetTable:
         with suppress(OSError):  # there is no room for its end
             self._writer.close()
 
-    def _gather(self) -> None:
-        """Turn the rows into columns."""
-        if not self._rows:
-            return
-        pa = self._pa
-        times, walls, rows = zip(*self._rows, strict=True)
-        arrays = [pa.array([time_ns / SECOND_NS for time_ns in times], pa.float64())]
-        if self._table.has_utc:
-            # one out of range comes from a damaged clock
-            known = [wall if wall is not None and -_FAR <= wall < _FAR else None for wall in walls]
-            arrays.append(pa.array(known, pa.int64()).cast(pa.timestamp("ns", tz="UTC")))
-        columns = enumerate(zip(*rows, strict=True))
-        arrays += [self._array(index, column) for index, column in columns]
-        self._rows = []
-        self._hold(arrays)
-
-    def _hold(self, arrays: list[Any]) -> None:
-        batch = self._pa.RecordBatch.from_arrays(arrays, schema=self._schema)
-        self._batches.append(batch)
-        self._held += batch.num_rows
-        if self._held >= GROUP:
-            self._write_group()
-
-    def _array(self, index: int, column: Sequence[Value]) -> Any:
-        pa, one = self._pa, self._table.fields[index]
+    def _plain(self, block: Block, index: int, one: Field) -> Any:
+        """A column of values."""
+        pa, values = self._pa, block.columns[index]
         if one.kind is not Kind.TEXT:
-            return pa.array(column, self._type(one))
-        codes = self._codes[index]
-        indices = pa.array([codes.get(value) for value in column], pa.int32())
-        return pa.DictionaryArray.from_arrays(indices, self._texts(index))
+            return pa.array(values, self._type(one))
+        codes = {text: code for code, text in enumerate(self._texts[index])}
+        return self._dictionary(index, pa.array([codes.get(value) for value in values], pa.int32()))
 
-    def _texts(self, index: int) -> Any:
-        return self._pa.array(list(self._codes[index]), self._pa.string())
+    def _played(self, block: PlayedBlock, index: int, one: Field) -> Any:
+        """A column of the core in C, as it is."""
+        pa, made, begin, end = self._pa, block.made, block.begin, block.end
+        kind = pa.float64() if made.is_real[index] else pa.int64()
+        buffers = [pa.py_buffer(made.valid[index]), pa.py_buffer(made.values(index))]
+        found = pa.Array.from_buffers(kind, end, buffers)[begin:]
+        if one.kind is Kind.FLAG:
+            return found.cast(pa.int8(), safe=False)
+        if one.kind is not Kind.TEXT:
+            return found
+        numbers = pa.array([number for number, _ in one.texts], pa.int64())
+        places = [self._texts[index].index(text) for _, text in one.texts]
+        at = self._compute.index_in(found, numbers)
+        return self._dictionary(index, pa.array(places, pa.int32()).take(at))
+
+    def _dictionary(self, index: int, codes: Any) -> Any:
+        texts = self._pa.array(self._texts[index], self._pa.string())
+        return self._pa.DictionaryArray.from_arrays(codes, texts)
 
     def _write_group(self) -> None:
         if self._batches:

@@ -1,0 +1,171 @@
+"""The UART bytes of one ESC, which have no times: their live frames are taken to come at a fixed rate."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from kontronik_can_gw.capture.format import Entry, Kind
+from kontronik_can_gw.capture.replay import TimedFrame, in_order
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.desk.recordings.played import PlayedInput
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.decoder import Counters, Reading
+from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.transmit_queue import TransmitQueue
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.offline import Frames
+    from kontronik_can_gw.native.player import Player
+
+CHUNK = 1 << 16
+LIVE_RATE = 100.0
+"""Live frames a second that plain bytes are taken to have come at."""
+UART_MAGIC = b"KOD"
+"""What a telemetry frame begins with."""
+_UNDECIDED = len(UART_MAGIC) - 1
+"""Bytes at the end of a read that may begin a header."""
+
+
+class BytesInput(PlayedInput):
+    """The bytes of one ESC, without times."""
+
+    def __init__(
+        self, path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE
+    ) -> None:
+        layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+        if len(layout.escs) != 1:
+            raise UserError(
+                f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}"
+            )
+        self._path = path
+        self._period_ns = max(1, round(SECOND / live_rate))
+        timeout_ns = max(layout.escs[0].timeout_ns, 3 * self._period_ns)
+        escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
+        setup = CaptureSetup(escs, (str(path),), None, DbcSettings(), False, False, None)
+        try:
+            size = path.stat().st_size
+        except OSError as error:
+            raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
+        super().__init__(str(path), layout, size, setup)
+        self.times_assumed = True
+        self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
+        if layout.config is None:
+            self.provenance["motor"] = (
+                "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
+            )
+
+    def entries(self) -> Iterator[Entry]:
+        """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period after it."""
+        now = 0
+        with self._path.open("rb") as file:
+            for now, reading in self._found(PROTOCOLS[0].make()):
+                end = reading.offset + reading.form.length
+                while data := file.read(min(CHUNK, end - file.tell())):
+                    yield Entry(now, Kind.BYTES, data=data)
+            while data := file.read(CHUNK):
+                yield Entry(now, Kind.BYTES, data=data)
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        if esc:
+            raise UserError(f"{self.name}: holds the bytes of one ESC")
+        self.position = 0
+        try:
+            with self._path.open("rb") as file:
+                while data := file.read(CHUNK):
+                    self.position += len(data)
+                    yield data
+        except OSError as error:
+            raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
+
+    def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
+        return None
+
+    def _play_frames(
+        self, gateway: Gateway, player: "Player | None", marked: bool
+    ) -> "Iterator[list[TimedFrame] | Frames]":
+        waiting = TransmitQueue()
+        for now in self._play(gateway, player, marked):
+            if player is not None:
+                yield player.take_frames()
+            else:
+                yield [TimedFrame(now, one) for one in in_order(gateway.take_frames(now), waiting)]
+
+    def _play(
+        self, gateway: Gateway, player: "Player | None" = None, marked: bool = False
+    ) -> Iterator[int]:
+        """Give all frames to a gateway; the times at which it may have something to send, of a player 0."""
+        # it runs before the first byte
+        gateway.port(0, True, 0)
+        gateway.start(0)
+        if marked:
+            gateway.status.state = GatewayState.REPLAY
+        if player is not None:
+            yield from self._play_in_c(player)
+            return
+        core, now = cast(PythonCore, gateway.core), 0
+        for now, reading in self._found(core.escs[0].decoder):
+            while (due := gateway.next_deadline()) < now:
+                gateway.advance(due)
+                yield due
+            core.accept(0, reading, now)
+            gateway.advance(now)
+            gateway.take_link_changes()
+            yield now
+        gateway.advance(now)
+        yield now
+
+    def _play_in_c(self, player: "Player") -> Iterator[int]:
+        """The same, and what ``_found`` does."""
+        self.damage = []
+        player.set_bytes(self._period_ns)
+        rest, begin = b"", 0
+        for data in chain(self.esc_bytes(0), (None,)):
+            rest = rest[player.position - begin :] + (data or b"")
+            begin = player.position
+            while player.play_bytes(rest, begin, ended=data is None):
+                yield 0
+            yield 0
+        self._describe_damage(player.counters)
+
+    def _found(self, decoder: Any) -> Iterator[tuple[int, Reading]]:
+        """Each frame at its time. The decoder is given the bytes up to the next header with it: its counters are of that time."""
+        self.damage = []
+        now = lives = 0
+        for piece in chain(self._pieces(), (b"",)):
+            for frame in decoder.feed(piece) if piece else decoder.flush():
+                if not frame.form.is_info:
+                    now = lives * self._period_ns
+                    lives += 1
+                else:
+                    now = max(now, lives * self._period_ns - self._period_ns // 2)
+                yield now, frame
+        self._describe_damage(decoder.counters)
+
+    def _describe_damage(self, counters: Counters) -> None:
+        if counters.dropped_bytes:
+            self.damage.append(
+                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
+            )
+        if not counters.live:
+            self.damage.append(counters.diagnosis() or "no live frame")
+
+    def _pieces(self) -> Iterator[bytes]:
+        """The bytes of the file, each header at the beginning of a piece."""
+        rest = b""
+        for data in self.esc_bytes(0):
+            first, *others = (rest + data).split(UART_MAGIC)
+            pieces = [first, *(UART_MAGIC + other for other in others)]
+            rest = pieces[-1][-_UNDECIDED:]
+            pieces[-1] = pieces[-1][:-_UNDECIDED]
+            yield from filter(None, pieces)
+        if rest:
+            yield rest

@@ -1,0 +1,107 @@
+"""Frames as a CAN tool logged them, as a recording."""
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+
+from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.can_logs.log import log_format, reader_of
+from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS, Damage
+from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.recording import Input, Sample
+from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
+from kontronik_can_gw.errors import RunError, UserError
+
+_BATCH = 256
+"""Frames."""
+_BACK_NS = 10 * SECOND_NS
+_AHEAD_NS = 86_400 * SECOND_NS
+"""A step of time that is larger must be confirmed by the frame after it, or it is a damaged time."""
+
+
+class CanLogInput(Input):
+    """A log of CAN frames. UserError where it is no log that is known, or a table; RunError where it cannot be read."""
+
+    def __init__(self, path: Path, layout: BusLayout) -> None:
+        self.format = log_format(path) or ""
+        if not self.format:
+            raise UserError(f"{path}: is no CAN log that is known (candump, ASC, BLF, TRC, MF4).")
+        super().__init__(str(path), layout, path.stat().st_size)
+        self._path = path
+        self._open()
+
+    def _open(self) -> None:
+        self._damage = Damage()
+        try:
+            self._file = self._path.open("rb")
+        except OSError as error:
+            raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
+        self._reader = reader_of(self.format)(self._file, self._damage)
+
+    def batches(self) -> Iterator[list[TimedFrame]]:
+        frames = self.frames()
+        while some := list(islice(frames, _BATCH)):
+            yield some
+
+    def frames(self) -> Iterator[TimedFrame]:
+        self.close()
+        self._open()
+        ours = self.reader.keys
+        self.others = 0
+        try:
+            for item in self._in_time():
+                self.position = min(self._reader.position, self.size)
+                self.others += item.frame.key not in ours
+                yield item
+        except OSError as error:
+            raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
+        self.position = self.size
+        self.damage = self._damage.texts()
+
+    def _in_time(self) -> Iterator[TimedFrame]:
+        """Left out is what has a time that leads far away and back: a digit or a bit of it is damaged."""
+        last: TimedFrame | None = None
+        doubtful: TimedFrame | None = None
+        wrong = 0
+        for item in self._reader:
+            if last is None or _follows(item, last):
+                wrong += doubtful is not None
+            elif doubtful is not None and _follows(item, doubtful):
+                # two agree: the clock was set, or the first frame was the damaged one
+                yield doubtful
+            else:
+                wrong += doubtful is not None
+                doubtful = item
+                continue
+            doubtful, last = None, item
+            yield item
+        if doubtful is not None:
+            yield doubtful
+        if wrong:
+            plural = "s" if wrong > 1 else ""
+            self._damage.notes.append(f"{wrong} frame{plural} with an impossible time left out")
+
+    @cached_property
+    def fields(self) -> Sequence[Field]:
+        return fields_of_log(self.reader, self.bus.escs)
+
+    def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
+        return samples_of_frames(self.frames(), self.reader, chosen)
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")
+
+    def wall_ns(self, time_ns: int) -> int | None:
+        """0 is the start of a log whose times are Unix times; the start is known with the first frame."""
+        start: int | None = self._reader.wall_start_ns
+        return None if start is None else start + time_ns
+
+    def close(self) -> None:
+        self._reader.close()
+        self._file.close()
+
+
+def _follows(item: TimedFrame, last: TimedFrame) -> bool:
+    return -_BACK_NS <= item.time_ns - last.time_ns <= _AHEAD_NS

@@ -1,0 +1,129 @@
+"""Recordings of what ESCs sent are played through the gateway's core: the one in C at full speed (native/player.py), else Python's."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+from kontronik_can_gw.capture.format import Entry
+from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.desk.recordings.columns import values_of_fields
+from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample, timed
+from kontronik_can_gw.desk.recordings.samples import RowMaker
+from kontronik_can_gw.gateway import Gateway, MakeOutput
+from kontronik_can_gw.native import load
+from kontronik_can_gw.signals.plan import Layout
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.offline import Frames, Rows
+    from kontronik_can_gw.native.player import Player
+
+NO_MESSAGES = Layout("", "", ())
+
+
+class PlayedInput(Input):
+    """Bytes of ESCs, played through a gateway. ``sent_layout``: of its frames; that of the rows, ``bus``, may be another one."""
+
+    created_ns = 0
+    """When the gateway was made: its cycles count from there."""
+
+    def __init__(self, name: str, bus: BusLayout, size: int, setup: CaptureSetup) -> None:
+        super().__init__(name, bus, size)
+        self.setup = setup
+        self.sent_layout = bus.layout
+
+    @abstractmethod
+    def entries(self) -> Iterator[Entry]:
+        """What was recorded, in its order; of plain bytes these at their times."""
+
+    @abstractmethod
+    def _play(self, gateway: Gateway, player: "Player | None" = None) -> Iterator[object]:
+        """Give all that was recorded to a gateway, or to the player of its core; an item now and then."""
+
+    @abstractmethod
+    def _play_frames(
+        self, gateway: Gateway, player: "Player | None", marked: bool
+    ) -> "Iterator[list[TimedFrame] | Frames]":
+        """The same; the CAN frames that were sent and received."""
+
+    def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
+        for frames in self.batches(marked):
+            yield from timed(frames)
+
+    def batches(self, marked: bool = False) -> "Iterator[list[TimedFrame] | Frames]":
+        """``marked``: the gateway's state in the frames is REPLAY."""
+
+        def make(_: Sequence[MakeOutput] = ()) -> Gateway:
+            return self.setup.gateway(self.sent_layout, self.created_ns)
+
+        has_frames_of_its_own = self.setup.canopen is not None or self.setup.outputs
+        found = None if has_frames_of_its_own else self._player_of(make, None)
+        player, gateway = found or (None, make())
+        return self._play_frames(gateway, player, marked)
+
+    def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
+        fields = [self.fields[index] for index in chosen]
+        makers: list[RowMaker] = []
+
+        def make(*of_gateway: Any) -> RowMaker:
+            makers.append(RowMaker(fields, *of_gateway))
+            return makers[0]
+
+        for _ in self._play(self._silent_gateway((make,))):
+            yield from makers[0].take_rows()
+        yield from makers[0].finish()
+
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
+        fields = [self.fields[index] for index in self._chosen(chosen)]
+        found = self._player_of(self._silent_gateway, fields)
+        return super().blocks(chosen) if found is None else self._played(*found)
+
+    def _played(self, player: "Player", gateway: Gateway) -> Iterator[Block]:
+        is_first = True
+        for _ in self._play(gateway, player):
+            if player.is_full or (is_first and player.has_rows):
+                is_first = False
+                yield from self._timed(player.take_rows())
+        yield from self._timed(player.take_rows(final=True))
+
+    def _timed(self, rows: "Rows") -> Iterator[Block]:
+        """Blocks of rows in which the wall clock goes on as it began."""
+        yield PlayedBlock(rows, 0, rows.count, None)
+
+    def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
+        """Without messages; nodes are there, because they may change pole pairs and gear."""
+        # the caller shows names, pole pairs and gears
+        escs = [
+            replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
+            for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
+        ]
+        return Gateway(
+            *(escs, NO_MESSAGES, self.created_ns), canopen=self.setup.canopen, further=further
+        )
+
+    def _player_of(
+        self, make: Callable[[Sequence[MakeOutput]], Gateway], fields: Sequence[Field] | None
+    ) -> "tuple[Player, Gateway] | None":
+        """What plays at once, for rows of ``fields`` or for frames (None), and the gateway that it plays. None: Python must."""
+        if self.setup.version == 1 or load.library()[0] is None:
+            return None
+        from kontronik_can_gw.native.offline import ColumnOf
+        from kontronik_can_gw.native.player import Player
+        from kontronik_can_gw.native.rows import NotInCore
+
+        columns = None
+        if fields is not None:
+            found = values_of_fields(fields, self.bus.escs)
+            columns = [ColumnOf(value, field.esc) for field, value in found]
+        player = Player(columns)
+        gateway = make(() if fields is None else (lambda *_: player,))
+        if gateway.core.language != "C":
+            return None
+        try:
+            player.bind(cast(Any, gateway.core), self.created_ns)
+        except NotInCore:
+            return None
+        return player, gateway
