@@ -6,6 +6,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import capture_bench
 import pytest
@@ -14,8 +16,12 @@ from dronecan_bench import LIVE, Bench, answers_of, loaded
 from test_replay_is_identical import replayed
 
 from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.cli import replay
 from kontronik_can_gw.desk.monitor import status
+from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.frames import id_block
+from kontronik_can_gw.runtime import locks
 from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, gateway_facts, program_facts
 from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.snapshot import Moment, snapshot
@@ -196,6 +202,18 @@ def test_a_replay_is_identical_to_the_run(seed: int, node_id: int) -> None:
     frames = [frame for frame in replayed(bench) if not frame.received]
     assert frames == bench.sent
     assert sum(each.frame.extended for each in frames) > (0 if node_id == 0 else 300)
+
+
+def test_a_replay_and_a_gateway_do_not_send_as_one_node(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(locks, "lock_folder", lambda: tmp_path / "lock")
+    setup, layout = capture_bench.made(2, dronecan=ON)
+    gateway, capture = locks.Locks(), cast("Any", SimpleNamespace(setup=setup))
+    assert not gateway.hold([locks.ids_lock("can7", id_block(43, 0x7F))])
+    with pytest.raises(RunError, match=r"can7: another gateway .* 29-bit ids with 2Bh"):
+        replay._hold(locks.Locks(), "can7", layout, capture)
+    gateway.close()
 
 
 def header() -> dict[str, object]:
