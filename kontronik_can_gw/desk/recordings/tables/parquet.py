@@ -44,6 +44,15 @@ class ParquetTable:
             {text: code for code, text in enumerate(dict.fromkeys(text for _, text in one.texts))}
             for one in table.fields
         ]
+        self._texts = [pa.array(list(codes), pa.string()) for codes in self._codes]
+        self._numbers = [
+            (
+                pa.array([number for number, _ in one.texts], pa.int64()),
+                pa.array([codes[text] for _, text in one.texts], pa.int32()),
+            )
+            for one, codes in zip(table.fields, self._codes, strict=True)
+        ]
+        """Of a column of texts: its numbers, and the place in ``_texts`` of each."""
         self._rows: list[Row] = []
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
@@ -92,7 +101,8 @@ class ParquetTable:
             return pa.Array.from_buffers(kind, begin + count, buffers)[begin:]
 
         times = array(pa.int64(), block.rows.times)
-        since = compute.subtract(times, block.origin_ns).cast(pa.float64())
+        # what it cannot hold exactly was excluded above
+        since = compute.subtract(times, block.origin_ns).cast(pa.float64(), safe=False)
         arrays = [compute.divide(since, float(SECOND_NS))]
         if self._table.has_utc:
             wall = compute.add(times, block.wall_ns)
@@ -102,10 +112,9 @@ class ParquetTable:
             is_real = block.rows.is_real[index]
             found = array(pa.float64() if is_real else pa.int64(), values, valid)
             if one.kind is Kind.TEXT:
-                numbers = pa.array([number for number, _ in one.texts], pa.int64())
-                codes = pa.array([self._codes[index][text] for _, text in one.texts], pa.int32())
+                numbers, codes = self._numbers[index]
                 found = codes.take(compute.index_in(found, numbers))
-                found = pa.DictionaryArray.from_arrays(found, self._texts(index))
+                found = pa.DictionaryArray.from_arrays(found, self._texts[index])
             elif one.kind is Kind.FLAG:
                 found = found.cast(pa.int8(), safe=False)
             arrays.append(found)
@@ -151,10 +160,7 @@ class ParquetTable:
             return pa.array(column, self._type(one))
         codes = self._codes[index]
         indices = pa.array([codes.get(value) for value in column], pa.int32())
-        return pa.DictionaryArray.from_arrays(indices, self._texts(index))
-
-    def _texts(self, index: int) -> Any:
-        return self._pa.array(list(self._codes[index]), self._pa.string())
+        return pa.DictionaryArray.from_arrays(indices, self._texts[index])
 
     def _write_group(self) -> None:
         if self._batches:
