@@ -209,10 +209,10 @@ def test_a_replay_and_a_gateway_do_not_send_as_one_node(
 ) -> None:
     monkeypatch.setattr(locks, "lock_folder", lambda: tmp_path / "lock")
     setup, layout = capture_bench.made(2, dronecan=ON)
-    gateway, capture = locks.Locks(), cast("Any", SimpleNamespace(setup=setup))
+    gateway, capture = locks.Locks(), SimpleNamespace(setup=setup, sent_layout=layout)
     assert not gateway.hold([locks.ids_lock("can7", id_block(43, 0x7F))])
     with pytest.raises(RunError, match=r"can7: another gateway .* 29-bit ids with 2Bh"):
-        replay._hold(locks.Locks(), "can7", layout, capture)
+        replay._hold(locks.Locks(), "can7", cast("Any", capture))
     gateway.close()
 
 

@@ -30,7 +30,19 @@ class ParquetTable:
         self._compute: Any = compute
         self._table = table
         # the same text may stand for several numbers
-        self._texts = [list(dict.fromkeys(text for _, text in one.texts)) for one in table.fields]
+        self._codes = [
+            {text: code for code, text in enumerate(dict.fromkeys(text for _, text in one.texts))}
+            for one in table.fields
+        ]
+        self._texts = [pa.array(list(codes), pa.string()) for codes in self._codes]
+        self._numbers = [
+            (
+                pa.array([number for number, _ in one.texts], pa.int64()),
+                pa.array([codes[text] for _, text in one.texts], pa.int32()),
+            )
+            for one, codes in zip(table.fields, self._codes, strict=True)
+        ]
+        """Of a column of texts: its numbers, and the place in ``_texts`` of each."""
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
             heads.append(pa.field(UTC, pa.timestamp("ns", tz="UTC")))
@@ -98,8 +110,8 @@ class ParquetTable:
         pa, values = self._pa, block.columns[index]
         if one.kind is not Kind.TEXT:
             return pa.array(values, self._type(one))
-        codes = {text: code for code, text in enumerate(self._texts[index])}
-        return self._dictionary(index, pa.array([codes.get(value) for value in values], pa.int32()))
+        found = pa.array(map(self._codes[index].get, values), pa.int32())
+        return pa.DictionaryArray.from_arrays(found, self._texts[index])
 
     def _played(self, block: PlayedBlock, index: int, one: Field) -> Any:
         """A column of the core in C, as it is."""
@@ -111,14 +123,9 @@ class ParquetTable:
             return found.cast(pa.int8(), safe=False)
         if one.kind is not Kind.TEXT:
             return found
-        numbers = pa.array([number for number, _ in one.texts], pa.int64())
-        places = [self._texts[index].index(text) for _, text in one.texts]
-        at = self._compute.index_in(found, numbers)
-        return self._dictionary(index, pa.array(places, pa.int32()).take(at))
-
-    def _dictionary(self, index: int, codes: Any) -> Any:
-        texts = self._pa.array(self._texts[index], self._pa.string())
-        return self._pa.DictionaryArray.from_arrays(codes, texts)
+        numbers, places = self._numbers[index]
+        codes = places.take(self._compute.index_in(found, numbers))
+        return pa.DictionaryArray.from_arrays(codes, self._texts[index])
 
     def _write_group(self) -> None:
         if self._batches:
