@@ -267,6 +267,18 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
     assert len(bench.times()) == 1 + lives
 
 
+def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
+    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("CellCount", 0, 8)]), EVENT, 0, 0)])
+    bench.now = 50 * MS
+    bench.live()
+    bench.forget()
+    bench.live(InfoData(cell_count=6))
+    assert bench.raws(8) == [6]
+    bench.until(100 * MS)
+    bench.live()
+    assert bench.raws(8) == [6]
+
+
 def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> None:
     cycles = {EVENT: 0, ON_CHANGE: 0, CYCLIC_AND_EVENT: 40, CYCLIC_AND_ON_CHANGE: 30, CYCLIC: 50}
     for kind, cycle in cycles.items():

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from kontronik_can_gw.desk.pty import PtyEsc
@@ -28,12 +29,14 @@ def test_it_is_ready_and_alive_outlives_a_hang_up_and_says_that_it_ends(tmp_path
         config.write_text(f'[can]\ninterface = "virtual"\n[[esc]]\nport = "{esc.path}"\n')
         listening.bind(manager["NOTIFY_SOCKET"])
         listening.settimeout(LIMIT_S)
-        with subprocess.Popen(command, stderr=log, env=environment) as process:
-            said = ""
+        process = subprocess.Popen(command, stderr=log, env=environment)
+        try:
+            said, end = "", time.monotonic() + LIMIT_S
 
             def heard(text: str) -> str:
                 nonlocal said
                 while text not in said:
+                    assert time.monotonic() < end, f"{text} was never said"
                     said += listening.recv(4096).decode() + "\n"
                 return said.partition(text)[0]
 
@@ -42,11 +45,15 @@ def test_it_is_ready_and_alive_outlives_a_hang_up_and_says_that_it_ends(tmp_path
             process.send_signal(signal.SIGHUP)
             before = said.count("WATCHDOG=1")
             while said.count("WATCHDOG=1") < before + 4 or not file.exists():
+                assert time.monotonic() < end, "no signs of life, or no status file"
                 said += listening.recv(4096).decode() + "\n"
             assert json.loads(file.read_text())["escs"][0]["name"] == "esc1"
             process.terminate()
             heard("STOPPING=1")
             assert process.wait(LIMIT_S) == 0
+        finally:
+            process.kill()
+            process.wait()
         esc.check()
         assert esc.received == 0, "the gateway wrote to the ESC"
     assert not file.exists()
