@@ -135,7 +135,7 @@ ON_OLDER_PYTHON = pytest.mark.skipif(
 @BOTH
 def test_opendbc_reads_every_signal_from_the_path_of_the_file(file: Path) -> None:
     """It takes a path where one exists, else the name of a packaged file. What it does not understand it skips."""
-    from opendbc.can.dbc import DBC  # type: ignore[import-untyped]
+    from opendbc.can.dbc import DBC
 
     db = layout(file)
     seen = DBC(str(file))
@@ -154,7 +154,7 @@ def test_opendbc_reads_every_signal_from_the_path_of_the_file(file: Path) -> Non
 @BOTH
 def test_opendbc_reads_every_value_text(file: Path) -> None:
     """It splits texts at blanks and shouts: `Bus Off` would raise, `Ok` and `OK` would meet."""
-    from opendbc.can import CANDefine  # type: ignore[import-untyped]
+    from opendbc.can import CANDefine
 
     db = layout(file)
     names = {message.id: message.name for message in db.messages}
@@ -175,7 +175,7 @@ def test_all_readers_find_the_same_raw_values_in_any_bytes(
 ) -> None:
     import cantools
     from opendbc.can.dbc import DBC
-    from opendbc.can.parser import get_raw_value  # type: ignore[import-untyped]
+    from opendbc.can.parser import get_raw_value
 
     opendbc, matrix = DBC(str(file)), matrix_of(file, caplog)
     database: Any = cantools.database.load_file(file)
