@@ -132,7 +132,10 @@ def put_documents(tree: Path, seconds: int) -> None:
     put(document / "CHANGELOG.md.gz", compressed((PROJECT / "CHANGELOG.md").read_bytes()))
     maintainer = re.findall(r"^Maintainer: (.*)$", (HERE / "control").read_text(), re.MULTILINE)[0]
     entry = f"{NAME} ({version()}) stable; urgency=medium\n\n  * See CHANGELOG.md.gz.\n\n"
-    put(document / "changelog.gz", compressed(f"{entry} -- {maintainer}  {formatdate(seconds)}\n"))
+    put(
+        document / "changelog.gz",
+        compressed(f"{entry} -- {maintainer} <>  {formatdate(seconds)}\n"),
+    )
     put(share / "lintian/overrides" / NAME, (HERE / "lintian-overrides").read_bytes())
 
 
