@@ -72,14 +72,19 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.fixture(autouse=True, scope="session")
-def machine_with_an_id(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Gateways in this process find a machine's id; a container or a fresh root has none, of which a configuration warns."""
+def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Gateways in this process find a machine's id; a container or a fresh root has none, of which a configuration warns.
+
+    And no configuration in /etc, as where the gateway is installed.
+    """
+    from kontronik_can_gw.cli import arguments
     from kontronik_can_gw.runtime import machine
 
     file = tmp_path_factory.mktemp("machine") / "machine-id"
     file.write_text("0123456789abcdef0123456789abcdef\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(machine, "_IDENTITIES", (str(file), "/etc/machine-id"))
+        patch.setattr(arguments, "CONFIG_PLACES", arguments.CONFIG_PLACES[:1])
         yield
 
 
