@@ -243,7 +243,7 @@ def shell(command: str) -> Done:
     return subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("words", ["schema", "init -", "dbc"])
+@pytest.mark.parametrize("words", ["schema", "init -", "dbc --esc 1"])
 def test_a_full_disk_at_standard_output_is_one_line(words: str) -> None:
     done = shell(f"PROGRAM {words} >/dev/full")
     assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
