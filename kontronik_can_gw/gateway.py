@@ -196,6 +196,7 @@ class Gateway:
     def next_deadline(self, with_core: bool = True) -> int:
         """When ``advance`` is to be called at the latest."""
         due = self.core.next_deadline() if with_core else NEVER
+        due = min(due, self.conflicts.next_deadline())
         for output in self.outputs:
             due = min(due, output.next_deadline())
         return due

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import MAX_EXTENDED_ID, block_of, ids_in_words
-from kontronik_can_gw.output import NO_IDS, Output, Owner
+from kontronik_can_gw.output import NEVER, NO_IDS, Output, Owner
 
 _OVER_NS = 10 * SECOND
 """A conflict is over when no further frame has come for so long."""
@@ -116,6 +116,10 @@ class IdConflicts:
                 for each in self._present.values()
             ):
                 self._report(conflict, False, now)
+
+    def next_deadline(self) -> int:
+        """When ``advance`` has something to do at the earliest."""
+        return min((each.last + _OVER_NS + 1 for each in self._present.values()), default=NEVER)
 
     def take(self) -> list[Conflict]:
         """Conflicts that have begun, or are over, since the last call."""

@@ -176,7 +176,7 @@ def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
     for time_ns, kind, flags, index, length in _ENTRY.iter_unpack(payload[_COUNT.size : at]):
         data, came_ns = payload[at : at + length], None
         if version > 1 and kind in _WITH_ARRIVAL:
-            if length < _NUMBER.size:
+            if len(data) < _NUMBER.size:
                 raise ValueError("has an entry without its time of arrival")
             came_ns, data = _NUMBER.unpack_from(data)[0], data[_NUMBER.size :]
         yield Entry(time_ns, kind, index, data, flags, came_ns)

@@ -109,7 +109,7 @@ def main(args: argparse.Namespace, opened_by: Callable[..., Input] = open_input)
         with _ended_by_signals():
             _convert(args, form, opened_by)
     except KeyboardInterrupt as end:
-        _say("stopped: nothing is written" if args.output != "-" else "stopped")
+        say("stopped: nothing is written" if args.output != "-" else "stopped", args.command)
         return 143 if isinstance(end, _Ended) else 130
     return 0
 
@@ -164,26 +164,27 @@ def _report(
     """Say what was written, and what of the recording was not intact. RunError where there was nothing."""
     damage = [f"{args.input}: damaged: {line}" for line in recording.damage]
     if summary is None:
-        raise RunError(*damage, f"{args.input}: {_nothing(args, recording)}")
+        raise RunError(*damage, f"{args.input}: {_nothing(args, form, recording)}")
+    if form in TABLES and recording.left_out:
+        damage.append(f"{args.input}: {recording.left_out}")
     if not args.quiet:
-        if form in TABLES and recording.others:
-            file = Path(recording.bus.layout.file).name
-            summary += f", {recording.others} frames left out that {file} does not have (-c or --dbc gives another)"
         where = "standard output" if args.output == "-" else args.output
-        _say(f"{where}: {summary}, in {seconds:.1f} s")
+        say(f"{where}: {summary}, in {seconds:.1f} s", args.command)
         if recording.times_assumed and form != BYTES:
             live_rate = args.live_rate or LIVE_RATE
-            _say(f"times are assumed: {live_rate:g} live frames a second (--live-rate)")
+            assumed = f"times are assumed: {live_rate:g} live frames a second"
+            say(f"{assumed} (convert --live-rate)", args.command)
     for line in damage:
-        _say(line)
+        say(line, args.command)
 
 
-def _nothing(args: argparse.Namespace, recording: Input) -> str:
+def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
     """Why there is nothing to convert."""
     if args.start is not None or args.end is not None:
         return "nothing in it is between --from and --until"
     if not isinstance(recording, CanLogInput):
-        return "nothing in it can be converted: it has no frame."
+        what = "live frame" if form in TABLES else "frame"
+        return f"nothing in it can be converted: it has no {what}."
     if not recording.others:
         return "nothing in it can be converted: it has no CAN frame."
     return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
@@ -268,7 +269,3 @@ def _esc(args: argparse.Namespace, recording: Input, needed: bool = False) -> in
     if args.esc not in names:
         raise UserError(f"--esc {args.esc}: there is no such ESC. There are: {', '.join(names)}")
     return names.index(args.esc)
-
-
-def _say(text: str) -> None:
-    say(text, "convert")

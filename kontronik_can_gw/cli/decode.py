@@ -21,5 +21,6 @@ exit codes: 0 decoded, also where a part of FILE is damaged; 1 no frame is found
 def main(args: argparse.Namespace) -> int:
     """Decode args.file. RunError where something cannot be opened, read or written."""
     form = "csv" if args.csv else "jsonl"
-    words = ["convert", "--to", form, "--", args.file, "-"]
-    return convert.main(make_parser(["convert"]).parse_args(words), BytesInput)
+    given = make_parser(["convert"]).parse_args(["convert", "--to", form, "--", args.file, "-"])
+    given.command = args.command
+    return convert.main(given, BytesInput)

@@ -142,10 +142,7 @@ def _publish(source: Source, publisher: Publisher, client: "MqttClient") -> None
     """Publish from the source to the broker, until a signal or the end of the source."""
     stop, notifier, faults = Event(), Notifier(), FaultLog()
     with stopping_on_signals(stop.set):
-        try:
-            client.start()
-        except OSError as error:
-            raise RunError(str(error)) from None
+        client.start()
         notifier.ready("started")
         try:
             while not source.ended and not stop.is_set():

@@ -16,7 +16,7 @@ from kontronik_can_gw.desk.recordings.pacing import Pace
 from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.locks import Locks, ids_lock, in_use, messages_lock, node_lock
@@ -135,7 +135,9 @@ def _hold(locks: Locks, channel: str, recording: PlayedInput) -> None:
             if node.node_id != UNCONFIGURED:
                 names.append(node_lock(channel, node.node_id))
     for output in recording.setup.outputs:
-        names += [ids_lock(channel, key) for key in output.taken_ids() if key >> 32]
+        # without the bits of a node-ID that an allocator gives
+        blocks = [key for key in output.taken_ids() if key >> 32 and key != id_block(0, 0)]
+        names += [ids_lock(channel, key) for key in blocks]
     for taken in locks.hold(names):
         raise in_use(taken)
 

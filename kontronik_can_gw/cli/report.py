@@ -68,6 +68,8 @@ def main(args: argparse.Namespace) -> int:
             damage=recording.damage,
         )
         write_output(args.output, page)
+    if recording.left_out:
+        damage.append(f"{args.input}: {recording.left_out}")
     for line in damage:
         say(line, "report")
     return 0

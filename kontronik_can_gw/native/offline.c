@@ -191,7 +191,7 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
     return KCG_ALL_DONE;
 }
 
-/* --- plain bytes, which have no times (twin: dump_input.py) ---------------------------------------------------------- */
+/* --- plain bytes, which have no times (twin: bytes_input.py) --------------------------------------------------------- */
 
 /* Let time pass until `now`. 0 where there is no room for what may come of it. */
 static int catch_up(kcg_offline *o, int64_t now)

@@ -128,6 +128,18 @@ def test_wrong_values_in_the_header(
         read_all(path)
 
 
+def test_a_table_whose_last_entry_is_longer_than_the_block(
+    header: dict[str, Any], bench: Bench, tmp_path: Path
+) -> None:
+    """Its time of arrival lies outside: damage, whatever the lengths say."""
+    path = tmp_path / "a.kcap"
+    entry = next(entry for entry in bench.entries if entry.came_ns is not None)
+    payload = data_payload([entry])
+    for left in range(len(payload)):
+        path.write_bytes(block(b"H", 0, json_payload(header)) + block(b"D", 1, payload[:left]))
+        read_all(path)
+
+
 def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
     rng = random.Random(4)

@@ -60,6 +60,12 @@ def test_the_beginning_of_an_option_is_none(words: str) -> None:
     assert f"unrecognized arguments: {words.split()[-2]}" in refused(2, *words.split())
 
 
+@pytest.mark.parametrize("words", ["-o a.log", "--output=a.log", "--force", "--to log"])
+def test_every_removed_option_of_replay_says_what_to_type(words: str) -> None:
+    said = refused(2, "replay", "a.kcap", *words.split())
+    assert "was removed" in said and "convert FILE flight.log" in said
+
+
 def test_no_removed_option_is_in_use() -> None:
     for (command, option), advice in REMOVED_OPTIONS.items():
         name, _, choice = option.partition(" ")

@@ -586,18 +586,22 @@ def judge_decoded(file: Path) -> Judge:
             if name not in SHOWN_OTHERWISE
         }
         wanted = meaning.column_lines(columns)[1:]
-        shown = Counter(line.removeprefix("| ") for line in lines)
-        always = [line[7:].partition(": ") for line in shown if line.startswith("always ")]
+        # JSON lines and CSV, whose headers have the units
+        shown = Counter(re.sub(r" \[[^]]*\]", "", line.removeprefix("| ")) for line in lines)
+        always = Counter(
+            (value, name)
+            for line in shown.elements()
+            if line.startswith("always ")
+            for value, _, names in [line[7:].partition(": ")]
+            for name in names.split(", ")
+        )
         for line in wanted:
             found.count["columns"] += 1
             if line.startswith("always "):
                 value, _, names = line[7:].partition(": ")
-                same = {
-                    n for other, _, these in always if other == value for n in these.split(", ")
-                }
-                missing = {*names.split(", ")} - same
+                missing = [name for name in names.split(", ") if always[value, name] != 2]
                 found.wrong += [f"{title}: {name} is not always {value}" for name in missing]
-            elif not shown[line]:
+            elif shown[line] != 2:
                 found.wrong.append(f"{title}: not so: {line}")
     return found
 

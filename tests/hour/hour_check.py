@@ -460,15 +460,16 @@ def check_decoded(truth: Truth, esc: int, path: Path) -> Verdict:
     """The JSON lines of ``decode``: live frames in their order, every field as meant."""
     verdict = Verdict()
     one = truth.escs[esc]
+    keys = [_WIRE_NAMES.get(name, name) for name in one.live]
     with path.open(encoding="utf-8") as file:
-        rows = [json.loads(line) for line in file]
+        rows = [[row[key] for key in keys] for row in map(json.loads, file)]
     verdict.rows, count = len(rows), len(next(iter(one.live.values())))
     if len(rows) != count:
         verdict.say(1, f"{len(rows)} rows, must be {count}")
         return verdict
-    for name, raw in one.live.items():
-        key = _WIRE_NAMES.get(name, name)
-        got = np.array([np.nan if r[key] is None else r[key] for r in rows], dtype=np.float64)
+    for place, (name, raw) in enumerate(one.live.items()):
+        values = [row[place] for row in rows]
+        got = np.array([np.nan if value is None else value for value in values], np.float64)
         wanted = raw / _WIRE_STEPS.get(name, 1)
         if name == "bec_current":
             # of a JIVEPro none, as soon as an info frame has told what it is

@@ -1,5 +1,6 @@
 """A loop that turns in C, with pseudo terminals and a local socket: what it records, replayed by the core in Python, gives what it sent."""
 
+import logging
 import os
 import random
 import socket
@@ -31,7 +32,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
-from kontronik_can_gw.output import Output
+from kontronik_can_gw.output import NEVER, Output
 from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.native_poller import NativePoller
@@ -290,6 +291,35 @@ def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
     assert waiting[-1].data == struct.pack("<I", beacon.count)
     assert (len(waiting) > 10) == queued
     assert len(waiting) == 1 or queued
+    loop.close()
+
+
+def test_a_foreign_frame_with_our_id_is_over_after_ten_seconds_between_turns_in_c(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No output has a deadline of its own; the next one is a new one, which is said."""
+    caplog.set_level(logging.INFO)
+    monkeypatch.setenv(load.PURE, "0")
+    world = wire_world.World()
+    loop = wire_world.loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    wire, begun = world.wires[0], world.now
+    wire.stream(begun, begun + 40 * SECOND, 10 * MS)
+    conflicts = loop.gateway.conflicts
+    for came in (1, 25):
+        world.bus.came(0x100, bytes(8), begun + came * SECOND)
+        wire_world.run(loop, world, begun + (came + 9) * SECOND)
+        assert conflicts.next_deadline() < NEVER
+        wire_world.run(loop, world, begun + (came + 11) * SECOND)
+        assert conflicts.next_deadline() == NEVER
+    wire_world.run(loop, world, begun + 39 * SECOND)
+    said = [
+        r.getMessage().split(": ")[2].split()[0]
+        for r in caplog.records
+        if "else sends" in r.getMessage()
+    ]
+    assert said == ["somebody", "nobody", "somebody", "nobody"]
     loop.close()
 
 

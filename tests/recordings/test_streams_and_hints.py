@@ -93,8 +93,15 @@ def test_frames_that_the_dbc_does_not_have_are_counted_and_the_remedy_is_said(
     tmp_path: Path,
 ) -> None:
     log = write_bus_log(tmp_path / "bus.log", flight(layout_of(["a", "b", "c"]), 2))
-    said = run("convert", log, tmp_path / "o.csv").err
-    assert "frames left out that kontronik_esc.dbc does not have (-c or --dbc gives" in said
+    for words in (
+        ("convert", log, tmp_path / "o.csv"),
+        ("convert", "-q", log, tmp_path / "q.csv"),
+        ("report", log, "-o", tmp_path / "o.html"),
+        ("monitor", "--once", log),
+    ):
+        said = run(*words).err
+        left_out = "frames left out that kontronik_esc.dbc does not have (-c or --dbc gives"
+        assert left_out in said, words
     assert "left out" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
 
 

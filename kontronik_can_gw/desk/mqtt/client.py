@@ -5,6 +5,7 @@ nobody. Lasting messages are published again after each reconnection. MQTT 3.1.1
 """
 
 import contextlib
+import errno
 import logging
 import random
 import socket
@@ -21,6 +22,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.desk.mqtt.messages import OFFLINE, ONLINE, Message
+from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.fault_log import FaultLog
 
 KEEPALIVE_S = 15
@@ -122,12 +124,14 @@ class MqttClient:
         return f"MQTT broker [{host}]:{port}" if ":" in host else f"MQTT broker {host}:{port}"
 
     def start(self) -> None:
-        """Start paho's thread, which connects. OSError with the remedy where 127.0.0.1, by which paho wakes it, does not work."""
+        """Start paho's thread, which connects. RunError with the remedy where 127.0.0.1, by which paho wakes it, does not work."""
         self._client.connect_async(*self.address, KEEPALIVE_S)
         try:
             self._client.loop_start()
         except OSError as error:
-            raise OSError(
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                raise
+            raise RunError(
                 f"127.0.0.1: {error.strerror or error}. MQTT needs this machine's own network: sudo ip link set lo up"
             ) from None
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import groupby, islice
 from operator import itemgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from kontronik_can_gw.capture.replay import TimedFrame
@@ -104,6 +105,14 @@ class Input(ABC):
         """True where the recording has no times."""
         self.others = 0
         """CAN frames that the layout does not have; complete when it was read to the end."""
+
+    @property
+    def left_out(self) -> str:
+        """What became of ``others`` in tables, pages and screens; empty where there are none."""
+        if not self.others:
+            return ""
+        file = Path(self.bus.layout.file).name
+        return f"{self.others} CAN frames left out that {file} does not have (-c or --dbc gives another)"
 
     @property
     def channel(self) -> str:

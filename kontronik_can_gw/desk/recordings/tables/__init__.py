@@ -1,1 +1,1 @@
-"""Tables of ESC values, a row at each time: CSV, JSON lines, Parquet, MF4."""
+"""Tables of ESC values, a row at each time: CSV, JSON lines, Parquet."""

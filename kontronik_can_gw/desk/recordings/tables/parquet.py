@@ -16,7 +16,10 @@ GROUP = 1 << 16
 
 
 class ParquetTable:
-    """Columns as in CSV. Flags int8, whole numbers int64, others float64, texts dictionaries of strings; null where not available."""
+    """Columns as in CSV.
+
+    Flags int8, whole numbers int64 (uint64 where they need it), others float64, texts dictionaries of strings; null where not available.
+    """
 
     def __init__(self, path: Path, table: Table) -> None:
         try:
@@ -137,4 +140,5 @@ class ParquetTable:
         pa = self._pa
         if one.kind is Kind.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
-        return {Kind.FLAG: pa.int8(), Kind.WHOLE: pa.int64(), Kind.FLOAT: pa.float64()}[one.kind]
+        whole = pa.uint64() if _FAR <= one.high <= 2 * _FAR else pa.int64()
+        return {Kind.FLAG: pa.int8(), Kind.WHOLE: whole, Kind.FLOAT: pa.float64()}[one.kind]
