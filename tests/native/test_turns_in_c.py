@@ -9,6 +9,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -320,6 +321,31 @@ def test_a_foreign_frame_with_our_id_is_over_after_ten_seconds_between_turns_in_
         if "else sends" in r.getMessage()
     ]
     assert said == ["somebody", "nobody", "somebody", "nobody"]
+    loop.close()
+
+
+def test_the_kernel_is_asked_for_the_interface_each_second_between_turns_in_c(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(load.PURE, "0")
+    world = wire_world.World()
+    loop = wire_world.loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    asked: list[int] = []
+
+    def ask(now: int) -> None:
+        asked.append(now)
+        loop.can.controller.due = now + SECOND
+
+    monkeypatch.setattr(loop.can, "ask", ask)
+    loop.can.controller.due = world.now
+    begun = world.now
+    world.wires[0].stream(begun, begun + 10 * SECOND, 10 * MS)
+    wire_world.run(loop, world, begun + 10 * SECOND)
+    gaps = [later - at for at, later in pairwise([begun, *asked, world.now])]
+    assert max(gaps) <= 1600 * MS
+    assert len(asked) < 12
     loop.close()
 
 

@@ -32,7 +32,15 @@ PATIENCE = 60.0
 
 def numbered(number: int) -> Moment:
     """A moment of a gateway without an ESC."""
-    gateway = GatewayFacts([], GatewayStatus(sent_frames=number), [], {}, None, "Python", "")
+    gateway = GatewayFacts(
+        [],
+        GatewayStatus(sent_frames=number, received_frames=3 * number),
+        [],
+        {},
+        None,
+        "Python",
+        "",
+    )
     can = CanFacts("socketcan", "can0", None, True)
     now = number * SECOND
     return Moment(gateway, now, 0.0, ProgramFacts("x"), ProcessFacts(), [], can)
@@ -115,7 +123,8 @@ def test_the_file_is_readable_for_all_whole_and_alone(file: Path) -> None:
     put(statistics, file, 3)
     assert stat.S_IMODE(file.stat().st_mode) == 0o644
     assert os.listdir(file.parent) == ["status.json"]
-    assert json.loads(file.read_text(encoding="utf-8"))["rates"]["sent_frames_per_s"] == 1.0
+    rates = json.loads(file.read_text(encoding="utf-8"))["rates"]
+    assert (rates["sent_frames_per_s"], rates["received_frames_per_s"]) == (1.0, 3.0)
     statistics.close()
 
 
