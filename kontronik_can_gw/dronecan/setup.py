@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from kontronik_can_gw.dronecan.esc_report import SPEEDS
 from kontronik_can_gw.dronecan.nodes import Dronecan
-from kontronik_can_gw.dronecan.transport import MAX_NODE_ID
+from kontronik_can_gw.dronecan.transport import MAX_NODE_ID, NODE
 from kontronik_can_gw.dronecan.types import MAX_ESC_INDEX, MAX_RPM
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
@@ -71,7 +71,7 @@ class DronecanSetup:
         if not self.given.table.node_id:
             return {id_block(0, 0): "DroneCAN, whose node-ID an allocator chooses"}
         return {
-            id_block(node.node_id, 0x7F): f"DroneCAN node {node.node_id} (bits 0 to 6 of its ids)"
+            id_block(node.node_id, NODE): f"DroneCAN node {node.node_id} (bits 0 to 6 of its ids)"
             for node in self.nodes
         }
 
