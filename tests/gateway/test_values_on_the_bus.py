@@ -176,13 +176,6 @@ def test_information_that_runs_out_is_not_available_on_every_page() -> None:
         assert value in shown and shown[-1] == b"\xff\xff"
 
 
-def test_the_load_of_can_fd_counts_the_data_phase_at_its_own_rate() -> None:
-    messages = "".join(f"BO_ {257 + n} M{n}: 64 Gw\n{SPEED}\n" for n in range(8))
-    layout = layout_of(f"{HEAD}{SPEED}\n{messages}{ATTRIBUTES}")
-    assert 0.25 < layout.bus_load(500_000, 2_000_000) < 0.45
-    assert layout.bus_load(500_000, 500_000) > 1
-
-
 def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:
     cycle = 'BA_ "GenMsgSendType" BO_ 256 "Cyclic";\nBA_ "GenMsgCycleTime" BO_ 256 20;\n'
     (message,) = layout_of(f"\ufeff{HEAD}{SPEED}{ATTRIBUTES}{cycle}").messages

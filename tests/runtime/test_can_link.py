@@ -303,22 +303,6 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> 
     side.close()
 
 
-def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
-    bench: Bench, kernel: Kernel
-) -> None:
-    bench.begin()
-    bench.port.answer = Sent.BUSY
-    bench.can.transmitter.queue.put_all([CanFrame(0x100, b"held")])
-    bench.can.transmit(bench.now)
-    bench.can.is_proven = False
-    bench.can.transmitter.clear()
-    later = bench.now + SECOND
-    bench.gateway.take_frames(bench.now)
-    bench.can.transmit(later)
-    assert not bench.can.is_proven
-    assert bench.can.transmitter._busy_since is None
-
-
 def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -373,25 +357,6 @@ def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
     bench.turn(200)
     assert bench.gateway.status.bus_off_count == 2
     assert told(bench.take()) == ["8110", "0000"]
-
-
-def test_answers_that_an_interface_that_is_down_does_not_take_are_dropped_and_counted(
-    bench: Bench,
-) -> None:
-    bench.start()
-    bench.turn(100)
-    bench.port.answer = Sent.DOWN
-    Port.there = False
-    for n in range(3):
-        bench.gateway.receive_frame(
-            CanFrame(0x601, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0))), bench.now, bench.now
-        )
-    before = bench.gateway.status.dropped_frames
-    bench.can.transmit(bench.now)
-    assert bench.gateway.status.can_state is CanState.DOWN
-    assert bench.gateway.status.dropped_frames >= before + 3
-    assert len(bench.can.transmitter.queue) == 0
-    bench.can.serve(bench.now)  # closed in this round
 
 
 def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) -> None:
