@@ -45,19 +45,6 @@ class Port(Bus):
         super().__init__(World())
         self.state = CanState.UNKNOWN
 
-    def set_receive_ids(self, ids: frozenset[int]) -> None:
-        self.ids = ids
-
-    def note_state(self, state: CanState) -> None:
-        self.bus_off_count += state is CanState.BUS_OFF and self.state is not CanState.BUS_OFF
-        self.state = state
-
-    def send(self, frame: CanFrame) -> Sent:
-        answer = super().send(frame)
-        if answer is Sent.OK and self.state is CanState.UNKNOWN:
-            self.state = CanState.ERROR_ACTIVE
-        return answer
-
 
 class Kernel:
     """What rtnetlink tells: ``facts`` on being asked, and ``news`` by itself."""
@@ -362,11 +349,11 @@ def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
 def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) -> None:
     bench.start()
     bench.turn(10)
-    assert 0x601 in bench.port.ids and 0x705 not in bench.port.ids
+    assert 0x601 in bench.port._ids and 0x705 not in bench.port._ids
     watch_node_5 = bytes.fromhex("23 16 10 01 2c 01 05 00")
     bench.gateway.receive_frame(CanFrame(0x601, watch_node_5), bench.now, bench.now)
     bench.turn(1)
-    assert {0x601, 0x705} <= bench.port.ids
+    assert {0x601, 0x705} <= bench.port._ids
 
 
 def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> None:
@@ -377,5 +364,5 @@ def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> 
     bench.can.serve(bench.now)
     assert not bench.can.is_open
     bench.turn(600)
-    assert bench.port is not before and bench.port.ids == before.ids
+    assert bench.port is not before and bench.port._ids == before._ids
     assert told(bench.take()) == ["boot-up"]
