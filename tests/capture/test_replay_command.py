@@ -1,15 +1,19 @@
 """``replay`` as a person uses it."""
 
+import os
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 from capture_bench import START, Bench, capture, made
 from command_line import refused, written
 
+from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.desk.recordings.pacing import Pace
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 
@@ -24,6 +28,15 @@ def test_a_log_is_not_written_over_itself_and_has_no_bytes_of_escs(tmp_path: Pat
     )
 
 
+@contextmanager
+def playing(*words: object) -> Iterator[subprocess.Popen[str]]:
+    """A replay in a process of its own, whose last terminal is there."""
+    command = [*PROGRAM, "replay", *map(str, words), "--on", "pty"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as player:
+        yield player
+
+
 def test_it_stops_at_once_when_asked(tmp_path: Path) -> None:
     bench = Bench(*made(1))
     bench.gateway.start(START)
@@ -31,16 +44,30 @@ def test_it_stops_at_once_when_asked(tmp_path: Path) -> None:
     bench.gateway.advance(START + 3600 * SECOND)
     bench.take(START + 3600 * SECOND)
     path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
-    words = ["replay", str(path), "--on", "pty"]
-    with subprocess.Popen(
-        [*PROGRAM, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as player:
-        assert player.stdout
-        assert player.stderr
+    with playing(path) as player:
+        assert player.stdout and player.stderr
         assert player.stdout.readline().startswith("e0 "), "it runs"
         player.send_signal(signal.SIGINT)
         assert player.wait(600) == 0, "in an hour it would end by itself"
         assert "stopped" in player.stderr.read()
+
+
+def test_a_terminal_has_the_bytes_of_its_esc(tmp_path: Path) -> None:
+    bench = Bench(*made(2)).live(5, 2)
+    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
+    found = bytearray()
+    with playing(path, "--link", tmp_path / "esc{n}", "--speed", 4) as player:
+        assert player.stdout
+        assert [player.stdout.readline().split()[0] for _ in range(2)] == ["e0", "e1"]
+        player.send_signal(signal.SIGSTOP)  # until there is a reader
+        fd = os.open(tmp_path / "esc2", os.O_RDONLY | os.O_NOCTTY)
+        player.send_signal(signal.SIGCONT)
+        with suppress(OSError):  # the other end is closed
+            while data := os.read(fd, 4096):
+                found += data
+        os.close(fd)
+        assert player.wait(600) == 0
+    assert found == b"".join(e.data for e in bench.entries if e.kind == Kind.BYTES and e.esc == 1)
 
 
 # --- recorded time against real time
