@@ -14,7 +14,6 @@ from kontronik_can_gw.cli.arguments import CONFIG, config_file, number_from, opt
 from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.telemetry import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.gateway import Gateway
@@ -118,7 +117,8 @@ class _Run:
         _begin_realtime(config.run.realtime_priority, wait)
         gateway, recorder = self._gateway(loaded)
         try:
-            statistics = Statistics(config.statistics_path or default_file())
+            file = config.statistics_path or default_file()
+            statistics = None if file is None else Statistics(file)
         except UserError:
             if loaded.store is not None:
                 loaded.store.close(0)
@@ -129,7 +129,6 @@ class _Run:
             config.can,
             wait,
             loaded.store,
-            int((self._args.status or 0) * SECOND),
             notifier=self._notifier,
             statistics=statistics,
             program=self._program,

@@ -12,7 +12,7 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
+from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.socketcan_port import fault_of, socketcan_error
 
@@ -101,12 +101,7 @@ class BusListener:
     def _take(self) -> list[CanFrame]:
         if self._port is None:
             return []
-        frames: list[CanFrame] = []
-        while len(frames) < _MAX_AT_ONCE:
-            new = self._port.receive()
-            frames += [frame for frame, _ in new]
-            if len(new) < RECEIVE_LIMIT:
-                break
+        frames = [frame for frame, _ in self._port.receive(_MAX_AT_ONCE)]
         self.lost_frames += self._port.overruns
         self._port.overruns = 0
         if self._port.gone:

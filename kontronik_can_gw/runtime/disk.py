@@ -11,6 +11,19 @@ def write_all(fd: int, data: bytes) -> None:
         rest = rest[os.write(fd, rest) :]
 
 
+def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> None:
+    """Write a new file with these permissions, in place of a left-over one; ``is_synced``: its content is on disk then. Or OSError."""
+    path.unlink(missing_ok=True)
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    try:
+        os.fchmod(fd, mode)  # whatever the umask
+        write_all(fd, data)
+        if is_synced:
+            os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
 def sync_folder(folder: Path) -> None:
     """Force the names in a folder to the disk. OSError where that fails, as on a file system that cannot."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -62,8 +62,6 @@ class EscPort:
         self._counted: Mapping[str, int] = {}
         self._stuck = StuckCheck(self._noted)
         self._lost_since: int | None = None
-        self._facts: tuple[int, PortFacts] | None = None
-        """Of the fault log's state with this number; None: of another state of the port."""
 
     @property
     def name(self) -> str:
@@ -71,12 +69,6 @@ class EscPort:
 
     def facts(self) -> PortFacts:
         """For the statistics."""
-        changes, is_down = self._conditions.changes, not self._gateway.escs[self._index].up
-        if is_down or self._facts is None or self._facts[0] != changes:
-            self._facts = changes, self._facts_now()
-        return self._facts[1]
-
-    def _facts_now(self) -> PortFacts:
         return PortFacts(
             self.name,
             self.path if self.port is None else self.port.path,
@@ -105,7 +97,7 @@ class EscPort:
         noted = self._noted
         noted.empty_ns, noted.undrained_ns, noted.is_plain = self._clock(), NEVER, False
         port.discard()  # what came before we listened has no time
-        self.port, self._facts = port, None
+        self.port = port
         self.identity = port.identity()
         self.reopened += 1
         self._lost_since = None
@@ -171,7 +163,7 @@ class EscPort:
         if self.port is not None:
             self._poller.unregister(self.port.fileno())
             self.port.close()
-            self.port = self._facts = None
+            self.port = None
 
     def is_stuck(self) -> bool:
         """True if the loop does not serve this port."""
@@ -195,7 +187,7 @@ class EscPort:
             self.line_errors[kind] = self.line_errors.get(kind, 0) + new
             if kind != "break":  # a break is a framing error too
                 self._gateway.escs[self._index].line_errors += new
-        self._counted, self._facts = counts, None
+        self._counted = counts
 
     def _failed(self, reason: str, now: int, quiet: bool = False) -> None:
         self.due = self._retry.failed(now)

@@ -24,11 +24,10 @@ class _Condition:
 
 
 class FaultLog:
-    """The conditions of a gateway by name; ``changes`` grows when one does. ``recent``: the last lines, for the statistics."""
+    """The conditions of a gateway by name. ``recent``: the last lines, for the statistics."""
 
     def __init__(self) -> None:
         self.recent: deque[str] = deque(maxlen=REMEMBERED)
-        self.changes = 0
         self._held: list[tuple[int, str]] | None = None
         self._known: dict[str, _Condition] = {}
         self._summing: dict[str, int] = {}
@@ -50,7 +49,6 @@ class FaultLog:
         condition = self._known.setdefault(name, _Condition())
         if condition.begun is not None and condition.reason == text:
             return
-        self.changes += 1
         if condition.begun is None:
             condition.begun = now if since is None else since
         condition.reason = text
@@ -78,7 +76,6 @@ class FaultLog:
         if condition is None or condition.begun is None:
             return
         lasted = now - condition.begun
-        self.changes += 1
         condition.begun = None
         condition.total += lasted
         if name not in self._summing:
@@ -87,7 +84,6 @@ class FaultLog:
     def forget(self, name: str) -> None:
         """It is over, and something else says so."""
         if (condition := self._known.get(name)) is not None and condition.begun is not None:
-            self.changes += 1
             condition.begun = None
 
     def is_on(self, name: str) -> bool:

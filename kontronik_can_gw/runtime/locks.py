@@ -25,7 +25,6 @@ SYSTEM_FOLDER = Path("/run/kontronik-can-gw/lock")
 PREFIX = ""
 """Before the names of all locks, for tests that run side by side."""
 _NAME = "kontronik-can-gw"
-_MAX_NAME = 200
 _TRIES = 100
 _OPEN = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
 
@@ -71,11 +70,6 @@ def network_namespace() -> int:
 def file_name(name: str, namespace: int) -> str:
     """The file that stands for a lock."""
     text = (PREFIX + name).replace("%", "%25").replace("/", "%2F")
-    if len(os.fsencode(text)) > _MAX_NAME:
-        from hashlib import sha256  # which loads OpenSSL: 4 MB
-
-        channel, what, number = (PREFIX + name).rsplit("/", 2)
-        text = f"{sha256(os.fsencode(channel)).hexdigest()}%2F{what}%2F{number}"
     return f"{namespace}.{text}"
 
 

@@ -50,7 +50,6 @@ class Loop:
         can_config: CanConfig,
         wait_for_devices: bool = False,
         store: "ParameterStore | None" = None,
-        status_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
         notifier: Notifier | None = None,
         statistics: Statistics | None = None,
@@ -64,7 +63,7 @@ class Loop:
         self._wait = wait_for_devices
         self._store = store
         self._notifier = notifier or Notifier({})
-        self._statistics = statistics or Statistics(None)
+        self._statistics = statistics
         self._recorder = recorder
         self._now = self._node_changes = 0
         self._due: int | None = None  # not known since something was done
@@ -87,7 +86,6 @@ class Loop:
             statistics=self._statistics,
             recorder=recorder,
             program=program or ProgramFacts(""),
-            status_ns=status_ns,
         )
         self._wake: Handover[None] = Handover()
         self._poller.register(self._wake.fileno(), self._woken)
@@ -210,7 +208,8 @@ class Loop:
             esc.close()
         self.can.close()
         self._poller.close()
-        self._statistics.close()
+        if self._statistics is not None:
+            self._statistics.close()
         if self._recorder is not None:
             self._recorder.close()
             self._housekeeping.follow_recorder(self._clock())  # the last words

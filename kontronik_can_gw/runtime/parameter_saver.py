@@ -1,7 +1,6 @@
 """Parameters on their way from the nodes to the store, and what became of them on the way back."""
 
 import logging
-from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,14 +9,13 @@ from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.facts import StoreFacts
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.storage import Stored
     from kontronik_can_gw.runtime.store import ParameterStore
 
 log = logging.getLogger("kontronik_can_gw")
 
 
 class ParameterSaver:
-    """Hands savings to the store's thread, in their order; ``store`` None: each is answered with an error."""
+    """Hands savings to the store's thread, in their order (a node has a few at most); ``store`` None: each is answered with an error."""
 
     def __init__(
         self, gateway: Gateway, escs: Sequence[EscPort], store: "ParameterStore | None"
@@ -25,43 +23,37 @@ class ParameterSaver:
         self._gateway = gateway
         self._escs = escs
         self._store = store
-        self._waiting: deque[tuple[int, Stored]] = deque()
-        self._being_saved = 0
+        self._waiting = 0
         self._last_error = ""
 
     def save(self, now: int) -> None:
-        """Hand over what is to be stored; while the disk has not taken what came before, it waits."""
-        self._waiting += self._gateway.take_saves()
-        if not self._waiting:
-            return
-        from kontronik_can_gw.canopen.storage import encode  # only nodes have something to store
+        """Hand over what is to be stored."""
+        for index, stored in self._gateway.take_saves():
+            from kontronik_can_gw.canopen.storage import (
+                encode,
+            )  # only nodes have something to store
 
-        while self._waiting:
-            index, stored = self._waiting[0]
             name = self._escs[index].name
             if self._store is not None and self._store.save(name, encode(stored)):
-                self._being_saved += 1
-            elif self._being_saved:
-                return
+                self._waiting += 1
             else:
-                log.error("%s: parameters cannot be stored: there is no store for them", name)
-                self._gateway.saved(index, "no store", now)
-            self._waiting.popleft()
+                self._take(index, "no store", now)
 
     def take_results(self, now: int, _events: int = 0) -> None:
         """The store has something to report: pass it on."""
         for name, error in self._store.results() if self._store is not None else ():
-            self._being_saved -= 1
-            index = next(index for index, esc in enumerate(self._escs) if esc.name == name)
-            if error is None:
-                log.info("%s: parameters stored", name)
-            else:
-                log.error("%s: parameters cannot be stored: %s", name, error)
-            self._last_error = "" if error is None else f"{name}: {error}"
-            self._gateway.saved(index, error, now)
+            self._waiting -= 1
+            self._take([esc.name for esc in self._escs].index(name), error, now)
+
+    def _take(self, index: int, error: str | None, now: int) -> None:
+        name = self._escs[index].name
+        if error is None:
+            log.info("%s: parameters stored", name)
+        else:
+            log.error("%s: parameters cannot be stored: %s", name, error)
+        self._last_error = "" if error is None else f"{name}: {error}"
+        self._gateway.saved(index, error, now)
 
     def facts(self) -> StoreFacts | None:
         """For the statistics; None without a store."""
-        if self._store is None:
-            return None
-        return StoreFacts(len(self._waiting) + self._being_saved, self._last_error)
+        return None if self._store is None else StoreFacts(self._waiting, self._last_error)

@@ -8,11 +8,9 @@ import contextlib
 import os
 import resource
 import threading
-from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
 
-_CAP_IPC_LOCK = 14
 _LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4
 """Of mlockall(2): what is used, as it comes to be used."""
 
@@ -60,20 +58,9 @@ def _how(priority: int) -> str:
     return f"Once, for this shell: sudo prlimit --rtprio={priority} --memlock=unlimited --pid $$"
 
 
-def _may_lock_all() -> bool:
-    """Whether memory may be locked without a bound: with one, an allocation would fail some day."""
-    if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY:
-        return True
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        lines = Path("/proc/self/status").read_text().splitlines()
-        held = next(int(line.split()[1], 16) for line in lines if line.startswith("CapEff:"))
-        return bool(held >> _CAP_IPC_LOCK & 1)
-    return False
-
-
 def _lock_memory() -> None:
-    """Keep what is used in memory. A right that is missing, or an old kernel, is no reason not to run."""
-    if not _may_lock_all():
+    """Keep what is used in memory, where that has no limit: with one, an allocation would fail some day."""
+    if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
         return
     import ctypes  # a megabyte that others need not pay for
 

@@ -1,13 +1,14 @@
 """A gateway whose every call is handed to a recorder: played again in their order they give the same frames (capture/replay.py)."""
 
 from collections.abc import Callable, Iterable, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway, MakeOutput
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ Put = Callable[[int, int, int, bytes, int, int | None], None]
 """(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""
 
 
+_counters_of: Callable[[GatewayStatus], tuple[int, ...]] = attrgetter(*COUNTERS)
 Call = tuple[int, int, int, bytes, int | None]
 """Time, kind, ESC's index, data, time of arrival."""
 
@@ -38,7 +40,7 @@ class RecordedGateway(Gateway):
     ) -> None:
         super().__init__(escs, layout, now, silent_on_loss, canopen, further)
         self._put = put
-        self._counters = self._counters_now()
+        self._counters = _counters_of(self.status)
         self._line_errors = [0] * len(escs)
 
     def start(self, now: int, can_open: bool = True) -> None:
@@ -135,17 +137,7 @@ class RecordedGateway(Gateway):
         self._put(now, kind, esc, data, flags, came)
 
     def _note_counters(self, now: int) -> None:
-        counters = self._counters_now()
+        counters = _counters_of(self.status)
         if counters != self._counters:
             self._counters = counters
             self._put(now, Kind.COUNTERS, 0, counters_data(counters), 0, None)
-
-    def _counters_now(self) -> tuple[int, ...]:
-        s = self.status
-        return (
-            *(s.sent_frames, s.replaced_frames, s.send_failures, s.received_frames),
-            *(s.bus_off_count, s.dropped_frames, s.id_conflicts, s.started_ns),
-        )
-
-
-assert len(COUNTERS) == 8  # in the order of ``_counters_now``

@@ -21,7 +21,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.capture_folder import make_folder, remove_oldest
 from kontronik_can_gw.runtime.capture_part import CapturePart, Item
 from kontronik_can_gw.runtime.disk import reason_of
-from kontronik_can_gw.runtime.worker import Faults, Report, Worker
+from kontronik_can_gw.runtime.worker import Report, Worker
 
 CAPACITY = 50_000
 """Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""
@@ -83,14 +83,13 @@ class Recorder:
         self._unwritten = 0
         """Entries that could not be written: the thread's count."""
         self._reported_overflow = 0
-        self._faults = Faults()
         self._state_ns = 0
         self._devices: list[Any] = []
         self._recorded_devices: list[Any] = []
         self._worker: Worker[None] = Worker(
-            "recorder", self._work, wait=self._wait, ended=self._end
+            "recorder", self._work, wait=self._wait, ended=self._end, clock=clock
         )
-        self._busy_since: int | None = None
+        self._faults = self._worker.faults
         self._file: CapturePart | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
@@ -135,19 +134,13 @@ class Recorder:
 
     def reports(self, now: int) -> list[Report]:
         """Take what went wrong, or is right again, since the last call."""
-        taken = self._faults.take()
+        taken = self._worker.reports(f"captures: {self.settings.folder}", _SLOW_NS, now)
         if self._overflowed >= max(1, 2 * self._reported_overflow):
             self._reported_overflow = self._overflowed
             text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
             taken.append(Report("captures: losses", True, text))
-        since = self._busy_since
-        is_slow = since is not None and now - since > _SLOW_NS
-        if is_slow or since is None:
-            text = "does not answer; the gateway is not held up." if is_slow else "answers again"
-            text = f"captures: {self.settings.folder}: the disk {text}"
-            self._faults.note("captures: disk", is_slow, text)
         self.facts.lost = self._overflowed + self._unwritten
-        return taken + self._faults.take()
+        return taken
 
     def close(self) -> None:
         """Write what waits and end the thread; a disk that does not answer is waited for 0.35 s and no longer."""
@@ -161,7 +154,6 @@ class Recorder:
     def _work(self, _items: list[None]) -> None:
         """Write what has come."""
         entries = self._entries
-        self._busy_since = self._clock()
         while True:
             items = [entries.popleft() for _ in range(min(_AT_ONCE, len(entries)))]
             now = self._clock()
@@ -172,7 +164,6 @@ class Recorder:
                 self._fail(error, now)
             if not entries or self._file is None:
                 break
-        self._busy_since = None
 
     def _end(self) -> None:
         try:

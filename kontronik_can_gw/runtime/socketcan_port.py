@@ -38,9 +38,8 @@ _ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
 _CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30, 0x40
 _OK = Sent.OK
 _CAN_RAW_ERR_FILTER = 2
-_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD = 64, 35
-"""Times of reception, of two 64-bit numbers on every machine; and of kernels before 5.1, of the machine's own."""
-_TIMES = {16: struct.Struct("=qq"), 8: struct.Struct("=ii")}
+_SO_TIMESTAMPNS, _TIME = 64, struct.Struct("=qq")
+"""Times of reception. Kernels before 5.1 have none of this form: there the time of the read counts."""
 _ANCILLARY_SIZE = 64
 _SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
 """The kernel's figures of a socket; the last one counts what it dropped for want of room."""
@@ -60,10 +59,8 @@ class SocketCanPort(CanPort):
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-        for option in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD):
-            with contextlib.suppress(OSError):
-                opened.setsockopt(socket.SOL_SOCKET, option, 1)
-                break
+        with contextlib.suppress(OSError):
+            opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         opened.setblocking(False)
 
     def fileno(self) -> int:
@@ -173,12 +170,8 @@ class SocketCanPort(CanPort):
 def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
     """The time of reception that came with a frame, on the monotonic clock."""
     for level, kind, data in ancillary:
-        if (
-            level == socket.SOL_SOCKET
-            and kind in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD)
-            and len(data) in _TIMES
-        ):
-            seconds, ns = _TIMES[len(data)].unpack(data)
+        if (level, kind, len(data)) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS, _TIME.size):
+            seconds, ns = _TIME.unpack(data)
             return int(seconds * SECOND + ns - time.time_ns() + time.monotonic_ns())
     return None
 

@@ -16,12 +16,9 @@ from pathlib import Path
 
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.disk import reason_of, sync_folder, write_all
+from kontronik_can_gw.runtime.disk import reason_of, sync_folder, write_new
 from kontronik_can_gw.runtime.locks import Taken, lock_file
 from kontronik_can_gw.runtime.worker import Handover, Worker
-
-CAPACITY = 32
-"""Savings that may wait for the disk."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,11}")
 
@@ -31,9 +28,7 @@ class ParameterStore:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._worker: Worker[tuple[str, bytes]] = Worker(
-            "parameter-store", self._write_all, capacity=CAPACITY
-        )
+        self._worker: Worker[tuple[str, bytes]] = Worker("parameter-store", self._write_all)
         self._results: Handover[tuple[str, str | None]] = Handover()
         # Names whose file could not be used and is still in its place: it is moved aside before a new one takes that.
         self._unusable: set[str] = set()
@@ -85,7 +80,7 @@ class ParameterStore:
     def save(self, name: str, data: bytes) -> bool:
         """Let ``data`` become the file's content; never blocks. True: exactly one result follows; results come in the order of the savings.
 
-        False: not accepted, because too many savings wait or the store is closed; no result follows. ValueError for an invalid name.
+        False: the system gives no thread, or the store is closed; no result follows. ValueError for an invalid name.
         """
         self._path(name)
         return self._worker.start() and self._worker.put((name, data))
@@ -130,7 +125,7 @@ class ParameterStore:
         temporary = _temporary(path)
         try:
             _make_folder(self._folder)
-            _write_synced(temporary, data)
+            write_new(temporary, data, 0o600, is_synced=True)
             if name in self._unusable:
                 _keep_damaged(path)
                 self._unusable.remove(name)
@@ -164,14 +159,3 @@ def _make_folder(folder: Path) -> None:
     _make_folder(folder.parent)
     folder.mkdir(mode=0o700, exist_ok=True)
     sync_folder(folder.parent)
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    """Write a new file, in place of a left-over one, and put its content on disk."""
-    path.unlink(missing_ok=True)
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    try:
-        write_all(fd, data)
-        os.fsync(fd)
-    finally:
-        os.close(fd)

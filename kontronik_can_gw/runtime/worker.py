@@ -11,6 +11,7 @@ import select
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
@@ -124,6 +125,7 @@ class Worker(Generic[Item]):
 
     ``work`` is called after each ``wait`` with the items that have come, and a last time at the end, then ``ended``. What they raise is
     given to ``failed`` and does not end the thread. ``wait`` returns when there is something to do; without it the worker waits for items.
+    ``faults``: what the work reports. ``busy_since``: when the work began that goes on, by ``clock``; None: there is none.
     """
 
     def __init__(
@@ -135,7 +137,11 @@ class Worker(Generic[Item]):
         wait: Callable[[], None] | None = None,
         ended: Callable[[], None] = lambda: None,
         capacity: int = sys.maxsize,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        self.faults = Faults()
+        self.busy_since: int | None = None
+        self._clock = clock
         self._name = name
         self._work = work
         self._failed = failed or self._log_failure
@@ -163,6 +169,18 @@ class Worker(Generic[Item]):
         """True from ``end`` on."""
         return self._ending.is_set()
 
+    def reports(self, what: str, slow_ns: int, now: int) -> list[Report]:
+        """Faults that have begun, or are over, since the last call.
+
+        One is that a disk does not answer: the work, on the file or folder ``what``, takes longer than ``slow_ns``.
+        """
+        since = self.busy_since
+        is_slow = since is not None and now - since > slow_ns
+        if is_slow or since is None:
+            text = "does not answer; the gateway is not held up." if is_slow else "answers again"
+            self.faults.note(f"{what}: disk", is_slow, f"{what}: the disk {text}")
+        return self.faults.take()
+
     def end(self) -> None:
         """Let the thread end when it has done what waits; may be called by the thread itself."""
         self._ending.set()
@@ -189,10 +207,12 @@ class Worker(Generic[Item]):
                 if not self._ending.is_set():  # whose wake may be read already, with the last items
                     self._wait()
                 is_last = self._ending.is_set()  # asked first: what was put before the end is done
-                self._work(self._items.take())
+                items, self.busy_since = self._items.take(), self._clock()
+                self._work(items)
             except Exception as error:  # whatever it is: the next item has its turn
                 self._failed(error)
                 self.pause(FAILURE_PAUSE_S)
+            self.busy_since = None
         try:
             self._ended()
         except Exception as error:

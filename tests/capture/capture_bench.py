@@ -82,14 +82,19 @@ class Bench:
 
     def live(self, seed: int, seconds: float, wild: bool = True) -> "Bench":
         """Run: bytes in random pieces, turns that come late, the bus and the ports go and come, a master asks."""
+        now = self.running(seed, wild)(seconds)
+        self.gateway.stop(now)
+        self.take(now)
+        return self
+
+    def running(self, seed: int, wild: bool = True) -> Callable[[float], int]:
+        """The gateway has started; what lets it run for so many seconds, and returns the time."""
         rng = random.Random(seed)
         gateway, now = self.gateway, START + rng.randrange(MS)
+        faults = Faults(noise=0.5, lost_bytes=0.002, flipped_bits=0.0002)
         escs = [
             SimulatedEsc(
-                EscOptions(
-                    device=rng.choice([Device.KOSMIK, Device.JIVEPRO]),
-                    faults=Faults(noise=0.5, lost_bytes=0.002, flipped_bits=0.0002),
-                ),
+                EscOptions(device=rng.choice([Device.KOSMIK, Device.JIVEPRO]), faults=faults),
                 seed=rng.randrange(1000),
                 start_ns=now,
             )
@@ -100,29 +105,31 @@ class Bench:
         gateway.start(now, rng.random() < 0.9)
         self.take(now)
         open_ports = [True] * len(escs)
-        end = now + int(seconds * SECOND)
-        while now < end:
-            late = rng.choice([0, 0, rng.randrange(200_000), rng.randrange(3 * MS)])
-            now = max(now + 1, min(gateway.next_deadline(), now + rng.randrange(1, 12 * MS)) + late)
-            if wild and rng.random() < 0.002:
-                now += rng.randrange(400 * MS)
-                gateway.held_up(now, rng.random() < 0.5)
-            for index, esc in enumerate(escs):
-                data = b"".join(sent.wire for sent in esc.frames_until(now))
-                if data and open_ports[index]:
-                    cut = rng.randrange(len(data) + 1)
-                    for part in (data[:cut], data[cut:]):
-                        if part:
-                            gateway.receive_bytes(
-                                index, part, now, now - rng.choice([0, rng.randrange(20 * MS)])
-                            )
-            if wild:
-                self._happens(rng, now, open_ports)
-            gateway.advance(now)
-            self.take(now)
-        gateway.stop(now)
-        self.take(now)
-        return self
+
+        def run(seconds: float) -> int:
+            nonlocal now
+            end = now + int(seconds * SECOND)
+            while now < end:
+                late = rng.choice([0, 0, rng.randrange(200_000), rng.randrange(3 * MS)])
+                soon = now + rng.randrange(1, 12 * MS)
+                now = max(now + 1, min(gateway.next_deadline(), soon) + late)
+                if wild and rng.random() < 0.002:
+                    now += rng.randrange(400 * MS)
+                    gateway.held_up(now, rng.random() < 0.5)
+                for index, esc in enumerate(escs):
+                    data = b"".join(sent.wire for sent in esc.frames_until(now))
+                    if data and open_ports[index]:
+                        cut = rng.randrange(len(data) + 1)
+                        for part in filter(None, (data[:cut], data[cut:])):
+                            since = now - rng.choice([0, rng.randrange(20 * MS)])
+                            gateway.receive_bytes(index, part, now, since)
+                if wild:
+                    self._happens(rng, now, open_ports)
+                gateway.advance(now)
+                self.take(now)
+            return now
+
+        return run
 
     def _happens(self, rng: random.Random, now: int, open_ports: list[bool]) -> None:
         gateway = self.gateway

@@ -27,22 +27,8 @@ from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
 
 VALUES: tuple[Any, ...] = (
-    *(
-        None,
-        0,
-        -1,
-        10**30,
-        1.5,
-        1e308,
-        float("inf"),
-        float("nan"),
-        "",
-        "x",
-        "1/0",
-        "1e9999",
-        "9" * 5000,
-    ),
-    *([], [1], {}, {"a": 1}, True),
+    *(None, 0, -1, 10**30, 1.5, 1e308, float("inf"), float("nan"), True, [], [1], {}, {"a": 1}),
+    *("", "x", "1/0", "1e9999", "9" * 5000),
 )
 GONE = object()
 
@@ -125,18 +111,6 @@ def test_wrong_values_in_the_header(
             json_payload(document) if isinstance(document, dict) else json.dumps(document).encode()
         )
         path.write_bytes(block(b"H", 0, payload) + data)
-        read_all(path)
-
-
-def test_a_table_whose_last_entry_is_longer_than_the_block(
-    header: dict[str, Any], bench: Bench, tmp_path: Path
-) -> None:
-    """Its time of arrival lies outside: damage, whatever the lengths say."""
-    path = tmp_path / "a.kcap"
-    entry = next(entry for entry in bench.entries if entry.came_ns is not None)
-    payload = data_payload([entry])
-    for left in range(len(payload)):
-        path.write_bytes(block(b"H", 0, json_payload(header)) + block(b"D", 1, payload[:left]))
         read_all(path)
 
 

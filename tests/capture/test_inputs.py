@@ -1,6 +1,5 @@
 """Recordings of every kind as rows and frames: rows are what the bus said, times are those of the wire, nothing old is ever shown."""
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import pytest
 from capture_bench import START, Bench, capture, made
 from simulated_bus import write_log
 
-from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.inputs import (
     BytesInput,
     CanLogInput,
@@ -17,7 +15,6 @@ from kontronik_can_gw.desk.recordings.inputs import (
     Input,
     open_input,
 )
-from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults, SimulatedEsc
@@ -156,26 +153,6 @@ def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
     )
     with open_input(tmp_path / "20260102") as found, pytest.raises(UserError, match="another run"):
         list(found.samples())
-
-
-def test_pole_pairs_and_gear_are_those_of_the_capture_whatever_dbc_shows_it(tmp_path: Path) -> None:
-    setup, layout = made(2)
-    escs = (replace(setup.escs[0], pole_pairs=7), replace(setup.escs[1], pole_pairs=5))
-    bench, _ = plain_run(12, escs=2)
-    with_dbc = capture(tmp_path / "a.kcap", replace(setup, escs=escs), bench.entries)
-    without = capture(tmp_path / "b.kcap", replace(setup, escs=escs, dbc=None), bench.entries)
-    shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    assert layout.messages
-    for path, given in ((with_dbc, None), (without, None), (with_dbc, shown), (without, shown)):
-        with open_input(path, given) as found:
-            at = columns(found)
-            rows = list(found.samples())
-            for index, poles in enumerate((7, 5)):
-                electrical, motor = at[f"e{index}.electrical_speed"], at[f"e{index}.motor_speed"]
-                speeds: list[Any] = [(row.values[electrical], row.values[motor]) for row in rows]
-                assert max(speed for speed, _ in speeds if speed is not None) > 1000
-                for speed, of_motor in speeds:
-                    assert of_motor == (None if speed is None else round(speed / poles, 6))
 
 
 def test_a_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: Path) -> None:

@@ -15,10 +15,8 @@ from capture_bench import START, Bench, made
 from kontronik_can_gw.capture.format import Entry, Kind, read_number
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik import InfoData
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime import capture_part, recorder
+from kontronik_can_gw.runtime import recorder
 from kontronik_can_gw.runtime.capture_folder import is_ours
 from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings
 
@@ -142,27 +140,6 @@ def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_the_header_shows_where_it_comes_from(tmp_path: Path) -> None:
-    bed = Bed(tmp_path, time.monotonic_ns)
-    bench = Bench(*made(1))
-    bed.it.note(bench.gateway, 0)
-    bed.put(1)
-    bed.written()
-    info = InfoData(device_and_variant=1 << 10 | 160, firmware_word=4 << 8 | 17)
-    bench.gateway.receive_bytes(0, encode(info, Layout.V4), 1, 1)
-    bed.it.note(bench.gateway, 1)
-    until(lambda: bed.it._recorded_devices == bed.it._devices)
-    bed.it.close()
-    with open_input(tmp_path) as found:
-        assert isinstance(found, CaptureInput)
-        list(found.entries())
-        assert found.provenance["e0"] == "KOSMIK 160, firmware 4.17, V4 layout, at /dev/ttyUSB0"
-        assert found.provenance["DBC"] == "kontronik_esc.dbc"
-        assert "port" in found.setup.configuration
-        now = time.time_ns()
-        assert abs((found.wall_ns(time.monotonic_ns()) or 0) - now) < 60 * SECOND
-
-
 def test_room_again_and_it_goes_on_and_the_loss_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,51 +242,20 @@ def test_a_disk_that_stands_still_holds_nobody_up(
     bed.written()
     stuck.set()
     bed.put(1, 10)
-    until(lambda: it._busy_since is not None and not it._entries)
+    until(lambda: it._worker.busy_since is not None and not it._entries)
     bed.put(CAPACITY + 500, 11)
-    assert it._busy_since is not None, "all this while it stood still"
+    assert it._worker.busy_since is not None, "all this while it stood still"
     assert len(it._entries) == CAPACITY
     reports = it.reports(time.monotonic_ns() + RETRY)
     assert [r.begins for r in reports] == [True, True]
-    assert "500 entries" in reports[0].text
-    assert "does not answer" in reports[1].text
+    assert "500 entries" in reports[1].text
+    assert "does not answer" in reports[0].text
     stuck.clear()
     go_on.set()
-    until(lambda: not it._entries and it._busy_since is None)
+    until(lambda: not it._entries and it._worker.busy_since is None)
     assert [r.begins for r in it.reports(time.monotonic_ns())] == [False]
     found, lost, _ = bed.closed()
     assert (len(found), lost) == (11 + CAPACITY, 500)
-
-
-def test_the_end_waits_for_a_stuck_disk_but_not_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder, "_CLOSE_S", 0.1)
-    go_on = threading.Event()
-    monkeypatch.setattr(os, "fdatasync", lambda _fd: go_on.wait(600))
-    bed = Bed(tmp_path, time.monotonic_ns)
-    bed.put(3)
-    until(lambda: bed.it._busy_since is not None)
-    bed.it.close()
-    assert bed.it._busy_since is not None, "the disk has not answered yet"
-    go_on.set()
-
-
-def test_a_part_that_could_not_be_begun_does_not_stand_in_the_way(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def no_room(fd: int, data: bytes) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "write", no_room)
-        bed = Bed(tmp_path)
-        bed.put(3)
-        until(lambda: bed.it._unwritten == 3)
-        assert list(tmp_path.iterdir()) == []
-    bed.again()
-    bed.put(3, 3)
-    assert bed.closed()[0] == entries(3, 3)
 
 
 def test_a_folder_that_cannot_be_used_is_said_at_once_or_waited_for(tmp_path: Path) -> None:
@@ -366,30 +312,6 @@ def test_the_wall_clock_that_is_set_is_followed(
     assert walls[1] - walls[0] == 3612 * SECOND
 
 
-def test_a_mistake_in_what_writes_ends_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise ValueError("a mistake of ours")
-
-    bed = Bed(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(capture_part, "data_payload", fail)
-        bed.put(2)
-        said: list[str] = []
-
-        def heard() -> bool:
-            said.extend(report.text for report in bed.it.reports(0))
-            return bool(said)
-
-        until(heard)
-        until(lambda: bed.it.facts.lost == 2)
-    assert "a mistake of ours" in said[0]
-    bed.again()
-    bed.put(3)
-    assert bed.closed()[0] == entries(3)
-
-
 def test_a_file_that_is_removed_while_it_is_written_is_noticed(tmp_path: Path) -> None:
     bed = Bed(tmp_path)
     bed.put(3)
@@ -427,7 +349,7 @@ def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:
     for at in range(0, len(bench.entries), 1000):
         for entry in bench.entries[at : at + 1000]:
             bed.it.put(*entry)
-        until(lambda: not bed.it._entries and bed.it._busy_since is None)
+        until(lambda: not bed.it._entries and bed.it._worker.busy_since is None)
     bed.it.close()
     assert len(list(tmp_path.iterdir())) > 2
     with open_input(tmp_path) as found:

@@ -93,27 +93,6 @@ def test_a_jivepros_bec_current_stays_unavailable_when_its_information_has_expir
     assert bench.gateway.escs[0].info is None
 
 
-def test_energy_is_what_was_drawn_between_two_frames_and_nothing_that_was_fed_back() -> None:
-    bench = Bench(' SG_ EnergyUsed : 0|32@1+ (0.001,0) [0|4000000] "Wh" Car\n')
-    steps = [
-        (2400, 1000),
-        (2400, 1000),
-        (2000, -500),
-        (2000, -500),
-        (0, 1000),
-        (2400, 0),
-        (1000, 3000),
-    ]
-    drawn = 0  # 10 mV times 0.1 A times a period of 10 ms
-    for n in range(7 * 400):
-        voltage, current = steps[n % 7]
-        bits = bench.live(battery_voltage=voltage, battery_current=current)
-        wh = drawn / 1000 / 100 / 3600
-        assert abs((bits & 0xFFFFFFFF) - wh * 1000) <= 1
-        drawn += max(0, voltage * current)
-    assert drawn / 1000 / 100 / 3600 > 8
-
-
 def test_after_an_outage_of_the_bus_what_has_no_cycle_is_sent_again() -> None:
     bench = Bench(SPEED)
     bench.live(electrical_speed=30_000)
@@ -174,13 +153,6 @@ def test_information_that_runs_out_is_not_available_on_every_page() -> None:
     for page, value in ((0, b"\1\0"), (1, b"\2\0")):
         shown = [data[1:3] for data in sent if data[0] == page]
         assert value in shown and shown[-1] == b"\xff\xff"
-
-
-def test_the_load_of_can_fd_counts_the_data_phase_at_its_own_rate() -> None:
-    messages = "".join(f"BO_ {257 + n} M{n}: 64 Gw\n{SPEED}\n" for n in range(8))
-    layout = layout_of(f"{HEAD}{SPEED}\n{messages}{ATTRIBUTES}")
-    assert 0.25 < layout.bus_load(500_000, 2_000_000) < 0.45
-    assert layout.bus_load(500_000, 500_000) > 1
 
 
 def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:

@@ -36,7 +36,7 @@ class FakePort:
     def fileno(self) -> None:
         return None
 
-    def receive(self) -> list[tuple[CanFrame, int | None]]:
+    def receive(self, _limit: int) -> list[tuple[CanFrame, int | None]]:
         frames, self.inbox = self.inbox, []
         return [(frame, None) for frame in frames]
 

@@ -1,7 +1,7 @@
 """A gateway with simulated ESCs whose time is passed in, and documents of it."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -14,7 +14,6 @@ from kontronik_can_gw.runtime.facts import (
     CanFacts,
     PortFacts,
     ProgramFacts,
-    StoreFacts,
     gateway_facts,
 )
 from kontronik_can_gw.runtime.process import ProcessFacts
@@ -62,31 +61,24 @@ class Bench:
     def newest(self, esc: int, kind: type[LiveData] | type[InfoData]) -> Any:
         return next(data for data in reversed(self.sent[esc]) if isinstance(data, kind))
 
-    def document(
-        self,
-        *,
-        at: int | None = None,
-        ports: Sequence[PortFacts] | None = None,
-        can: CanFacts | None = None,
-        store: StoreFacts | None = None,
-        log_lines: Sequence[str] = (),
-        program: ProgramFacts = PROGRAM,
-    ) -> dict[str, Any]:
-        """The document now, as a reader of the file gets it."""
-        names = [esc.settings.name for esc in self.gateway.escs]
-        moment = Moment(
-            gateway_facts(self.gateway),
-            now=self.now if at is None else at,
-            wall=1_700_000_000.5,
-            program=program,
-            process=ProcessFacts(20_000_000, 12, 3),
-            ports=ports or [PortFacts(name, f"/dev/{name}", True) for name in names],
-            can=can or CanFacts("socketcan", "can0", 500_000, True),
-            store=store,
-            log_lines=log_lines,
-        )
+    def document(self, *, at: int | None = None, **facts: Any) -> dict[str, Any]:
+        """The document now, as a reader of the file gets it; ``facts``: those of a Moment that are others."""
+        moment = moment_of(self.gateway, self.now if at is None else at)._replace(**facts)
         read: dict[str, Any] = json.loads(snapshot(moment))
         return read
+
+
+def moment_of(gateway: Gateway, now: int) -> Moment:
+    """What the statistics are made of, of a gateway whose ports and bus are open."""
+    return Moment(
+        gateway_facts(gateway),
+        now=now,
+        wall=1_700_000_000.5,
+        program=PROGRAM,
+        process=ProcessFacts(20_000_000, 12, 3),
+        ports=[PortFacts(e.settings.name, f"/dev/{e.settings.name}", True) for e in gateway.escs],
+        can=CanFacts("socketcan", "can0", 500_000, True),
+    )
 
 
 def with_nodes(document: Mapping[str, Any], count: int = 2, sent: int = 0) -> dict[str, Any]:

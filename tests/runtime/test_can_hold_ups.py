@@ -200,18 +200,6 @@ def test_heartbeats_are_judged_by_when_they_came(
     assert [data[:2].hex() for data in emergencies] == codes
 
 
-def test_a_wall_clock_that_was_set_moves_no_heartbeat(bench: Bench) -> None:
-    bench.write(*WATCH)
-    for n in range(20):
-        bench.world.bus.clock_error = (-3600 * SECOND, 0, 3600 * SECOND)[n % 3]
-        bench.world.bus.came(0x705, b"\x05")
-        bench.run(200 * MS)
-    bench.run(250 * MS)
-    assert of(bench.take(), EMCY) == [(EMCY, "30 81 11 ff 05 00 00 00")], (
-        "when it ceased, and not before"
-    )
-
-
 def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench: Bench) -> None:
     bus = bench.world.bus
     bench.write(*WATCH)  # nothing is sent because telemetry is lost

@@ -45,19 +45,6 @@ class Port(Bus):
         super().__init__(World())
         self.state = CanState.UNKNOWN
 
-    def set_receive_ids(self, ids: frozenset[int]) -> None:
-        self.ids = ids
-
-    def note_state(self, state: CanState) -> None:
-        self.bus_off_count += state is CanState.BUS_OFF and self.state is not CanState.BUS_OFF
-        self.state = state
-
-    def send(self, frame: CanFrame) -> Sent:
-        answer = super().send(frame)
-        if answer is Sent.OK and self.state is CanState.UNKNOWN:
-            self.state = CanState.ERROR_ACTIVE
-        return answer
-
 
 class Kernel:
     """What rtnetlink tells: ``facts`` on being asked, and ``news`` by itself."""
@@ -303,22 +290,6 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> 
     side.close()
 
 
-def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
-    bench: Bench, kernel: Kernel
-) -> None:
-    bench.begin()
-    bench.port.answer = Sent.BUSY
-    bench.can.transmitter.queue.put_all([CanFrame(0x100, b"held")])
-    bench.can.transmit(bench.now)
-    bench.can.is_proven = False
-    bench.can.transmitter.clear()
-    later = bench.now + SECOND
-    bench.gateway.take_frames(bench.now)
-    bench.can.transmit(later)
-    assert not bench.can.is_proven
-    assert bench.can.transmitter._busy_since is None
-
-
 def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -375,33 +346,14 @@ def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
     assert told(bench.take()) == ["8110", "0000"]
 
 
-def test_answers_that_an_interface_that_is_down_does_not_take_are_dropped_and_counted(
-    bench: Bench,
-) -> None:
-    bench.start()
-    bench.turn(100)
-    bench.port.answer = Sent.DOWN
-    Port.there = False
-    for n in range(3):
-        bench.gateway.receive_frame(
-            CanFrame(0x601, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0))), bench.now, bench.now
-        )
-    before = bench.gateway.status.dropped_frames
-    bench.can.transmit(bench.now)
-    assert bench.gateway.status.can_state is CanState.DOWN
-    assert bench.gateway.status.dropped_frames >= before + 3
-    assert len(bench.can.transmitter.queue) == 0
-    bench.can.serve(bench.now)  # closed in this round
-
-
 def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) -> None:
     bench.start()
     bench.turn(10)
-    assert 0x601 in bench.port.ids and 0x705 not in bench.port.ids
+    assert 0x601 in bench.port._ids and 0x705 not in bench.port._ids
     watch_node_5 = bytes.fromhex("23 16 10 01 2c 01 05 00")
     bench.gateway.receive_frame(CanFrame(0x601, watch_node_5), bench.now, bench.now)
     bench.turn(1)
-    assert {0x601, 0x705} <= bench.port.ids
+    assert {0x601, 0x705} <= bench.port._ids
 
 
 def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> None:
@@ -412,5 +364,5 @@ def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> 
     bench.can.serve(bench.now)
     assert not bench.can.is_open
     bench.turn(600)
-    assert bench.port is not before and bench.port.ids == before.ids
+    assert bench.port is not before and bench.port._ids == before._ids
     assert told(bench.take()) == ["boot-up"]

@@ -34,18 +34,6 @@ def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(
     assert conditions.reason("port") == ""
 
 
-def test_another_reason_is_said_and_the_time_runs_on_also_after_a_quiet_beginning(
-    told: pytest.LogCaptureFixture,
-) -> None:
-    conditions = FaultLog()
-    conditions.end("port", "over", 0)
-    conditions.begin("port", "because of another", 0, quiet=True)
-    assert told.messages == []
-    conditions.begin("port", "no permission", 5 * SECOND)
-    conditions.end("port", "back", 10 * SECOND)
-    assert told.messages == ["no permission", "back, after 10.0 s"]
-
-
 def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(
     told: pytest.LogCaptureFixture,
 ) -> None:
@@ -82,18 +70,6 @@ def test_a_condition_that_lasts_while_it_is_summed_up_is_said_to_last(
             conditions.end("x", "good", n * SECOND + 1)
     conditions.advance(2 * MINUTE)
     assert told.messages[-1] == "x: no longer comes and goes, it lasts: bad"
-
-
-def test_events_are_said_one_by_one_and_then_summed_up(told: pytest.LogCaptureFixture) -> None:
-    conditions = FaultLog()
-    for n in range(20):
-        conditions.event("suspended", f"suspended for {n} s", n * SECOND)
-    assert len(told.messages) == FLAPPING
-    conditions.advance(MINUTE + 20 * SECOND)
-    assert (
-        told.messages[-1]
-        == "suspended: 14 more times in the last minute; the last: suspended for 19 s"
-    )
 
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))

@@ -270,36 +270,6 @@ def test_there_is_no_diagnosis_while_telemetry_comes_and_one_when_not(bench: Ben
     assert said.startswith("no bytes")
 
 
-def test_the_diagnosis_does_not_depend_on_how_long_ago_its_second_began(bench: Bench) -> None:
-    esc = bench.escs[0]
-    for n in range(1, 61):
-        now = n * 50 * MS
-        bench.port().reads = [bytes((0x55, 0xAA)) * 10]
-        esc.serve(now)
-        bench.gateway.advance(now)
-        esc.report(now)
-        said = esc.facts().diagnosis or ""
-        assert said.startswith("bytes but never KOD"), f"after {n * 50} ms"
-
-
-def test_what_is_shown_of_a_port_follows_its_faults_and_counts(bench: Bench) -> None:
-    esc = bench.escs[0]
-    bench.port().reads = [LIVE]
-    esc.serve(SECOND)
-    assert esc.facts() is esc.facts(), "nothing is new"
-    bench.port().counts = {"parity": 9}
-    esc.report(SECOND)
-    assert esc.facts().line_errors == {"parity": 4}
-    bench.conditions.begin(esc.log.port_condition, "torn", SECOND)
-    assert esc.facts().complaint == "torn"
-    bench.conditions.forget(esc.log.port_condition)
-    assert esc.facts().complaint == ""
-    bench.lose(0, 2 * SECOND)
-    assert (esc.facts().open, esc.facts().lost_since_ns) == (False, 2 * SECOND)
-    bench.reopen(3 * SECOND)
-    assert (esc.facts().open, esc.facts().reopened) == (True, 1)
-
-
 def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(bench: Bench) -> None:
     esc = bench.escs[0]
     assert [esc.is_stuck() for _ in range(3)] == [False] * 3

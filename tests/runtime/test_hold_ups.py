@@ -204,23 +204,6 @@ def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     assert len(fed) == 0 if blind else len(fed) > 8
 
 
-def test_bytes_that_came_while_the_interface_opened_are_as_old_as_that(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World()
-    (wire,) = world.wires
-    world.opening_ns = 3 * SECOND
-    wire.send(world.now + 100 * MS)
-    loop = begin(monkeypatch, world, EscSettings("esc1"))
-    run(loop, world, world.now + 50 * MS)
-    assert loop.gateway.escs[0].counters.live == 1
-    assert list(values(world)) == []
-    wire.send(world.now)
-    run(loop, world, world.now + 50 * MS)
-    assert {number for _, number, _ in values(world)} == {2}
-    loop.close()
-
-
 def test_bytes_that_came_while_an_interface_was_tried_again_are_as_old_as_that(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

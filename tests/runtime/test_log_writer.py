@@ -34,16 +34,6 @@ def logger_to(handler: logging.Handler) -> logging.Logger:
     return logger
 
 
-def test_lines_come_in_order_and_the_end_waits_for_them() -> None:
-    stream = io.StringIO()
-    handler = BackgroundHandler(stream)
-    logger = logger_to(handler)
-    for n in range(500):
-        logger.info("line %d", n)
-    handler.close()
-    assert stream.getvalue().splitlines() == [f"line {n}" for n in range(500)]
-
-
 def test_a_stream_that_stands_still_holds_nobody_up_and_losses_are_told() -> None:
     stream = StuckStream()
     handler = BackgroundHandler(stream, longest_end_s=0)

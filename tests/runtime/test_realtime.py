@@ -5,7 +5,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -38,30 +37,15 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
     return scheduler
 
 
-@pytest.fixture
-def sleeper() -> Iterator[threading.Thread]:
+def test_the_loop_goes_before_the_threads_beside_it(kernel: Scheduler) -> None:
     ended = threading.Event()
-    thread = threading.Thread(target=ended.wait)
-    yield thread
-    ended.set()
-    thread.join()
-
-
-def test_the_loop_goes_before_the_threads_beside_it(
-    kernel: Scheduler, sleeper: threading.Thread
-) -> None:
-    sleeper.start()
+    sleepers = [threading.Thread(target=ended.wait) for _ in range(2)]
+    sleepers[0].start()
     realtime.begin(30)
+    assert start_beside_the_loop(sleepers[1])
     assert kernel.of[threading.get_native_id()] == (os.SCHED_FIFO, 30)
-    assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 29)
-
-
-def test_a_thread_that_is_started_later_follows(
-    kernel: Scheduler, sleeper: threading.Thread
-) -> None:
-    realtime.begin(1)
-    assert start_beside_the_loop(sleeper)
-    assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 1)
+    assert [kernel.of[each.native_id or 0] for each in sleepers] == [(os.SCHED_FIFO, 29)] * 2
+    ended.set()
 
 
 @pytest.mark.parametrize(
@@ -78,19 +62,13 @@ def test_what_is_not_permitted_is_said_with_the_remedy(
         realtime.begin(20)
 
 
-def configuration(folder: Path, port: str, channel: str) -> Path:
-    file = folder / "gateway.toml"
-    file.write_text(
-        f'[can]\ninterface = "virtual"\nchannel = "{channel}"\n[run]\nrealtime_priority = 7\n[[esc]]\nport = "{port}"\n'
-    )
-    return file
-
-
 def test_a_real_process_has_what_it_is_permitted_to(tmp_path: Path) -> None:
     """With the right the main thread has the priority; without it, where --wait asks to go on in any case, an error is logged."""
     with PtyEsc() as esc:
         command = [sys.executable, "-m", "kontronik_can_gw", "run", "--wait", "-c"]
-        command.append(str(configuration(tmp_path, esc.path, "realtime-process")))
+        command.append(str(tmp_path / "gateway.toml"))
+        tables = '[can]\ninterface = "virtual"\n[run]\nrealtime_priority = 7\n[[esc]]\n'
+        (tmp_path / "gateway.toml").write_text(f'{tables}port = "{esc.path}"\n')
         errors = tmp_path / "errors"
         with errors.open("w") as file, subprocess.Popen(command, stderr=file) as process:
             try:

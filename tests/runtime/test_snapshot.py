@@ -2,8 +2,7 @@
 
 import json
 import os
-from dataclasses import fields, replace
-from fractions import Fraction
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from kontronik_can_gw.runtime.facts import (
     program_facts,
 )
 from kontronik_can_gw.runtime.process import ProcessFacts, process_facts, start_ticks
-from kontronik_can_gw.runtime.snapshot import LOG_LINES, Moment, snapshot
+from kontronik_can_gw.runtime.snapshot import Moment, snapshot
 
 
 def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> None:
@@ -82,17 +81,6 @@ def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
         assert (esc["link"], esc["fresh"], esc["layout"]) == ("ok", True, "V4")
 
 
-def test_pole_pairs_that_come_over_the_bus_hold_from_the_next_document_on() -> None:
-    bench = Bench(1)
-    bench.run(6)
-    before = bench.document()["escs"][0]["values"]
-    esc = bench.gateway.escs[0]
-    bench.gateway.core.apply(0, replace(esc.settings, pole_pairs=14, gear=Fraction(1)))
-    after = bench.document()["escs"][0]["values"]
-    assert after["motor_speed"] == pytest.approx(before["motor_speed"] / 2, abs=1e-5)
-    assert after["output_speed"] == after["motor_speed"] > 0
-
-
 def test_values_are_null_as_soon_as_they_are_older_than_the_time_out_whatever_the_gateway_was_told() -> (
     None
 ):
@@ -140,25 +128,6 @@ def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_er
     assert shown["errors"] == ["undervoltage", "bit31"]
     assert shown["warnings"] == ["power_stage_overtemp_warning"]
     assert shown["statuses"] == ["programming_allowed"]
-
-
-def test_a_port_that_is_lost_tells_since_when_and_why_and_the_log_is_the_newest() -> None:
-    bench = Bench(1)
-    bench.run(1)
-    bench.gateway.port(0, False, bench.now)
-    lines = [f"line {n}" for n in range(30)]
-    document = bench.document(
-        ports=[PortFacts("esc1", "/dev/b", False, "gone", lost_since_ns=bench.now - 5 * SECOND)],
-        log_lines=lines,
-    )
-    (esc,) = document["escs"]
-    assert (esc["port"]["open"], esc["port"]["complaint"], esc["port"]["lost_for_s"]) == (
-        False,
-        "gone",
-        5.0,
-    )
-    assert (esc["link"], esc["diagnosis"]) == ("port-error", None)
-    assert document["log"] == lines[-LOG_LINES:]
 
 
 def test_the_figures_of_the_process_are_those_of_proc(tmp_path: Path) -> None:

@@ -27,17 +27,6 @@ def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
     return len(taken)
 
 
-def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
-    for n in range(6):
-        queue.put_all([queued(n)])
-    for n in range(6):
-        queue.put_all([slot(0x181 + n)])
-    while len(queue):
-        assert send(queue, sent, 1) == 1
-    assert [frame.queued for frame in sent] == [True, False] * 6
-
-
 def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     queue, sent = TransmitQueue(), list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
@@ -50,14 +39,6 @@ def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     queue.clear()
     assert (len(queue), queue.dropped, queue.replaced) == (0, 10 + QUEUE_LENGTH, 0)
     assert send(queue, sent, 9) == 0
-
-
-def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
-    for number in range(10):
-        queue.put_all([CanFrame(1, bytes((number,)), page=number % 2)])
-    send(queue, sent, 9)
-    assert [(frame.page, frame.data) for frame in sent] == [(0, b"\x08"), (1, b"\x09")]
 
 
 PUTS = st.tuples(st.booleans(), st.integers(0x181, 0x184))

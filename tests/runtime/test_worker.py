@@ -97,23 +97,3 @@ def test_a_job_that_fails_is_reported_and_the_next_one_is_done(
     assert done == ([] if is_logged else [1])
     assert failures == ([] if is_logged else ["ZeroDivisionError('of ours')"])
     assert caplog.messages == (["test: ZeroDivisionError('of ours')"] if is_logged else [])
-
-
-def test_the_work_may_end_its_own_thread_and_the_end_comes_once() -> None:
-    calls: list[str] = []
-    ended = threading.Event()
-    worker: Worker[int]
-
-    def work(_items: list[int]) -> None:
-        calls.append("work")
-        worker.end()
-
-    def at_the_end() -> None:
-        calls.append("end")
-        ended.set()
-
-    worker = Worker("test", work, wait=lambda: None, ended=at_the_end)
-    worker.start()
-    assert ended.wait(PATIENCE)
-    assert worker.stop(PATIENCE)
-    assert calls == ["work", "work", "end"]

@@ -29,7 +29,7 @@ from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime import esc_port as esc_input
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Received
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler, Poller, PortInput
 from kontronik_can_gw.runtime.systemd import Notifier
@@ -152,15 +152,14 @@ class Wire:
         pass
 
 
-class Bus:
+class Bus(CanPort):
     """A CAN interface: ``sent`` with times, ``inbox`` with the times at which frames came."""
 
-    reports_full = is_socket = True
-    gone = False
+    is_socket = True
 
     def __init__(self, world: "World") -> None:
+        super().__init__()
         self.state = CanState.ERROR_ACTIVE
-        self.bus_off_count = self.overruns = 0
         self.sent: list[tuple[int, CanFrame]] = []
         self.inbox: list[tuple[CanFrame, int]] = []
         self.clock_error = 0
@@ -186,50 +185,45 @@ class Bus:
     def fileno(self) -> int:
         return CAN_FD
 
-    def set_receive_ids(self, ids: frozenset[int]) -> None:
-        pass
-
     @property
     def waits_to_be_read(self) -> bool:
         return bool(self.inbox) and self.inbox[0][1] <= self._world.now
 
-    def receive(self) -> list[tuple[CanFrame, int | None]]:
-        found: list[tuple[CanFrame, int | None]] = []
-        while self.waits_to_be_read and len(found) < RECEIVE_LIMIT:
+    def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
+        found: Received = []
+        while self.waits_to_be_read and len(found) < limit:
             frame, at = self.inbox.pop(0)
             found.append((frame, at + self.clock_error))
         self.drained = not self.waits_to_be_read
         return found
-
-    def discard(self) -> None:
-        while self.receive():
-            pass
 
     @property
     def room_at(self) -> int:
         """When the socket is writable: less than half of what the kernel takes is in it."""
         return self._out[-3] if len(self._out) > 2 else 0
 
-    def send(self, frame: CanFrame) -> Sent:
-        if self.frame_ns:
-            self._out = [at for at in self._out if at > self._world.now]
-            if len(self._out) == 6:
-                return Sent.FULL
-            self._out.append(max([self._world.now, *self._out[-1:]]) + self.frame_ns)
-        if self.answer is Sent.OK:
-            self.sent.append((self._world.now, frame))
-            self.on_send(frame)
-        return self.answer
-
-    def send_all(
+    def _send_each(
         self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
     ) -> tuple[int, Sent]:
         for count, frame in enumerate(frames):
             if clock() > latest:
                 return count, Sent.LATE
-            if (answer := self.send(frame)) is not Sent.OK:
-                return count, answer
+            if self.frame_ns:
+                self._out = [at for at in self._out if at > self._world.now]
+                if len(self._out) == 6:
+                    return count, Sent.FULL
+                self._out.append(max([self._world.now, *self._out[-1:]]) + self.frame_ns)
+            if self.answer is not Sent.OK:
+                return count, self.answer
+            self.sent.append((self._world.now, frame))
+            self.on_send(frame)
         return len(frames), Sent.OK
+
+    def _filter(self) -> None:
+        pass
+
+    def _drops(self) -> int:
+        return 0
 
     def close(self) -> None:
         pass
