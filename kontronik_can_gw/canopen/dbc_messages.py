@@ -14,11 +14,10 @@ from kontronik_can_gw.canopen.bound_values import message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
 from kontronik_can_gw.canopen.dictionary import Variable
-from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds import Entry
 from kontronik_can_gw.canopen.emergency_codes import Register
 from kontronik_can_gw.canopen.node import Node
-from kontronik_can_gw.canopen.pdo import Tpdo
-from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
+from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Tpdo
 from kontronik_can_gw.dbc import builder
 from kontronik_can_gw.dbc.builder import Message, Signal, number
 from kontronik_can_gw.esc.decoder import ErrorBit

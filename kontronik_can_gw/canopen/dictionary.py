@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.data_types import CODECS, DOMAIN_TYPE
-from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.objects import Bound
 
 Value = int | float | bytes

@@ -20,10 +20,10 @@ from kontronik_can_gw.canopen.identity import Identity
 from kontronik_can_gw.canopen.lss import LssSlave
 from kontronik_can_gw.canopen.nmt import Nmt
 from kontronik_can_gw.canopen.parameters import Parameters
+from kontronik_can_gw.canopen.pdo import Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.canopen.sync import SyncConsumer
-from kontronik_can_gw.canopen.tpdos import Tpdos
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -73,7 +73,7 @@ class Node:
         )
         self.lss = LssSlave(self.identity, partial(self._send, LSS_ANSWER))
         bind_values(dictionary, esc, gateway)
-        self.tpdos = Tpdos(dictionary, esc.protocol, partial(owner.slot, number), taken)
+        self.tpdos = Tpdos(dictionary, partial(owner.slot, number), taken)
         self._esc_objects = EscObjects(
             dictionary,
             esc,
@@ -144,7 +144,8 @@ class Node:
         self.emergencies.configure(node_id)
         self.tpdos.release_ids()
         parameters.reject_what_breaks_rules()
-        parameters.rejected += self.tpdos.reset(node_id, now)
+        for tpdo in self.tpdos:
+            parameters.rejected += tpdo.reset(node_id, now)
         self.consumer.reset()
         self.nmt.state = NmtState.INITIALISING
         if node_id == UNCONFIGURED:
@@ -214,7 +215,8 @@ class Node:
             return
         self.emergencies.open(now)
         if self.state is NmtState.OPERATIONAL:
-            self.tpdos.start(now)
+            for tpdo in self.tpdos:
+                tpdo.start(now)
 
     def _watch_changed(self, node_id: int, lost: bool, now: int) -> None:
         """A watched heartbeat stays away, or no longer."""
@@ -223,7 +225,8 @@ class Node:
             self.nmt.communication_error(now)
 
     def _on_download(self, variable: Variable, changed: bool, now: int) -> None:
-        self.tpdos.on_download(variable, now)
+        for tpdo in self.tpdos:
+            tpdo.on_download(variable, now)
         self.parameters.on_download(variable, changed)
         if variable.entry.index in _WITH_COB_ID:
             self._owner.rerouted = True

@@ -17,7 +17,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import ALL_NODES, RESETS, command
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
-from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAX_TPDOS
+from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.canopen.uses import FrameTaker, routes, uses
 from kontronik_can_gw.esc.stream import EscStream

@@ -7,8 +7,7 @@ import pytest
 from dialogue import QUIET, Bench, shipped_eds
 
 from kontronik_can_gw.canopen.dcf import without
-from kontronik_can_gw.canopen.eds import load
-from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds import Entry, load
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.codec import encode as uart

@@ -16,8 +16,7 @@ from eds_text import dcfchk, device_info, with_key
 
 from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.config.keys import EscConfig
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, Row, rows
 
@@ -228,14 +227,6 @@ def test_the_mirrors_can_be_dropped(shipped: Eds, tmp_path: Path) -> None:
     assert device_info(shorter.decode()) == device_info(SHIPPED_TEXT)
     assert shorter.isascii()
     assert shorter.count(b"\r\n") == shorter.count(b"\n")
-
-
-def test_dropping_a_pdo_counts_pdos_and_list_entries_anew(shipped: Eds, tmp_path: Path) -> None:
-    shorter = dcf.without(DATA, {0x1801, 0x1A01})
-    rest = reader.load(shorter, "short.eds")
-    assert device_info(shorter.decode())["nroftxpdo"] == 5
-    assert checked(shorter, tmp_path) == ""
-    assert set(shipped.object_names) - set(rest.object_names) == {0x1801, 0x1A01}
 
 
 def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
