@@ -11,7 +11,6 @@ from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.dbc import builder
 from kontronik_can_gw.dbc.builder import Database, Message
 from kontronik_can_gw.dbc.names import esc_prefix
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
 
@@ -26,7 +25,7 @@ def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Database:
     """What the nodes send by themselves, as they are configured now; ``escs`` in their order.
 
     With several ESCs each name begins with that of its ESC. Nodes that wait for LSS have no frames; the database's comment names
-    them. UserError for a COB-ID that is used twice.
+    them.
     """
     message_names, signal_names = Names(), Names()
     messages: list[Message] = []
@@ -35,7 +34,6 @@ def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Database:
             continue
         prefix = esc_prefix(esc.name) if len(escs) > 1 else ""
         messages += NodeMessages(node, prefix, message_names, signal_names).all()
-    _check_ids(messages)
     return builder.database(_NODES, _about(nodes, escs), LAYOUT_VERSION, messages)
 
 
@@ -43,17 +41,6 @@ def waiting_for_lss(nodes: Nodes, escs: Sequence[EscSettings]) -> list[str]:
     """Names of the ESCs whose nodes have no node-ID, and so no frames."""
     pairs = zip(nodes.nodes, escs, strict=True)
     return [esc.name for node, esc in pairs if node.node_id == UNCONFIGURED]
-
-
-def _check_ids(messages: Sequence[Message]) -> None:
-    seen: dict[int, str] = {}
-    for message in messages:
-        if message.frame_id in seen:
-            raise UserError(
-                f"{message.name} and {seen[message.frame_id]} have the same COB-ID {message.frame_id:03X}h. "
-                "Give one of them another (180xh:1, 1014h)."
-            )
-        seen[message.frame_id] = message.name
 
 
 def _about(nodes: Nodes, escs: Sequence[EscSettings]) -> str:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen.abort import Abort
 from kontronik_can_gw.canopen.bound_values import bind_values
-from kontronik_can_gw.canopen.can_faults import CanFaults
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT, LSS_ANSWER, SDO_ANSWER
 from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.emergency import Emergencies
@@ -81,9 +80,8 @@ class Node:
             self.emergencies,
             settings.device,
             partial(owner.settings_changed, number),
-            self.nmt.telemetry_lost,
+            partial(self.nmt.behave, 2),
         )
-        self.can_faults = CanFaults(self.emergencies, self.nmt, self._returned, self._repeat)
         self._timers = (self._producer, self.consumer, self.sdo, self.emergencies)
         dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
         dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS
@@ -115,13 +113,8 @@ class Node:
 
     # --- resets
 
-    def power_on(self, now: int) -> None:
-        """The gateway starts. A node without a node-ID stays silent until LSS gives it one."""
-        self.can_faults.power_on()
-        self.reset_node(now)
-
     def reset_node(self, now: int) -> None:
-        """NMT reset node: manufacturer's and profile objects too."""
+        """NMT reset node, and power-on: manufacturer's and profile objects too. Without a node-ID it stays silent until LSS gives one."""
         self.tpdos.stop()
         self.emergencies.close()  # nothing is sent before the boot-up message
         self.parameters.reset_application(self.pending_node_id)
@@ -222,7 +215,7 @@ class Node:
         """A watched heartbeat stays away, or no longer."""
         self.emergencies.set(GatewayError.HEARTBEAT_LOST, lost, now, node_id)
         if lost:
-            self.nmt.communication_error(now)
+            self.nmt.behave(1, now)
 
     def _on_download(self, variable: Variable, changed: bool, now: int) -> None:
         for tpdo in self.tpdos:
@@ -231,7 +224,7 @@ class Node:
         if variable.entry.index in _WITH_COB_ID:
             self._owner.rerouted = True
 
-    def _returned(self, now: int) -> None:
+    def returned(self, now: int) -> None:
         """The controller left bus-off, or the interface is back. With 1029h:1 = 0 the node boots, so that its master sets it up anew.
 
         CiA 301 asks for PRE-OPERATIONAL then; a boot-up besides is what brings a node without a master, self-starting, to work again.
@@ -240,9 +233,10 @@ class Node:
             self.reset_communication(now)
         else:
             self._producer.beat(now)
-            self._repeat(now)
+            self.repeat(now)
 
-    def _repeat(self, now: int) -> None:
+    def repeat(self, now: int) -> None:
+        """Frames were lost: what is sent on change only, and what is wrong, is sent once more."""
         self.emergencies.repeat(now)
         self.tpdos.repeat(now)
 

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from kontronik_can_gw.canopen.can_faults import CanFaults
 from kontronik_can_gw.canopen.cob_ids import (
     HEARTBEAT,
     LSS_REQUEST,
@@ -100,6 +101,7 @@ class Nodes(Output):
         self._to_watchers: deque[CanFrame] = deque()
         self._started = False
         self.nodes = [Node(n, setup, esc, gateway, self) for n, esc in enumerate(escs)]
+        self._can_faults = CanFaults(self.nodes)
 
     # --- what happens
 
@@ -108,8 +110,9 @@ class Nodes(Output):
         if not can_open:
             return
         self._started = True
+        self._can_faults.power_on()
         for node in self.nodes:
-            node.power_on(now)
+            node.reset_node(now)
         self._after(now)
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
@@ -140,8 +143,7 @@ class Nodes(Output):
         """The CAN controller's state changed, or it is down again before a frame was sent."""
         if state is before and state is not CanState.DOWN:
             return
-        for node in self.nodes:
-            node.can_faults.on_state(state, now)
+        self._can_faults.on_state(state, now)
         self._after_all(now)
 
     def can_returned(self, now: int) -> None:
@@ -149,8 +151,7 @@ class Nodes(Output):
         if not self._started:
             self.start(now, can_open=True)
             return
-        for node in self.nodes:
-            node.can_faults.frames_pass(now)
+        self._can_faults.frames_pass(now)
         self._after_all(now)
 
     def held_up(self, now: int) -> None:
@@ -194,8 +195,7 @@ class Nodes(Output):
         }
 
     def overrun(self, now: int) -> None:
-        for node in self.nodes:
-            node.can_faults.overrun(now)
+        self._can_faults.overrun(now)
         self._after_all(now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:

@@ -21,7 +21,7 @@ Choices where the standard leaves room:
 """
 
 from collections.abc import Callable
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
@@ -30,7 +30,6 @@ from kontronik_can_gw.canopen.sdo_transfers import (
     BlockDownload,
     BlockUpload,
     InFlight,
-    Pace,
     SegmentedDownload,
     SegmentedUpload,
     check_block_size,
@@ -60,7 +59,7 @@ class SdoServer:
     ) -> None:
         self._objects = objects
         self._send = send
-        self._pace = Pace(segment_ns)
+        self._segment_ns = segment_ns
         self._transfer: _Transfer | None = None
         self._confirming = False
         """All data is here, the result of the dictionary is pending."""
@@ -119,18 +118,23 @@ class SdoServer:
         """Let time pass: the time-out of a transfer, and the paced segments of a block upload."""
         if now < self.due:
             return
-        transfer = self._transfer
-        if isinstance(transfer, BlockUpload) and transfer.bursts:
-            transfer.advance(now)
-            self._deadline = now + TIMEOUT_NS
-        else:
+        if (upload := self._bursting) is None:
             self._abort(Abort.TIMEOUT)
+        else:
+            upload.advance(now)
+            self._deadline = now + TIMEOUT_NS
 
     @property
     def due(self) -> int:
         """When ``advance`` has something to do."""
-        bursts = isinstance(self._transfer, BlockUpload) and self._transfer.bursts
-        return self._pace.next_burst if bursts else self._deadline
+        upload = self._bursting
+        return self._deadline if upload is None else upload.next_burst
+
+    @property
+    def _bursting(self) -> BlockUpload | None:
+        """A block upload in the midst of a sub-block."""
+        transfer = self._transfer
+        return transfer if isinstance(transfer, BlockUpload) and transfer.bursts else None
 
     # ---- requests
 
@@ -156,7 +160,7 @@ class SdoServer:
             case 6:
                 self._initiate_block_download(data, now)
             case _:
-                _refuse(Abort.COMMAND)
+                raise SdoAbort(Abort.COMMAND)
 
     def _begin(self, data: bytes) -> None:
         """Leave what is going on for the transfer that an initiate request names."""
@@ -168,7 +172,7 @@ class SdoServer:
     def _running(self, kind: type[_T]) -> _T:
         """The transfer that goes on; 05040001h where it is of another kind, or there is none."""
         if not isinstance(self._transfer, kind):
-            _refuse(Abort.COMMAND)
+            raise SdoAbort(Abort.COMMAND)
         return self._transfer
 
     def _open_block_download(self) -> BlockDownload | None:
@@ -273,7 +277,7 @@ class SdoServer:
             self._start_upload(value)
             return
         with_crc = bool(data[0] & 4)
-        self._transfer = BlockUpload(value, block_size, with_crc, self._pace, self._send)
+        self._transfer = BlockUpload(value, block_size, with_crc, self._segment_ns, self._send)
         self._send(self._initiated(0xC6, len(value).to_bytes(4, "little")))
 
     # ---- all transfers
@@ -295,7 +299,3 @@ class SdoServer:
         self._transfer, self._confirming = None, False
         self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
-
-
-def _refuse(code: Abort) -> NoReturn:
-    raise SdoAbort(code)
