@@ -8,11 +8,9 @@ from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, OCTET_STRING, TYPE_
 from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.eds_sections import (
     OBJECT,
-    bare,
     blocks,
     integer,
     pair,
-    spelling,
 )
 from kontronik_can_gw.errors import UserError
 
@@ -79,6 +77,7 @@ def dcf(
             added = _commissioning(node_id, bitrate, values.get((0x1018, 4)), node_name)
         elif match := OBJECT.match(name):
             index, sub = int(match[1], 16), int(match[2] or "0", 16)
+            lines = [line for line in lines if pair(line)[0] != "parametervalue"]
             if (index, sub) in texts:
                 added = [f"ParameterValue={texts[index, sub]}"]
         end = max((number for number, line in enumerate(lines, 1) if line.strip()), default=0)
@@ -90,20 +89,12 @@ def _commissioning(
     node_id: int, bitrate: int, serial: float | bytes | None, node_name: str
 ) -> list[str]:
     """[DeviceComissioning]: CiA 306 spells it so."""
-    lines = [
-        "",
-        "[DeviceComissioning]",
-        f"NodeID=0x{node_id:02X}",
-        f"NodeName={node_name}",
-        f"Baudrate={bitrate // 1000}",
-        "NetNumber=0",
-        "CANopenManager=0",
-    ]
-    if (
-        isinstance(serial, int) and serial
-    ):  # 0: not known, so nothing that an LSS master could look for
-        lines.append(f"LSS_SerialNumber=0x{serial:08X}")
-    return lines
+    lines = ["", "[DeviceComissioning]", f"NodeID=0x{node_id:02X}", f"NodeName={node_name}"]
+    lines += [f"Baudrate={bitrate // 1000}", "NetNumber=0", "CANopenManager=0"]
+    # 0: not known, so nothing that an LSS master could look for
+    return lines + (
+        [f"LSS_SerialNumber=0x{serial:08X}"] if isinstance(serial, int) and serial else []
+    )
 
 
 def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
@@ -114,14 +105,7 @@ def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
     if entry.data_type == OCTET_STRING:
         return value.hex()
     text = value.decode("utf-16-le" if entry.data_type == UNICODE_STRING else "latin-1")
-    if (
-        not text.isascii()
-        or text != text.strip()
-        or (text and not text.isprintable())
-        or bare(f"={text}") != f"={text}"
-    ):
-        where = spelling(entry.index, entry.sub)
-        raise UserError(
-            f"{name}: [{where}] the text {text!r} of {entry.name} cannot stand in a DCF."
-        )
+    if not (text.isascii() and text.isprintable()) or pair(f"={text}")[1] != text:
+        what = f"the text {text!r} of {entry.name} cannot stand in a DCF."
+        raise UserError(f"{name}: {entry.place} {what}")
     return text

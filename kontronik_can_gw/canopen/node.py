@@ -97,19 +97,10 @@ class Node:
         return self.identity.active_node_id
 
     @property
-    def pending_node_id(self) -> int:
-        """The node-ID from the next reset on."""
-        return self.identity.pending_node_id
-
-    @property
     def claimed_node_id(self) -> int:
         """The node-ID it has; before it is powered on the one it will have."""
-        return self.pending_node_id if self.state is NmtState.INITIALISING else self.node_id
-
-    @property
-    def rejected(self) -> list[int]:
-        """Keys of stored values that were rejected at the last reset."""
-        return self.parameters.rejected
+        is_on = self.state is not NmtState.INITIALISING
+        return self.node_id if is_on else self.identity.pending_node_id
 
     # --- resets
 
@@ -117,7 +108,7 @@ class Node:
         """NMT reset node, and power-on: manufacturer's and profile objects too. Without a node-ID it stays silent until LSS gives one."""
         self.tpdos.stop()
         self.emergencies.close()  # nothing is sent before the boot-up message
-        self.parameters.reset_application(self.pending_node_id)
+        self.parameters.reset_application(self.identity.pending_node_id)
         self._esc_objects.apply_settings(now)
         self._reset_communication(now)
 
@@ -154,7 +145,6 @@ class Node:
         parameters.verify()
         self._owner.rerouted = True
         self._owner.state_changes += 1
-        self.set_due()
 
     # --- what happens
 
@@ -180,7 +170,6 @@ class Node:
             self.lss.stored(error is None)
         else:
             self.sdo.confirm(None if error is None else Abort.HARDWARE, ticket)
-        self.set_due()
 
     # --- what services give out
 

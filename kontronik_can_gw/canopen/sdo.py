@@ -156,7 +156,7 @@ class SdoServer:
             case 5:
                 self._serve_block_upload(data, now)
             case 6 if command & 1:
-                self._end_block_download(data, now)
+                self._store(self._running(BlockDownload).end(data), b"\xa1" + bytes(7), now)
             case 6:
                 self._initiate_block_download(data, now)
             case _:
@@ -244,11 +244,6 @@ class SdoServer:
         self._transfer = BlockDownload(size, limit if size is None else size, bool(data[0] & 4))
         self._in_flight.segment_seen(now)
         self._send(self._initiated(0xA4, bytes((BLOCK_SIZE,))))
-
-    def _end_block_download(self, data: bytes, now: int) -> None:
-        """The end request of a block download. Answer: A1h, 0 (7)."""
-        whole = self._running(BlockDownload).end(data)
-        self._store(whole, b"\xa1\0\0\0\0\0\0\0", now)
 
     def _serve_block_upload(self, data: bytes, now: int) -> None:
         command = data[0] & 3

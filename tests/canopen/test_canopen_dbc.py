@@ -24,7 +24,6 @@ from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.writer import dbc_text
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.simulator import (
     BYTE_NS,
@@ -462,13 +461,6 @@ def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
     assert max(map(len, names)) == 32
     assert all(re.fullmatch("PortOuter[12][A-Z][A-Za-z0-9]*", name) for name in names)
     assert "PortOuter1LimitBatteryVoltageMin" in names
-
-
-def test_one_cob_id_for_two_messages_is_refused_by_name() -> None:
-    eds = reader.load(EDS_TEXT.replace("$NODEID+0x80\r", "0xA0\r").encode(), "mine.eds")
-    said = r"RightREmergency and LeftEmergency have the same COB-ID 0A0h\. Give one of them another"
-    with pytest.raises(UserError, match=said):
-        written(PAIR, eds=eds)
 
 
 def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(

@@ -167,7 +167,7 @@ def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
 def test_a_text_that_a_dcf_cannot_hold_is_named(value: bytes) -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
     with pytest.raises(
-        UserError, match=r"kontronik_esc\.eds: \[2010sub6\] the text .* of Device name cannot stand"
+        UserError, match=r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot stand"
     ):
         dcf.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left", "left.dcf")
 

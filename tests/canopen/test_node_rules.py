@@ -208,7 +208,7 @@ def test_nothing_a_master_stored_keeps_the_gateway_from_starting(
         for cob_id, what, *_ in uses(node):
             assert ids.setdefault(cob_id, what) == what
     # said at start, or by the node when it boots
-    assert loaded.warnings or any(node.rejected for node in nodes)
+    assert loaded.warnings or any(node.parameters.rejected for node in nodes)
 
 
 @pytest.mark.parametrize("clashing", [Stored(2), Stored(communication={0x101400: u32(0x82)})])
