@@ -3,12 +3,11 @@
 One gateway serves most tests; each begins with its nodes reset.
 """
 
-import struct
 from collections.abc import Iterator
 
 import pytest
 from encoding import Identity
-from vcan_tools import SERIAL, Chain, Master, Recorded, canopen_table, chain, wait_for
+from vcan_tools import Chain, Master, Recorded, canopen_table, chain, wait_for
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 
@@ -99,58 +98,3 @@ def test_heartbeats_and_nmt_commands(nodes: Nodes) -> None:
         wait_for(lambda begin=begin: BOOT_UP in nodes.states(1)[begin:], command)  # type: ignore[misc]
         assert (master.number(1, 0x1017), master.number(1, *TIMEOUT)) == (1000, kept), command
     assert BOOT_UP not in nodes.states(2), "the other node has not noticed"
-
-
-@pytest.mark.parametrize("at_sync", [False, True])
-def test_all_pdos_of_a_moment_show_one_frame(nodes: Nodes, at_sync: bool) -> None:
-    """(Each value of a PDO is judged besides: that it was sent by this ESC, and never an older one after a newer one.)"""
-    master = nodes.master
-    tpdo = master.node(1).tpdo
-    tpdo.read()  # type: ignore[no-untyped-call]
-    heard: list[tuple[int, ...]] = []
-    tpdo[1].add_callback(lambda pdo: heard.append(tuple(value.raw for value in pdo)))
-    for number in (1, 2, 3, 4):
-        tpdo[number].inhibit_time = tpdo[number].event_timer = 0
-        tpdo[number].trans_type = 1 if at_sync else 254
-        tpdo[number].save()
-    nodes.go(1, OPERATIONAL)
-    assert master.number(1, 0x1018, 4) == SERIAL  # after it no PDO comes that tells how it begins
-    nodes.run.catch_up()
-    ids = [pdo + 1 for pdo in (PDOS if at_sync else PDOS[:3])]
-    shown = []
-    held_up = nodes.run.held_up
-    for n in range(1, 21):
-        begin = len(nodes.watch.recorded)
-        nodes.run.feed(0)
-        if at_sync:
-            master.network.sync.transmit()
-
-        def came(begin: int = begin) -> list[Recorded]:
-            return [frame for frame in nodes.watch.recorded[begin:] if frame.can_id in ids]
-
-        wait_for(
-            lambda came=came: [f.can_id for f in came()] == ids or nodes.run.held_up > held_up,  # type: ignore[misc]
-            f"the PDOs of frame {n}",
-        )
-        if nodes.run.held_up > held_up:
-            return  # what waited to be sent was dropped and made anew
-        fed = nodes.run.escs[0]
-        sent = fed.live(len(fed.sent) - 1)
-        one, two, three, *_ = (frame.data for frame in came())
-        assert struct.unpack("<IHh", one) == (
-            sent.electrical_speed,
-            sent.battery_voltage,
-            sent.battery_current,
-        )
-        assert struct.unpack("<hhH", two[:6]) == (
-            sent.motor_current,
-            sent.peak_current,
-            sent.consumed_charge,
-        )
-        assert struct.unpack("<HHH", three[:6]) == (
-            sent.bec_voltage,
-            sent.pwm_input,
-            sent.bec_current,
-        )
-        shown.append((sent.electrical_speed, sent.battery_voltage, sent.battery_current))
-    wait_for(lambda: heard[-20:] == shown, "the library hears them too")

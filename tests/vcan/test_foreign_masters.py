@@ -1,10 +1,9 @@
-"""CANopen masters of others (zencan-cli in Rust, canopen for node in JavaScript) against the gateway; tshark decodes what they said.
+"""A CANopen master of others (canopen for node, in JavaScript) against the gateway; tshark decodes what they said.
 
-They come from tests/foreign/install.sh; none of them shares code with the gateway or with its usual test master.
+It comes from tests/foreign/install.sh and shares no code with the gateway or with its usual test master.
 """
 
 import itertools
-import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -17,7 +16,6 @@ from foreign_tools import (
     NODE_CANOPEN,
     NodeMaster,
     Refused,
-    Zencan,
     has_tshark,
     need,
     tshark,
@@ -44,7 +42,6 @@ LOSS_MS = 10_000
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 # CiA 301 data types: bytes of a number; strings and domains have any length
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
-SAVE = int.from_bytes(b"save", "little")
 READ_ONLY, WRITE_ONLY = 0x06010002, 0x06010001
 NO_OBJECT, NO_SUB, TOO_HIGH, TOO_LOW = 0x06020000, 0x06090011, 0x06090031, 0x06090032
 TOO_LONG, NO_DATA, DEVICE_STATE = 0x06070012, 0x08000024, 0x08000022
@@ -83,135 +80,6 @@ def u32(value: int) -> bytes:
 
 def sent_speeds(run: Bench, index: int = 0) -> set[tuple[int, int, int]]:
     return {(d.electrical_speed, d.battery_voltage, d.battery_current) for d in run.live(index)}
-
-
-# --- zencan-cli
-
-
-@pytest.fixture
-def zencan(vcan: str, tmp_path_factory: pytest.TempPathFactory) -> Zencan:
-    return Zencan(vcan, tmp_path_factory.mktemp("clock"))
-
-
-def test_zencan_scans_reads_writes_and_stores(
-    vcan: str, zencan: Zencan, start_gateway: Start, tmp_path: Path
-) -> None:
-    with bench(EscOptions(), EscOptions()) as run, Candump(vcan) as dump:
-        start_nodes(vcan, start_gateway, run, tmp_path, 5)
-        wait_for(lambda: len(dump.of(0x705)) >= 2 and len(dump.of(0x706)) >= 2, "heartbeats")
-
-        found = zencan("scan", slower=10)  # it waits for a dozen that are not there
-        assert re.findall(r"^Node (\d+):", found, re.MULTILINE) == ["5", "6"], found
-        for serial in (SERIAL, SERIAL + 1):
-            identity = (
-                f"vendor: 0, product: {PRODUCT:X}, revision: {REVISION:X}, serial: {serial:X}"
-            )
-            assert identity in found, found
-        assert found.count("Device Name: 'KONTRONIK ESC gateway'") == 2, found
-        assert "Unknown" not in re.sub("Unknown State", "", found), found
-
-        def read(index: int, sub: int, kind: str, node: int = 5) -> str:
-            return zencan(f"read {node} {index:#x} {sub} {kind}").removeprefix("Value: ")
-
-        assert read(0x1008, 0, "utf8") == "KONTRONIK ESC gateway"  # segmented
-        assert read(0x2101, 1, "u8") == "5"
-        assert read(0x2101, 1, "u8", node=6) == "6"
-        assert int(read(0x2000, 2, "u16")) in {data.battery_voltage for data in run.live(0)}
-        assert int(read(0x2000, 12, "i8")) in {data.power_stage_temperature for data in run.live(0)}
-
-        def refusal(command: str) -> str:
-            said = zencan(command)
-            assert re.search("[Ee]rror", said), said
-            return said.rsplit(" ", 1)[1]
-
-        assert refusal("read 5 0x2222 0") == "NoSuchObject"
-        assert refusal("read 5 0x2000 0x22") == "NoSuchSubIndex"
-        assert refusal("read 5 0x2102 1") == "WriteOnly"
-        assert refusal("write 5 0x2000 1 u32 1") == "ReadOnly"
-        assert refusal("write 5 0x2100 1 u8 0") == "ValueTooLow"
-        assert refusal("write 5 0x2100 1 u8 101") == "ValueTooHigh"
-        assert refusal("write 5 0x2100 1 u16 7") == "DataTypeMismatchLengthHigh"
-
-        assert zencan("write 5 0x2100 1 u8 14") == "Wrote 1 bytes"
-        assert read(0x2100, 1, "u8") == "14"
-        assert read(0x2100, 1, "u8", node=6) == "7"  # the other node's is its own
-        # zencan 0.0.5 has the letters of the signature in the wrong order ("evas"): nothing may be stored
-        assert refusal("save-objects 5") == "CantStore"
-        assert not list(tmp_path.rglob("*.params")), "stored without the signature"
-        assert zencan(f"write 5 0x1010 1 u32 {SAVE}") == "Wrote 4 bytes"
-        assert list(tmp_path.rglob("*")), "nothing was stored"
-        zencan("nmt reset-app 5")
-        wait_for(
-            lambda: len([f for f in dump.of(0x705) if f.data == b"\0"]) == 2, "a second boot-up"
-        )
-        assert read(0x2100, 1, "u8") == "14"
-        assert len([f for f in dump.of(0x706) if f.data == b"\0"]) == 1  # the other was not reset
-
-
-def test_zencan_switches_states_and_remaps_a_pdo(
-    vcan: str, zencan: Zencan, start_gateway: Start, tmp_path: Path
-) -> None:
-    new = tmp_path / "remap.toml"
-    new.write_text("""
-        [tpdo.4]
-        enabled = true
-        cob_id = 0x2F0
-        rtr_disabled = true
-        transmission_type = 254
-        mappings = [{ index = 0x2000, sub = 2, size = 16 }, { index = 0x2000, sub = 1, size = 32 }]
-
-        [[store]]
-        index = 0x1017
-        sub = 0
-        type = "u16"
-        value = 100
-    """)
-    with bench(EscOptions()) as run, Candump(vcan) as dump:
-        start_nodes(vcan, start_gateway, run, tmp_path, 9)
-
-        def last_state() -> int:
-            return dump.of(0x709)[-1].data[0]
-
-        wait_for(lambda: len(dump.of(0x709)) >= 2, "a heartbeat")
-        assert [frame.data[0] for frame in dump.of(0x709)][:2] == [BOOT_UP, PRE_OPERATIONAL]
-
-        assert zencan(f"load-config 9 {new}") == ""  # it only says what failed
-        wait_for(lambda: len(dump.of(0x709)) >= 10, "heartbeats each 100 ms")
-        seen = zencan("scan-pdo-config 9")
-        blocks = re.split(r"TPDO\d:", seen)[1:]
-        assert len(blocks) == 6, seen
-        assert "valid=true, COB=Std(0x189), transmission_type=254" in blocks[0], seen
-        assert "valid=true, COB=Std(0x2F0), transmission_type=254".lower() in blocks[4].lower(), (
-            seen
-        )
-        mapped = re.findall(r"index=(0x\w+), sub=(\d+), size=(\d+)", blocks[4])
-        assert mapped == [("0x2000", "2", "16"), ("0x2000", "1", "32")], seen
-        assert "valid=false" in blocks[5], seen
-
-        pdo_ids = {0x189, 0x289, 0x389, 0x489, 0x2F0}
-        assert not [frame for frame in list(dump.frames) if frame.can_id in pdo_ids], (
-            "a PDO while PRE-OPERATIONAL"
-        )
-        zencan("nmt start 9")
-        wait_for(lambda: last_state() == OPERATIONAL, "OPERATIONAL")
-        wait_for(lambda: len(dump.of(0x2F0)) >= 20 and len(dump.of(0x189)) >= 20, "PDOs")
-        zencan("nmt stop all")
-        wait_for(lambda: last_state() == STOPPED, "STOPPED")
-        assert "Timeout" in zencan("read 9 0x1000 0", slower=1)
-        count = len([frame for frame in list(dump.frames) if frame.can_id in pdo_ids])
-        before = len(dump.of(0x709))
-        wait_for(lambda: len(dump.of(0x709)) >= before + 5, "heartbeats while STOPPED")
-        assert len([frame for frame in list(dump.frames) if frame.can_id in pdo_ids]) == count
-
-        wanted = sent_speeds(run)
-        assert {struct.unpack("<IHh", frame.data) for frame in dump.of(0x189)} <= wanted
-        assert {struct.unpack("<HI", frame.data)[::-1] for frame in dump.of(0x2F0)} <= {
-            s[:2] for s in wanted
-        }
-
-        zencan("nmt reset-comms 9")
-        wait_for(lambda: last_state() == PRE_OPERATIONAL, "PRE-OPERATIONAL")
-        assert zencan("read 9 0x1017 0 u16") == "Value: 1000"  # not stored: the default again
 
 
 # --- canopen for node
