@@ -444,15 +444,3 @@ def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(
     }
     assert "Waiting for a node-ID by LSS, so without frames: right_r." in dict(db.comments)[("",)]
     assert read(written(node_ids=(255,))).messages == []
-
-
-def test_a_word_that_ends_in_bits_without_a_name_keeps_its_length() -> None:
-    bench = Bench()
-    assert bench.write(0x1803, 1, 0xC0000481, size=4) is None
-    remap(bench, 4, 0x501, [0x20000F08, 0x20000E20])
-    bench.describe_anew()
-    assert bench.database.get_message_by_name("EscTpdo5").length == 5
-    assert not any(message.name == "EscTpdo4" for message in bench.database.messages)
-    bench.start()
-    bench.run(SECOND)
-    assert bench.seen["EscTpdo5"][-1]["ProgrammingAllowed"] in (0, 1)
