@@ -332,22 +332,6 @@ def test_what_a_master_mapped_and_stored_is_described_from_the_configuration() -
     assert bench.seen["RightRTpdo2"][-1]["RightRMaxBatteryVoltage"] > 10
 
 
-def test_a_value_in_two_pdos_has_two_names() -> None:
-    bench = Bench()
-    remap(bench, 4, 0x501, [0x20000210, 0x20000A08, 0x20000210])
-    remap(bench, 5, 0x502, [0x20000E20, 0x20200720])
-    bench.describe_anew()
-    names = {m.name: [s.name for s in m.signals] for m in bench.database.messages}
-    assert names["EscTpdo5"] == ["BatteryVoltage2", "Throttle2Percent", "BatteryVoltage3"]
-    assert names["EscTpdo4"][0] == "Undervoltage"
-    assert (names["EscTpdo6"][0], names["EscTpdo6"][-1]) == ("Undervoltage2", "CrcErrors")
-    comment = (
-        bench.database.get_message_by_name("EscTpdo6").get_signal_by_name("Undervoltage2").comment
-    )
-    assert comment is not None
-    assert comment.endswith("While the word is not available all its bits are set.")
-
-
 def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
     bench = Bench()
     remap(bench, 0, 0x181, [0x20000120], kind=3)

@@ -1,9 +1,7 @@
-"""ESCs -> gateway process with two CANopen nodes, the DBC beside them -> vcan -> the canopen library as master.
-
-One gateway serves most tests; each begins with its nodes reset.
-"""
+"""ESCs -> gateway process with two CANopen nodes, the DBC beside them -> vcan -> the canopen library as master."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from encoding import Identity
@@ -23,7 +21,7 @@ class Nodes:
 
     def __init__(self, run: Chain, master: Master) -> None:
         self.run, self.master, self.watch = run, master, run.watch
-        self.begin = 0
+        self.begin = len(run.watch.recorded)
 
     def of(self, can_id: int) -> list[Recorded]:
         """Frames since the test's beginning."""
@@ -31,15 +29,6 @@ class Nodes:
 
     def states(self, node: int) -> list[int]:
         return [frame.data[0] for frame in self.of(0x700 + node)]
-
-    def reset(self) -> None:
-        self.begin = len(self.watch.recorded)
-        for node in (1, 2):
-            self.master.node(node).nmt.state = "RESET"
-            wait_for(lambda node=node: BOOT_UP in self.states(node), "boot-up")  # type: ignore[misc]
-            self.master.write(node, *TIMEOUT, 60_000, 2)
-        self.run.catch_up()
-        self.begin = len(self.watch.recorded)
 
     def go(self, node: int, state: int) -> None:
         """Command a state and wait for the heartbeat that tells it."""
@@ -50,24 +39,19 @@ class Nodes:
         )
 
 
-@pytest.fixture(scope="module")
-def module_nodes(module_vcan: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
-    folder = tmp_path_factory.mktemp("nodes")
+@pytest.fixture
+def nodes(vcan: str, tmp_path: Path) -> Iterator[Nodes]:
     identities = Identity(1), Identity(2, Layout.LEGACY, cells=12)
     with (
-        chain(module_vcan, folder, *identities, toml=canopen_table(folder / "store")) as run,
-        Master(module_vcan) as master,
+        chain(vcan, tmp_path, *identities, toml=canopen_table(tmp_path / "store")) as run,
+        Master(vcan) as master,
         run.running() as gateway,
     ):
         wait_for(lambda: len(run.watch.boot_ups) == 2, "boot-ups")
+        for node in (1, 2):
+            master.write(node, *TIMEOUT, 60_000, 2)
         yield Nodes(run, master)
         assert gateway.end() == 0, gateway.log
-
-
-@pytest.fixture
-def nodes(module_nodes: Nodes) -> Nodes:
-    module_nodes.reset()
-    return module_nodes
 
 
 def test_heartbeats_and_nmt_commands(nodes: Nodes) -> None:

@@ -51,17 +51,23 @@ def canopen_only(
     interface: str, run: Bench, folder: Path, node_id: int, timeout_ms: int = 60_000
 ) -> str:
     """A configuration with nodes and no DBC."""
-    parts = [
-        f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 500000\n[dbc]\nenabled = false\n'
-    ]
-    parts += [
-        f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{folder}"\n'
-    ]
-    parts += [
+    escs = "".join(
         f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ntelemetry_timeout_ms = {timeout_ms}\n'
         for port in run.ports
-    ]
-    return "\n".join(parts)
+    )
+    return f"""
+[can]
+interface = "socketcan"
+channel = "{interface}"
+bitrate = 500000
+[dbc]
+enabled = false
+[canopen]
+enabled = true
+node_id = {node_id}
+serial = {SERIAL}
+store = "{folder}"
+{escs}"""
 
 
 def start_nodes(
@@ -92,6 +98,13 @@ def node_master(vcan: str) -> Iterator[NodeMaster]:
         yield master
 
 
+def refusal(transfer: Callable[..., object], *arguments: object, **more: object) -> int | None:
+    """The code of a transfer that is refused."""
+    with pytest.raises(Refused) as refused:
+        transfer(*arguments, **more)
+    return refused.value.code
+
+
 def scanned(master: NodeMaster, serial: int) -> dict[str, int]:
     """What a fastscan finds that has to find the vendor-ID, 0, bit by bit: every one of its requests is answered.
 
@@ -111,38 +124,29 @@ def test_node_canopen_polls_every_object_of_the_eds(
         wait_for(lambda: bool(run.info(0)), "an info frame")
         objects = node_master("eds", file=str(EDS))
         assert len(objects) > 200
+        upload, download = node_master.upload, node_master.download
         for index, sub, name, data_type, access in objects:
             where = f"{index:04X}:{sub} {name}"
             if access == "wo":
-                with pytest.raises(Refused) as refused:
-                    node_master.upload(5, index, sub)
-                assert refused.value.code == WRITE_ONLY, where
+                assert refusal(upload, 5, index, sub) == WRITE_ONLY, where
                 continue
-            if index == 0x1003 and sub:
-                with pytest.raises(Refused) as refused:  # nothing has happened yet
-                    node_master.upload(5, index, sub)
-                assert refused.value.code == NO_DATA, where
+            if index == 0x1003 and sub:  # nothing has happened yet
+                assert refusal(upload, 5, index, sub) == NO_DATA, where
                 continue
-            got = node_master.upload(5, index, sub)
+            got = upload(5, index, sub)
             assert len(got) == SIZES.get(data_type, len(got)), f"{where}: {got.hex()}"
             if access in ("ro", "const"):
-                with pytest.raises(Refused) as refused:
-                    node_master.download(5, index, sub, got or b"\0")
-                assert refused.value.code == READ_ONLY, where
+                assert refusal(download, 5, index, sub, got or b"\0") == READ_ONLY, where
             if access == "const":
-                assert node_master.upload(5, index, sub, block=True) == got, where
+                assert upload(5, index, sub, block=True) == got, where
 
         known = {(index, sub) for index, sub, *_ in objects}
         indices = {index for index, _ in known}
         for index in sorted({neighbour for i in indices for neighbour in (i - 1, i + 1)} - indices):
-            with pytest.raises(Refused) as refused:
-                node_master.upload(5, index)
-            assert refused.value.code == NO_OBJECT, hex(index)
+            assert refusal(upload, 5, index) == NO_OBJECT, hex(index)
         for index in sorted(indices):
             sub = 1 + max(s for i, s in known if i == index)
-            with pytest.raises(Refused) as refused:
-                node_master.upload(5, index, sub)
-            assert refused.value.code == NO_SUB, (hex(index), sub)
+            assert refusal(upload, 5, index, sub) == NO_SUB, (hex(index), sub)
 
         file = EDS.read_bytes()
         assert node_master.upload(5, 0x1021, block=True) == file
@@ -159,16 +163,11 @@ def test_node_canopen_downloads_in_every_way(
         for value, block in ((11, False), (12, True)):
             node_master.download(5, 0x2100, 2, u32(value), block)
             assert node_master.upload(5, 0x2100, 2) == u32(value)
-        for data, code in (
-            (b"\0", TOO_LOW),
-            (b"\x65", TOO_HIGH),
-            (b"\1\2", TOO_LONG),
-            (b"\1\2\3\4\5\6", TOO_LONG),
-        ):
+        too_long = {b"\1\2": TOO_LONG, b"\1\2\3\4\5\6": TOO_LONG}
+        for data, code in {b"\0": TOO_LOW, b"\x65": TOO_HIGH, **too_long}.items():
             for block in (False, True):
-                with pytest.raises(Refused) as refused:
-                    node_master.download(5, 0x2100, 1, data, block)
-                assert refused.value.code == code, (data, block)
+                found = refusal(node_master.download, 5, 0x2100, 1, data, block)
+                assert found == code, (data, block)
         assert node_master.upload(5, 0x2100, 1) == b"\7"
         node_master.download(5, 0x1010, 1, b"save")
         assert list(tmp_path.rglob("*")), "nothing was stored"
@@ -194,10 +193,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
         wait_for(
             lambda: node_master.states(7) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat"
         )
-        ids = [
-            node_master("receivePdo", node=7, file=str(EDS), number=number)
-            for number in (1, 2, 3, 4)
-        ]
+        ids = [node_master("receivePdo", node=7, file=str(EDS), number=n) for n in (1, 2, 3, 4)]
         assert ids == [0x187, 0x287, 0x387, 0x487]
         assert not node_master.of("pdo")
         node_master("nmt", command="startNode", node=7)
@@ -214,9 +210,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
 
         run.stop()
         wait_for(lambda: len(node_master.of("emergency")) >= 3, "telemetry lost")
-        with pytest.raises(Refused) as refused:
-            node_master.upload(7, 0x2000, 1)
-        assert refused.value.code == DEVICE_STATE
+        assert refusal(node_master.upload, 7, 0x2000, 1) == DEVICE_STATE
         assert node_master.upload(7, 0x2020, 1)[0] & 0x3F == 4  # lost
         sent = run.live(0)
         counts = Counter(told["cob_id"] for told in node_master.of("pdo"))
@@ -267,9 +261,8 @@ def test_node_canopen_names_nodes_by_lss(
             ):
                 assert node_master("lss", command=name) == identity[field]
             for wrong in (0, 128, 254):
-                with pytest.raises(Refused) as refused:
-                    node_master("lss", command="configureNodeId", args=[wrong])
-                assert refused.value.code == 1, wrong
+                code = refusal(node_master, "lss", command="configureNodeId", args=[wrong])
+                assert code == 1, wrong
             node_master("lss", command="configureNodeId", args=[node_id])
             node_master("lss", command="storeConfiguration")
             node_master("waiting")
@@ -317,8 +310,7 @@ def test_tshark_reads_what_was_said(
             name = node_master.upload(0x55, 0x1008)
             assert node_master.upload(0x55, 0x1008, block=True) == name
             for index, sub in ((0x2222, 0), (0x2000, 0x22), (0x2102, 1)):
-                with pytest.raises(Refused):
-                    node_master.upload(0x55, index, sub)
+                refusal(node_master.upload, 0x55, index, sub)
             node_master.download(0x55, 0x2100, 2, u32(3))
             node_master.download(0x55, 0x2100, 2, u32(4), block=True)
             node_master("receivePdo", node=0x55, file=str(EDS), number=1)
@@ -340,19 +332,11 @@ def test_tshark_reads_what_was_said(
     def of(cob_id: int) -> list[SimpleNamespace]:
         return [f for f in frames if int(f.can_id, 0) == cob_id]
 
-    states = [int(f.state, 0) for f in of(0x755)]
-    assert [state for state, _ in itertools.groupby(states)] == [
-        BOOT_UP,
-        PRE_OPERATIONAL,
-        OPERATIONAL,
-        STOPPED,
-    ]
+    states = [state for state, _ in itertools.groupby(int(f.state, 0) for f in of(0x755))]
+    assert states == [BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED]
     assert [int(f.nmt_command, 0) for f in of(0)] == [1, 2]
-    aborts = [
-        (int(f.sdo_index, 0), int(f.sdo_sub, 0), int(f.sdo_abort, 0))
-        for f in of(0x5D5)
-        if is_abort(f)
-    ]
+    parts = [(f.sdo_index, f.sdo_sub, f.sdo_abort) for f in of(0x5D5) if is_abort(f)]
+    aborts = [tuple(int(part, 0) for part in each) for each in parts]
     assert aborts == [(0x2222, 0, NO_OBJECT), (0x2000, 0x22, NO_SUB), (0x2102, 1, WRITE_ONLY)]
     echoed = [f.sdo_abort for f in of(0x655) if is_abort(f)]
     assert len(echoed) == len(aborts), "the master returns an abort; one more would be its own"
