@@ -13,9 +13,8 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.data_types import FLOATS, SIGNED, TYPE_BITS, range_of
 from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
-from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds import Entry
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
-from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Kind
 from kontronik_can_gw.esc.values import Value as EscValue
@@ -45,47 +44,48 @@ def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatu
         variable = dictionary.get(index, sub)
         if variable is not None:
             variable.bound = bound
-            variable.read = partial(_read, bound, variable.entry, dictionary, esc, gateway)
-
-
-def compile_pdo(mapped: Sequence[Variable], protocol: EscProtocol) -> SlotPlan:
-    """The packer of a PDO with these objects."""
-    if all(variable.bound is not None for variable in mapped):
-        return _shared_pdo(tuple(variable.entry for variable in mapped), protocol)
-    return _compile(mapped)
-
-
-@lru_cache(_MAX_PDOS)
-def _shared_pdo(entries: tuple[Entry, ...], protocol: EscProtocol) -> SlotPlan:
-    """Of values only: the same for all nodes."""
-    variables = [Variable(entry) for entry in entries]
-    for variable in variables:
-        variable.bound = bindings_of(protocol)[variable.entry.index, variable.entry.sub]
-    return _compile(variables)
+            ends = range_of(variable.entry.data_type)
+            variable.read = partial(_read, bound, ends, dictionary, (esc, gateway))
 
 
 def _read(
     bound: Bound,
-    entry: Entry,
+    ends: tuple[int, int],
     dictionary: Dictionary,
-    esc: EscTelemetry,
-    gateway: GatewayStatus,
+    source: tuple[EscTelemetry, GatewayStatus],
     now: int,
 ) -> Value:
     """The value of an object by SDO. Without one it aborts, or shows what 2100h:5 says."""
-    low, high = range_of(entry.data_type)
+    esc, (low, high) = source[0], ends
     behaviour = dictionary.number(at.SETTINGS, 5)
-    if bound.source.group is Group.LIVE and esc.live is None:
-        value, why = None, Abort.NO_DATA if esc.last_live is None else Abort.DEVICE_STATE
-        if behaviour == _LAST_VALUE and esc.last_live is not None:
-            value, why = bound.last(esc, high), Abort.NO_DATA
-    else:
-        value, why = bound.read(esc, gateway, now, high), Abort.NO_DATA
+    value, why = None, Abort.NO_DATA
+    if bound.source.group is not Group.LIVE or esc.live is not None:
+        value = bound.read(*source, now, high)
+    elif esc.last_live is not None:
+        if behaviour == _LAST_VALUE:
+            value = bound.last(esc, high)
+        else:
+            why = Abort.DEVICE_STATE
     if value is not None and low <= value <= high:
         return value
     if behaviour == _CODES:
         return high if low == 0 else low
     raise SdoAbort(why)
+
+
+def compile_pdo(mapped: Sequence[Variable]) -> SlotPlan:
+    """The packer of a PDO with these objects; one for all nodes where they show values only."""
+    shown = tuple((each.entry, each.bound) for each in mapped if each.bound is not None)
+    return _shared_pdo(shown) if len(shown) == len(mapped) else _compile(mapped)
+
+
+@lru_cache(_MAX_PDOS)
+def _shared_pdo(shown: tuple[tuple[Entry, Bound], ...]) -> SlotPlan:
+    variables = []
+    for entry, bound in shown:
+        variables.append(variable := Variable(entry))
+        variable.bound = bound
+    return _compile(variables)
 
 
 def _stored(variable: Variable) -> EscValue:

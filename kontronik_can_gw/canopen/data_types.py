@@ -1,10 +1,6 @@
-"""Data types and object codes of CiA 301 (tables 42 and 44) that the object dictionary can have."""
+"""Data types of CiA 301 (table 44) that the object dictionary can have."""
 
 import struct
-
-DOMAIN, VAR, ARRAY, RECORD = 2, 7, 8, 9
-"""Object codes."""
-KINDS = {DOMAIN: "DOMAIN", VAR: "VAR", ARRAY: "ARRAY", RECORD: "RECORD"}
 
 BOOLEAN = 0x01
 U8, U16, U32 = 0x05, 0x06, 0x07

@@ -5,61 +5,45 @@ from collections.abc import Container, Mapping
 from pathlib import PurePath
 
 from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, OCTET_STRING, TYPE_BITS, UNICODE_STRING
-from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.eds_sections import (
     OBJECT,
-    bare,
     blocks,
     integer,
-    key,
-    spelling,
-    value,
+    pair,
 )
 from kontronik_can_gw.errors import UserError
 
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
-_OF_OBJECT = re.compile(
-    r"([0-9a-f]{4})(sub[0-9a-f]+|name|value|denotation|objectlinks)?$", re.IGNORECASE
-)
+_OF_OBJECT = re.compile(r"([0-9a-f]{4})(sub[0-9a-f]+|denotation|objectlinks)?$", re.IGNORECASE)
 
 
 def without(eds_data: bytes, indices: Container[int]) -> bytes:
-    """The EDS without these objects: their sections and list entries removed, lists renumbered, NrOfTXPDO counted anew."""
+    """The EDS without these objects: their sections and list entries removed, lists renumbered."""
     text = eds_data.decode("latin-1")
     end = "\r\n" if "\r\n" in text else "\n"
-    kept_blocks = [
+    left = [
         block
         for block in blocks(text)
         if not (match := _OF_OBJECT.match(block[0])) or int(match[1], 16) not in indices
     ]
-    left = {name.lower() for name, _ in kept_blocks}
-    pdos = sum(f"{index:04x}" in left for index in range(0x1800, 0x1A00))
-    kept: list[str] = []
-    for name, lines in kept_blocks:
-        if name.lower() in _LISTS:
-            kept += _shorter_list(lines, indices)
-        elif name.lower() == "deviceinfo":
-            kept += [f"NrOfTXPDO={pdos}" if key(line) == "nroftxpdo" else line for line in lines]
-        else:
-            kept += lines
-    return end.join(kept).encode("latin-1")
+    kept = [
+        _shorter_list(lines, indices) if name.lower() in _LISTS else lines for name, lines in left
+    ]
+    return end.join(line for lines in kept for line in lines).encode("latin-1")
 
 
 def _shorter_list(lines: list[str], indices: Container[int]) -> list[str]:
     kept: list[str] = []
     count = 0
     for line in lines:
-        if not key(line).isdigit():
-            kept.append(line)
+        key, value = pair(line)
+        if key.isdigit() and integer(value) in indices:
             continue
-        if integer(value(line)) in indices:
-            continue
-        count += 1
-        kept.append(f"{count}={value(line)}")
-    return [
-        f"SupportedObjects={count}" if key(line) == "supportedobjects" else line for line in kept
-    ]
+        count += key.isdigit()
+        kept.append(f"{count}={value}" if key.isdigit() else line)
+    total = f"SupportedObjects={count}"
+    return [total if pair(line)[0] == "supportedobjects" else line for line in kept]
 
 
 def dcf(
@@ -87,15 +71,14 @@ def dcf(
         added: list[str] = []
         if name.lower() == "fileinfo":
             last = PurePath(eds.name).name.encode("ascii", "replace").decode("ascii")
-            lines = [line for line in lines if key(line) not in ("filename", "lasteds")]
+            lines = [line for line in lines if pair(line)[0] not in ("filename", "lasteds")]
             lines[1:1] = [f"FileName={file_name}", f"LastEDS={last}"]
         elif name.lower() == "deviceinfo":
             added = _commissioning(node_id, bitrate, values.get((0x1018, 4)), node_name)
         elif match := OBJECT.match(name):
             index, sub = int(match[1], 16), int(match[2] or "0", 16)
-            if any(key(line) == "compactsubobj" and value(line) not in ("", "0") for line in lines):
-                added = _compact_values(index, texts)
-            elif (index, sub) in texts:
+            lines = [line for line in lines if pair(line)[0] != "parametervalue"]
+            if (index, sub) in texts:
                 added = [f"ParameterValue={texts[index, sub]}"]
         end = max((number for number, line in enumerate(lines, 1) if line.strip()), default=0)
         result += lines[:end] + added + lines[end:]
@@ -106,26 +89,12 @@ def _commissioning(
     node_id: int, bitrate: int, serial: float | bytes | None, node_name: str
 ) -> list[str]:
     """[DeviceComissioning]: CiA 306 spells it so."""
-    lines = [
-        "",
-        "[DeviceComissioning]",
-        f"NodeID=0x{node_id:02X}",
-        f"NodeName={node_name}",
-        f"Baudrate={bitrate // 1000}",
-        "NetNumber=0",
-        "CANopenManager=0",
-    ]
-    if (
-        isinstance(serial, int) and serial
-    ):  # 0: not known, so nothing that an LSS master could look for
-        lines.append(f"LSS_SerialNumber=0x{serial:08X}")
-    return lines
-
-
-def _compact_values(index: int, texts: Mapping[tuple[int, int], str]) -> list[str]:
-    """The values of an object with CompactSubObj stand in a section of their own (which the canopen package ignores)."""
-    values = [f"{at[1]}={text}" for at, text in sorted(texts.items()) if at[0] == index and at[1]]
-    return ["", f"[{index:04X}Value]", f"NrOfEntries={len(values)}", *values] if values else []
+    lines = ["", "[DeviceComissioning]", f"NodeID=0x{node_id:02X}", f"NodeName={node_name}"]
+    lines += [f"Baudrate={bitrate // 1000}", "NetNumber=0", "CANopenManager=0"]
+    # 0: not known, so nothing that an LSS master could look for
+    return lines + (
+        [f"LSS_SerialNumber=0x{serial:08X}"] if isinstance(serial, int) and serial else []
+    )
 
 
 def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
@@ -136,14 +105,7 @@ def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
     if entry.data_type == OCTET_STRING:
         return value.hex()
     text = value.decode("utf-16-le" if entry.data_type == UNICODE_STRING else "latin-1")
-    if (
-        not text.isascii()
-        or text != text.strip()
-        or (text and not text.isprintable())
-        or bare(f"={text}") != f"={text}"
-    ):
-        where = spelling(entry.index, entry.sub)
-        raise UserError(
-            f"{name}: [{where}] the text {text!r} of {entry.name} cannot stand in a DCF."
-        )
+    if not (text.isascii() and text.isprintable()) or pair(f"={text}")[1] != text:
+        what = f"the text {text!r} of {entry.name} cannot stand in a DCF."
+        raise UserError(f"{name}: {entry.place} {what}")
     return text

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.data_types import CODECS, DOMAIN_TYPE
-from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.objects import Bound
 
 Value = int | float | bytes
@@ -53,13 +52,9 @@ class Variable:
         self.read: Read | None = None
         self.check: Check | None = None
         self.written: Written | None = None
-        self.power_on: Value = self.empty if entry.default is None else entry.default
+        empty: Value = b"" if self.codec is None else 0
+        self.power_on = empty if entry.default is None else entry.default
         self.value: Value = self.power_on
-
-    @property
-    def empty(self) -> Value:
-        """What a variable without a default holds."""
-        return b"" if self.codec is None else 0
 
     @property
     def size(self) -> int | None:
@@ -97,10 +92,12 @@ class Variable:
 
     def check_limits(self, value: Value) -> None:
         """SdoAbort 06090031h or 06090032h for a number outside the limits of the EDS."""
-        high, low = self.entry.high, self.entry.low
-        if high is not None and not isinstance(value, bytes) and not value <= high:
+        low, high = self.entry.low, self.entry.high
+        if isinstance(value, bytes):
+            return
+        if high is not None and not value <= high:
             raise SdoAbort(Abort.TOO_HIGH)
-        if low is not None and not isinstance(value, bytes) and not value >= low:
+        if low is not None and not value >= low:
             raise SdoAbort(Abort.TOO_LOW)
 
     def default(self, node_id: int) -> Value:

@@ -1,34 +1,73 @@
-"""Electronic data sheets of CiA 306: what a node is built from. Text in, checked entries out.
+"""Electronic data sheets of CiA 306: what a node is built from. Text in, entries out.
 
-Refused is what a node could not be run with: limits, types, defaults that do not fit, what stands there twice; by file, section, key and
-remedy, all at once. What concerns other readers of the file only (lists of objects, counts, [DeviceInfo]) is not looked at.
+Refused is what cannot be read, or only in several ways: limits, types, defaults that do not fit, what stands there twice; by file, section,
+key and remedy, one mistake of each section at once. What concerns other readers of the file only (lists of objects, counts, ObjectType,
+[DeviceInfo]) is not looked at. ``check`` judges whether a node can be built from the entries.
 
-Choices where CiA 306 leaves room: section names that it does not know are ignored. Types of 24, 40, 48 and 56 bits and times are refused;
-64-bit types are plain storage, so they are taken from 2000h on only.
+Choices where CiA 306 leaves room: an object has sub-indices where it has sections of them, else it is a variable; section names that
+it does not know are ignored. Types of 24, 40, 48 and 56 bits and times are refused.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
-from kontronik_can_gw.canopen import eds_rules
-from kontronik_can_gw.canopen.data_types import ARRAY, DOMAIN, KINDS, RECORD, U8, VAR
-from kontronik_can_gw.canopen.eds_object import EdsObject, Entry
-from kontronik_can_gw.canopen.eds_sections import OBJECT, Problems, Section, choices, read_sections
-from kontronik_can_gw.canopen.eds_values import data_type_of, default_value, limits
+from kontronik_can_gw.canopen.data_types import (
+    BOOLEAN,
+    DOMAIN_TYPE,
+    FLOATS,
+    OCTET_STRING,
+    REAL32,
+    SIGNED,
+    TYPE_NAMES,
+    UNICODE_STRING,
+    VISIBLE_STRING,
+    WHOLE,
+    range_of,
+)
+from kontronik_can_gw.canopen.eds_sections import OBJECT, Section, integer, read_sections
 from kontronik_can_gw.errors import UserError
 
 MAX_BYTES = 2_000_000
 """Of an EDS; the shipped one has 60 kB, 250 entries, 2 200 lines."""
-_MAX_LINES = 100_000
-_MAX_ENTRIES = 10_000
 _MAX_PROBLEMS = 20
-_MAX_NAME = 241
+_MAX_SAID = 500
+"""Characters of a mistake: it quotes the file."""
+_DOMAIN_OBJECT = 2
 _ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
+_NODE_ID = re.compile(
+    r"\$NODEID(?:\+(?P<after>[^+]+))?$|(?P<before>[^+]+)\+\$NODEID$", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One entry of the object dictionary, as the EDS describes it.
+
+    ``access`` is ro, wo, rw, rwr, rww or const. ``default`` is an int, a float, or bytes for texts and domains; with ``relative`` the
+    node-ID is still to be added to it.
+    """
+
+    index: int
+    sub: int
+    name: str
+    data_type: int
+    access: str
+    mappable: bool
+    low: int | None
+    high: int | None
+    default: int | float | bytes | None
+    relative: bool
+
+    @property
+    def place(self) -> str:
+        return f"{self.index:04X}h:{self.sub:02X}"
 
 
 @dataclass(frozen=True)
 class Eds:
-    """A checked EDS. ``data`` are the bytes as given, ``entries`` are in the order of index and sub-index."""
+    """What was read of an EDS. ``data`` are the bytes as given, ``entries`` are in the order of index and sub-index."""
 
     data: bytes
     name: str
@@ -37,161 +76,139 @@ class Eds:
 
 
 def load(data: bytes, name: str) -> Eds:
-    """Check and read an EDS by CiA 306. UserError with every mistake at once: file, section, key, what is wrong and what to do."""
+    """Read an EDS by CiA 306. UserError with the mistakes: file, section, key, what is wrong and what to do."""
     known = (b"[fileinfo]", b"[deviceinfo]", b"[mandatoryobjects]")
     if not any(section in data.lower() for section in known):
         raise UserError(
             f"{name}: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects]."
         )
-    if len(data) > MAX_BYTES or data.count(b"\n") > _MAX_LINES:
-        raise UserError(
-            f"{name}: is larger than {MAX_BYTES // 1_000_000} MB or {_MAX_LINES} lines. Is it an EDS?"
-        )
-    problems = Problems(name)
-    objects = _Reader(read_sections(data, problems), problems).read()
-    eds_rules.check(objects, problems.add)
-    if problems.found:
-        more = len(problems.found) - _MAX_PROBLEMS
+    if len(data) > MAX_BYTES:
+        raise UserError(f"{name}: is larger than {MAX_BYTES // 1_000_000} MB. Is it an EDS?")
+    problems: list[str] = []
+    sections = read_sections(data, problems)
+    entries, names = [], {}
+    for index, sub, section in _entry_sections(sections, problems):
+        try:
+            entries.append(_entry(section, index, sub))
+        except ValueError as error:
+            problems.append(f"[{section.name}] {error}")
+        names[index] = sections[f"{index:04x}"].get("ParameterName")
+    if problems:
+        more = len(problems) - _MAX_PROBLEMS
         rest = [f"{name}: and {more} more mistakes."] if more > 0 else []
-        raise UserError(*problems.found[:_MAX_PROBLEMS], *rest)
-    ordered = [objects[index] for index in sorted(objects)]
-    entries = tuple(item.subs[sub] for item in ordered for sub in sorted(item.subs))
-    return Eds(data, name, entries, {item.index: item.name for item in ordered})
+        raise UserError(*(f"{name}: {_cut(text)}" for text in problems[:_MAX_PROBLEMS]), *rest)
+    return Eds(data, name, tuple(entries), names)
 
 
-class _Reader:
-    """Reads the sections of objects and collects mistakes."""
-
-    def __init__(self, sections: Mapping[str, Section], problems: Problems) -> None:
-        self._sections = sections
-        self._problems = problems
-
-    def read(self) -> dict[int, EdsObject]:
-        """All objects."""
-        self._check_header()
-        members: dict[int, dict[int, Section]] = {}
-        for section in self._sections.values():
-            if match := OBJECT.match(section.name):
-                of_object = members.setdefault(int(match[1], 16), {})
-                if match[2] is not None:
-                    of_object[int(match[2], 16)] = section
-        objects: dict[int, EdsObject] = {}
-        count = 0
-        for index, subs in members.items():
-            section_of_index = self._sections.get(f"{index:04x}")
-            if section_of_index is None:
-                for sub in subs.values():
-                    sub.wrong(f"there is no section [{index:04X}]. Add it or remove this one.")
-                continue
-            objects[index] = self._read_object(index, section_of_index, subs)
-            count += len(objects[index].subs)
-            if count > _MAX_ENTRIES:
-                raise UserError(
-                    f"{self._problems.file}: has more than {_MAX_ENTRIES} objects and sub-indices. Remove some."
-                )
-        return objects
-
-    def _check_header(self) -> None:
-        if "devicecomissioning" in self._sections:
-            self._problems.add(
-                "DeviceComissioning",
-                "this is a DCF, the file of one node. Give the EDS it was made from.",
-            )
-        section = self._sections.get("deviceinfo")
-        if section is not None and section.number("CompactPDO"):
-            section.wrong(
-                "CompactPDO: not supported. Describe each PDO by its own sections and write 0."
-            )
-
-    def _read_object(self, index: int, section: Section, subs: Mapping[int, Section]) -> EdsObject:
-        kind = section.number("ObjectType", VAR)
-        item = EdsObject(index, kind or 0, _parameter_name(section), {})
-        if kind in (DOMAIN, VAR):
-            for sub in subs.values():
-                sub.wrong(
-                    f"[{index:04X}] is a {KINDS[kind]} and has no sub-indices. Remove this section."
-                )
-            item.subs[0] = _entry(section, item, 0, item.name, kind)
-        elif kind in (ARRAY, RECORD):
-            self._read_members(item, section, subs)
-        elif kind is not None:
-            section.wrong(f"ObjectType=0x{kind:X}: not one of {choices(KINDS)}.")
-        return item
-
-    def _read_members(self, item: EdsObject, section: Section, subs: Mapping[int, Section]) -> None:
-        compact = section.number("CompactSubObj", 0)
-        if compact and not subs:
-            self._read_compact(item, section, compact)
-            return
-        if compact:
-            section.wrong("CompactSubObj excludes sections of sub-indices. Keep one way.")
-        for sub in sorted(subs):
-            member = subs[sub]
-            kind = member.number("ObjectType", VAR)
-            if kind not in (None, DOMAIN, VAR):
-                member.wrong(f"ObjectType=0x{kind:X}: a sub-index is a VAR, 0x7.")
-            if sub > 0xFE:
-                member.wrong("sub-indices end at FE. Remove this section.")
-            item.subs[sub] = _entry(member, item, sub, _parameter_name(member), kind or VAR)
-        self._check_sub0(item)
-
-    def _check_sub0(self, item: EdsObject) -> None:
-        """Sub-index 0 is what masters read first (CiA 301, 7.4.5.2)."""
-        wrong = self._problems.add
-        first = item.subs.get(0)
-        if first is None:
-            wrong(
-                f"{item.index:04X}",
-                "sub-index 0 is missing. Add it with the highest sub-index as DefaultValue.",
-            )
-            return
-        where, highest = item.section(0), max(item.subs)
-        if first.data_type != U8:
-            wrong(where, f"DataType=0x{first.data_type:04X}: sub-index 0 is an UNSIGNED8, 0x0005.")
-        elif not eds_rules.counts(item.index) and first.default != highest:
-            wrong(
-                where, f"DefaultValue: the highest sub-index is {highest}. Write 0x{highest:02X}."
-            )
-
-    def _read_compact(self, item: EdsObject, section: Section, count: int) -> None:
-        """CiA 306, CompactSubObj: sub-index 0 and ``count`` alike ones. Their names are the object's and a number, or in [xxxxName]."""
-        if not 1 <= count <= 0xFE:
-            section.wrong(f"CompactSubObj={count}: not 1 to 254.")
-            return
-        first = _entry(section, item, 1, item.name, VAR)
-        names = {sub: f"{item.name}{sub}" for sub in range(1, count + 1)}
-        if given := self._sections.get(f"{item.index:04x}name"):
-            for key, name in given.values.items():
-                number = int(key) if key.isdigit() and len(key) < 10 else 0
-                if number in names:
-                    names[number] = name or names[number]
-                elif key != "nrofentries":
-                    given.wrong(f"{key}: not a sub-index from 1 to {count}.")
-        counts = eds_rules.counts(item.index)
-        about = f"{item.name} highest sub-index", U8, "rw" if counts else "const"
-        default = 0 if counts else count
-        item.subs[0] = Entry(item.index, 0, *about, False, None, None, default, False)
-        for sub, name in names.items():
-            item.subs[sub] = replace(first, sub=sub, name=name)
+def _cut(text: str) -> str:
+    """A mistake without its middle, if it is long: what is wrong and the remedy stand at its ends."""
+    half = _MAX_SAID // 2
+    return text if len(text) <= _MAX_SAID else f"{text[:half]} ... {text[-half:]}"
 
 
-def _parameter_name(section: Section) -> str:
-    name = section.get("ParameterName")
-    if not name:
-        section.wrong("ParameterName: missing. Name it.")
-    elif len(name) > _MAX_NAME:
-        section.wrong(f"ParameterName: longer than {_MAX_NAME} characters. Shorten it.")
-    return name
+def _entry_sections(
+    sections: Mapping[str, Section], problems: list[str]
+) -> Iterator[tuple[int, int, Section]]:
+    """Index, sub-index and section of each entry."""
+    if "devicecomissioning" in sections:
+        what = "this is a DCF, the file of one node. Give the EDS it was made from."
+        problems.append(f"[DeviceComissioning] {what}")
+    if integer(sections.get("deviceinfo", Section("")).get("CompactPDO") or "0") != 0:
+        what = "not supported. Describe each PDO by its own sections and write 0."
+        problems.append(f"[DeviceInfo] CompactPDO: {what}")
+    members: dict[int, dict[int, Section]] = {}
+    for section in sections.values():
+        if match := OBJECT.match(section.name):
+            of_object = members.setdefault(int(match[1], 16), {})
+            if match[2] is not None:
+                of_object[int(match[2], 16)] = section
+    for index, subs in sorted(members.items()):
+        head = sections.get(f"{index:04x}")
+        if head is None:
+            what = f"there is no section [{index:04X}]. Add it or remove this one."
+            problems += [f"[{section.name}] {what}" for section in subs.values()]
+        elif integer(head.get("CompactSubObj") or "0") != 0:
+            what = "CompactSubObj: not supported. Let the EDS editor expand it, a section for each sub-index."
+            problems.append(f"[{head.name}] {what}")
+        else:
+            for sub, section in sorted((subs or {0: head}).items()):
+                yield index, sub, section
 
 
-def _entry(section: Section, item: EdsObject, sub: int, name: str, kind: int) -> Entry:
-    data_type = data_type_of(section, kind, item.index)
-    access = section.get("AccessType").lower() or ("rw" if kind == DOMAIN else "")
+def _entry(section: Section, index: int, sub: int) -> Entry:
+    """ValueError for what is wrong."""
+    is_domain = section.number("ObjectType") == _DOMAIN_OBJECT
+    data_type = section.number("DataType", DOMAIN_TYPE if is_domain else 0)
+    if data_type not in TYPE_NAMES:
+        known = ", ".join(f"0x{code:X} {name}" for code, name in TYPE_NAMES.items())
+        raise ValueError(f"{section.said('DataType')}: not supported. Take one of {known}.")
+    access = section.get("AccessType").lower() or ("rw" if is_domain else "")
     if access not in _ACCESS:
-        section.wrong(f"{section.said('AccessType')}: not one of {', '.join(_ACCESS)}.")
-    mappable = bool(section.number("PDOMapping", 0))
-    if section.get("ParameterValue"):
-        section.wrong("ParameterValue: values belong in a DCF. Write DefaultValue.")
-    limit = limits(section, data_type)
-    default = default_value(section, data_type, *limit)
-    return Entry(item.index, sub, name, data_type, access, mappable, *limit, *default)
+        raise ValueError(f"{section.said('AccessType')}: not one of {', '.join(_ACCESS)}.")
+    low, high = _limit(section, "LowLimit", data_type), _limit(section, "HighLimit", data_type)
+    default, relative = _default(section, data_type)
+    if isinstance(default, int) and not relative:
+        if low is not None and default < low:
+            raise ValueError(f"{section.said('DefaultValue')}: below {section.said('LowLimit')}.")
+        if high is not None and default > high:
+            raise ValueError(f"{section.said('DefaultValue')}: above {section.said('HighLimit')}.")
+    mappable = bool(section.number("PDOMapping"))
+    about = section.get("ParameterName"), data_type, access, mappable
+    return Entry(index, sub, *about, low, high, default, relative)
+
+
+def _limit(section: Section, key: str, data_type: int) -> int | None:
+    text = section.get(key)
+    if not text:
+        return None
+    if data_type not in WHOLE | {BOOLEAN}:
+        raise ValueError(f"{key}={text}: only whole numbers have limits. Leave it empty.")
+    return _fitting(section, key, text, data_type)
+
+
+def _fitting(section: Section, key: str, text: str, data_type: int, room: int = 0) -> int:
+    """A whole number that fits its type with ``room`` above it. Signed ones may be hexadecimal in two's complement."""
+    number = integer(text)
+    if number is None:
+        raise ValueError(f"{section.said(key)}: not a number. Write 0x1F or 31.")
+    low, high = range_of(data_type)
+    if data_type in SIGNED and "x" in text.lower() and high < number <= high - low:
+        number -= high - low + 1
+    if not low <= number <= high - room:
+        of_type = f"{TYPE_NAMES[data_type]}, {low} to {high}"
+        raise ValueError(f"{section.said(key)}: does not fit {of_type}.")
+    return number
+
+
+def _default(section: Section, data_type: int) -> tuple[int | float | bytes | None, bool]:
+    """The default, and whether the node-ID is to be added to it."""
+    text = section.get("DefaultValue")
+    if not text:
+        return None, False
+    if data_type in (VISIBLE_STRING, UNICODE_STRING):
+        coding = "utf-16-le" if data_type == UNICODE_STRING else "ascii"
+        return text.encode(coding, "replace"), False
+    if data_type in (OCTET_STRING, DOMAIN_TYPE):
+        try:
+            return bytes.fromhex(text), False
+        except ValueError:
+            what = "not bytes. Write pairs of hexadecimal digits, or nothing."
+            raise ValueError(f"DefaultValue={text}: {what}") from None
+    if data_type in FLOATS:
+        return _real(text, data_type), False
+    if match := _NODE_ID.match(text.replace(" ", "")):
+        value = match["after"] or match["before"] or "0"
+        return _fitting(section, "DefaultValue", value, data_type, room=127), True
+    return _fitting(section, "DefaultValue", text, data_type), False
+
+
+def _real(text: str, data_type: int) -> float:
+    """A decimal, or the hexadecimal bits of the IEEE number that CiA 306 writes."""
+    try:
+        if "x" not in text.lower():
+            return float(text)
+        size, code = (4, ">f") if data_type == REAL32 else (8, ">d")
+        number: float = struct.unpack(code, int(text, 16).to_bytes(size, "big"))[0]
+        return number
+    except (ValueError, OverflowError):
+        raise ValueError(f"DefaultValue={text}: not a number. Write 1.5.") from None

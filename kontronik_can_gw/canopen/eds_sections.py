@@ -1,14 +1,10 @@
-"""The text of an EDS or DCF (CiA 306, clause 4): sections, keys, values, and what is wrong with them.
+"""The text of an EDS or DCF (CiA 306, clause 4): sections, keys, values.
 
 Choices where CiA 306 leaves room: section and key names in any case; LF as well as CR LF; a key without a value is a key that is not there.
 """
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-
-_MAX_SAID = 400
-"""Characters of a mistake: it quotes the file."""
 
 _HEADING = re.compile(r"\s*\[([^\]]*)\]")
 _COMMENT = re.compile(r"(?:^|\s);.*")
@@ -17,26 +13,11 @@ OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
 _NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
 
 
-class Problems:
-    """The mistakes of one file, each by section and key."""
-
-    def __init__(self, file: str) -> None:
-        self.file = file
-        self.found: list[str] = []
-
-    def add(self, section: str, text: str) -> None:
-        section = section[:_MAX_SAID]
-        if len(text) > _MAX_SAID:  # what is wrong and the remedy stand at its ends
-            text = f"{text[: _MAX_SAID // 2]} ... {text[-_MAX_SAID // 2 :]}"
-        self.found.append(f"{self.file}: [{section}] {text}" if section else f"{self.file}: {text}")
-
-
 @dataclass
 class Section:
     """One section: its name as written, and its keys in lower case with their values."""
 
     name: str
-    problems: Problems
     values: dict[str, str] = field(default_factory=dict)
 
     def get(self, key: str) -> str:
@@ -46,56 +27,41 @@ class Section:
         """A key as a mistake quotes it."""
         return f"{key}={self.get(key)}"
 
-    def wrong(self, text: str) -> None:
-        """Report a mistake."""
-        self.problems.add(self.name, text)
-
-    def number(self, key: str, otherwise: int | None = None) -> int | None:
-        """The number of a key; ``otherwise`` where it has no value; None, after a complaint, where that is no number."""
+    def number(self, key: str, otherwise: int = 0) -> int:
+        """The number of a key; ``otherwise`` where it has no value. ValueError for what is no number."""
         text = self.get(key)
-        if not text:
-            return otherwise
-        number = integer(text)
-        if number is None:
-            self.wrong(f"{key}={text}: not a number. Write 0x1F or 31.")
-        return number
+        found = integer(text) if text else otherwise
+        if found is None:
+            raise ValueError(f"{self.said(key)}: not a number. Write 0x1F or 31.")
+        return found
 
 
-def read_sections(data: bytes, problems: Problems) -> dict[str, Section]:
-    """The sections by their names in lower case, those of objects in one spelling."""
+def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
+    """The sections by their names in lower case, those of objects in one spelling. What is wrong is added to ``problems``."""
     for number, raw in enumerate(data.split(b"\n"), 1):
         if not raw.isascii():
             text = raw.decode("ascii", "backslashreplace").strip()
-            problems.add("", f"line {number} is not ASCII: {text}. Write it in plain letters.")
+            problems.append(f"line {number} is not ASCII: {text}. Write it in plain letters.")
     found: dict[str, Section] = {}
     for name, lines in blocks(data.decode("ascii", "replace")):
-        section = Section(name, problems)
+        where = f"[{name}] " if name else ""
+        section = Section(name)
         for line in lines[1:] if name else lines:
-            _read_line(section, line)
-        if not name:
-            continue
+            if text := bare(line):
+                key, equals, value = (part.strip() for part in text.partition("="))
+                if not (equals and key and name):
+                    what = f"'{text}' is neither a section, nor key=value, nor a comment after ';'."
+                    problems.append(where + what)
+                elif key.lower() in section.values:
+                    problems.append(f"{where}{key}: this key is there twice. Remove one.")
+                else:
+                    section.values[key.lower()] = value
         match = OBJECT.match(name)
-        same = (
-            spelling(int(match[1], 16), int(match[2], 16) if match[2] else None) if match else name
-        )
-        if same.lower() in found:
-            section.wrong("this section is there twice. Remove one.")
-        else:
-            found[same.lower()] = section
+        sub = int(match[2], 16) if match and match[2] else None
+        same = spelling(int(match[1], 16), sub) if match else name
+        if found.setdefault(same.lower(), section) is not section:
+            problems.append(f"{where}this section is there twice. Remove one.")
     return found
-
-
-def _read_line(section: Section, line: str) -> None:
-    text = bare(line)
-    if not text:
-        return
-    key, equals, value = (part.strip() for part in text.partition("="))
-    if not equals or not key or not section.name:
-        section.wrong(f"'{text}' is neither a section, nor key=value, nor a comment after ';'.")
-    elif key.lower() in section.values:
-        section.wrong(f"{key}: this key is there twice. Remove one.")
-    else:
-        section.values[key.lower()] = value
 
 
 def blocks(text: str) -> list[tuple[str, list[str]]]:
@@ -113,14 +79,10 @@ def bare(line: str) -> str:
     return "" if line.lstrip().startswith("#") else _COMMENT.sub("", line).strip()
 
 
-def key(line: str) -> str:
-    """The key of a line, in lower case."""
-    return bare(line).partition("=")[0].strip().lower()
-
-
-def value(line: str) -> str:
-    """The value of a line."""
-    return bare(line).partition("=")[2].strip()
+def pair(line: str) -> tuple[str, str]:
+    """Key, in lower case, and value of a line."""
+    key, _, value = bare(line).partition("=")
+    return key.strip().lower(), value.strip()
 
 
 def integer(text: str) -> int | None:
@@ -131,8 +93,3 @@ def integer(text: str) -> int | None:
 def spelling(index: int, sub: int | None) -> str:
     """The name of the section of an object or sub-index."""
     return f"{index:04X}" if sub is None else f"{index:04X}sub{sub:X}"
-
-
-def choices(names: Mapping[int, str]) -> str:
-    """What a number can be, for a message."""
-    return ", ".join(f"0x{code:X} {name}" for code, name in names.items())

@@ -139,17 +139,14 @@ class Emergencies:
     def close(self) -> None:
         """No emergencies (STOPPED): what is pending is reported later, if it is still true then."""
         self._open = False
-        self._unreported |= {
-            condition: None for condition, _ in self._pending if condition is not None
-        }
+        self._unreported |= dict.fromkeys(each for each, _ in self._pending if each is not None)
         self._pending.clear()
 
     def reset(self) -> None:
         """Reset communication: what is wrong is unreported and all that the history holds; heartbeats and SYNC are watched anew."""
         self.close()
-        self._active = {
-            condition: None for condition in self._active if condition.code not in OF_COMMUNICATION
-        }
+        kept = [each for each in self._active if each.code not in OF_COMMUNICATION]
+        self._active = dict.fromkeys(kept)
         self.history.clear()
         for condition in self._active:
             self._note(condition)

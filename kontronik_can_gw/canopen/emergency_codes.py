@@ -8,7 +8,6 @@
 
 from collections.abc import Iterator, Sequence
 from enum import Enum, IntFlag
-from functools import lru_cache
 from typing import NamedTuple, Self
 
 from kontronik_can_gw.esc.decoder import ErrorBit, Severity
@@ -26,18 +25,12 @@ class Register(IntFlag):
 
 
 _REGISTER_OF_CLASS = {
-    of_class: int(Register.GENERIC | bit)
-    for of_class, bit in {
-        0x2: Register.CURRENT,
-        0x3: Register.VOLTAGE,
-        0x4: Register.TEMPERATURE,
-        0x8: Register.COMMUNICATION,
-        0xF: Register.MANUFACTURER,
-    }.items()
+    0x2: Register.CURRENT,
+    0x3: Register.VOLTAGE,
+    0x4: Register.TEMPERATURE,
+    0x8: Register.COMMUNICATION,
+    0xF: Register.MANUFACTURER,
 }
-_GENERIC = int(Register.GENERIC)
-_MAX_WORDS = 256
-"""Error words of which the emergencies are kept."""
 FROM_GATEWAY = 0xFF
 
 
@@ -98,16 +91,7 @@ class Condition(NamedTuple):
 
 def register_of(code: int) -> int:
     """The bits of 1001h that an error code sets: the generic one and that of its class."""
-    return _REGISTER_OF_CLASS.get(code >> 12, _GENERIC)
-
-
-class Reported(NamedTuple):
-    """What is said of an ESC's error word."""
-
-    conditions: tuple[Condition, ...]
-    """Those that get an emergency, by their bits."""
-    register: int
-    """The bits of 1001h that it sets."""
+    return int(Register.GENERIC | _REGISTER_OF_CLASS.get(code >> 12, 0))
 
 
 class BitCodes:
@@ -122,16 +106,17 @@ class BitCodes:
         ]
         self._summary_bits = sum(bit for bit, _ in self._summaries)
         self._error_bits = sum(1 << bit for bit in bits if bit.severity is Severity.ERROR)
-        self.of = lru_cache(_MAX_WORDS)(self._of)
-        """Of an error word and a mask: a bit in the mask gets an emergency, a summary bit only where it is not explained by another.
-
-        1001h shows all errors, and the warnings in the mask."""
 
     def code(self, bit: int) -> int:
         """The emergency code of a bit: a standard one where there is one, else FF00h + bit."""
         return self._codes.get(bit, 0xFF00 + bit)
 
-    def _of(self, word: int, mask: int) -> Reported:
+    def of(self, word: int, mask: int) -> tuple[tuple[Condition, ...], int]:
+        """What gets an emergency, by bits, and the bits of 1001h, of an error word.
+
+        A bit in the mask gets one, a summary bit only where it is not explained by another. 1001h shows all errors, and the warnings in
+        the mask.
+        """
         summary_free = word & ~self._summary_bits
         bits = word & mask
         for summary, explained_by in self._summaries:
@@ -140,9 +125,7 @@ class BitCodes:
         register = 0
         for bit in _bits_of(summary_free & self._error_bits | bits):
             register |= register_of(self.code(bit))
-        return Reported(
-            tuple(Condition(self.code(bit), bit, 0) for bit in _bits_of(bits)), register
-        )
+        return tuple(Condition(self.code(bit), bit, 0) for bit in _bits_of(bits)), register
 
 
 def _bits_of(word: int) -> Iterator[int]:

@@ -120,10 +120,10 @@ class Consumer:
             self._watched[node_id] = kept or _Watched(timeout)
 
     def _written(self, now: int) -> None:
-        lost = [node_id for node_id, watched in self._watched.items() if watched.lost]
+        before = self._watched
         self._configure()
-        for node_id in lost:
-            if node_id not in self._watched or not self._watched[node_id].lost:
+        for node_id, old in before.items():
+            if old.lost and self._watched.get(node_id) is not old:
                 self._changed(node_id, False, now)
 
     def _check(self, own: Variable, value: int) -> None:

@@ -33,27 +33,19 @@ class Service(IntEnum):
     CONFIGURE_NODE_ID = 0x11
     CONFIGURE_BIT_TIMING = 0x13
     STORE = 0x17
-    SELECT_VENDOR = 0x40
-    SELECT_PRODUCT = 0x41
-    SELECT_REVISION = 0x42
-    SELECT_SERIAL = 0x43
     SELECTED = 0x44
-    IDENTIFY_VENDOR = 0x46
-    IDENTIFY_PRODUCT = 0x47
-    IDENTIFY_REVISION_LOW = 0x48
-    IDENTIFY_REVISION_HIGH = 0x49
-    IDENTIFY_SERIAL_LOW = 0x4A
-    IDENTIFY_SERIAL_HIGH = 0x4B
     IDENTIFY_NON_CONFIGURED = 0x4C
     IDENTIFIED = 0x4F
     NON_CONFIGURED = 0x50
     FASTSCAN = 0x51
-    INQUIRE_VENDOR = 0x5A
-    INQUIRE_PRODUCT = 0x5B
-    INQUIRE_REVISION = 0x5C
-    INQUIRE_SERIAL = 0x5D
     INQUIRE_NODE_ID = 0x5E
 
+
+_SELECT = range(0x40, 0x44)
+"""Command specifiers with one part each of the identity 1018h: vendor, product, revision, serial number."""
+_INQUIRE = range(0x5A, 0x5E)
+_IDENTIFY = range(0x46, 0x4C)
+"""Vendor, product, lowest and highest revision, lowest and highest serial number."""
 
 OK = 0
 NODE_ID_OUT_OF_RANGE = 1
@@ -99,16 +91,19 @@ class LssSlave:
         expected, self._expected = self._expected, 0
         if service == Service.SWITCH_GLOBAL:
             self._switch_global(data[1], now)
-        elif Service.IDENTIFY_VENDOR <= service <= Service.IDENTIFY_SERIAL_HIGH:
-            if self._sequence_ends(service, number, expected):
+        elif service in _IDENTIFY:
+            if self._sequence_ends(
+                _IDENTIFY, service, expected, self._is_in_range(service, number)
+            ):
                 self._answer(Service.IDENTIFIED)
         elif service == Service.IDENTIFY_NON_CONFIGURED:
             if self._unconfigured:
                 self._answer(Service.NON_CONFIGURED)
         elif self._configuring:
             self._configure(service, data)
-        elif Service.SELECT_VENDOR <= service <= Service.SELECT_SERIAL:
-            if self._sequence_ends(service, number, expected):
+        elif service in _SELECT:
+            fits = self._host.identity[service - _SELECT[0]] == number
+            if self._sequence_ends(_SELECT, service, expected, fits):
                 self._enter(configuring=True)
                 self._answer(Service.SELECTED)
         elif service == Service.FASTSCAN and self._unconfigured:
@@ -144,30 +139,20 @@ class LssSlave:
             if left:
                 self._host.lss_left_configuration(now)
 
-    def _sequence_ends(self, service: int, number: int, expected: int) -> bool:
-        """Whether this frame completes a selection (40h..43h) or identification (46h..4Bh) that fits in all its parts."""
-        first = service in (Service.SELECT_VENDOR, Service.IDENTIFY_VENDOR)
-        if not (first or service == expected) or not self._fits(service, number):
+    def _sequence_ends(self, services: range, service: int, expected: int, fits: bool) -> bool:
+        """Whether this frame completes a selection or identification that fits in all its parts."""
+        if not fits or service not in (services[0], expected):
             return False
-        if service in (Service.SELECT_SERIAL, Service.IDENTIFY_SERIAL_HIGH):
-            return True
-        self._expected = service + 1
-        return False
+        self._expected = service + 1 if service != services[-1] else 0
+        return not self._expected
 
-    def _fits(self, service: int, number: int) -> bool:
+    def _is_in_range(self, service: int, number: int) -> bool:
+        """Whether one part of an identification fits."""
         vendor, product, revision, serial = self._host.identity
-        return {
-            Service.SELECT_VENDOR: number == vendor,
-            Service.SELECT_PRODUCT: number == product,
-            Service.SELECT_REVISION: number == revision,
-            Service.SELECT_SERIAL: number == serial,
-            Service.IDENTIFY_VENDOR: number == vendor,
-            Service.IDENTIFY_PRODUCT: number == product,
-            Service.IDENTIFY_REVISION_LOW: number <= revision,
-            Service.IDENTIFY_REVISION_HIGH: revision <= number,
-            Service.IDENTIFY_SERIAL_LOW: number <= serial,
-            Service.IDENTIFY_SERIAL_HIGH: serial <= number,
-        }[Service(service)]
+        if service < _IDENTIFY[2]:
+            return number == (vendor, product)[service - _IDENTIFY[0]]
+        own = revision if service < _IDENTIFY[4] else serial
+        return own >= number if service in _IDENTIFY[2::2] else own <= number
 
     def _fastscan(self, number: int, bit_checked: int, sub: int, following: int) -> None:
         """51h | IDNumber u32 | BitChecked 0..31 or 80h | LSSSub 0..3 | LSSNext 0..3."""
@@ -199,11 +184,9 @@ class LssSlave:
             if not self._host.store_configuration():
                 self._stores.pop()
                 self._answer(service, STORE_NOT_SUPPORTED)
-        elif Service.INQUIRE_VENDOR <= service <= Service.INQUIRE_SERIAL:
-            self._answer(
-                service,
-                *self._host.identity[service - Service.INQUIRE_VENDOR].to_bytes(4, "little"),
-            )
+        elif service in _INQUIRE:
+            part = self._host.identity[service - _INQUIRE[0]]
+            self._answer(service, *part.to_bytes(4, "little"))
         elif service == Service.INQUIRE_NODE_ID:
             self._answer(service, self._host.active_node_id)
 

@@ -77,16 +77,9 @@ class Nmt:
             self.state = state
             self._entered(now)
 
-    def communication_error(self, now: int) -> None:
-        """Behave as 1029h:1 says."""
-        self._behave(self._dictionary.number(0x1029, 1), now)
-
-    def telemetry_lost(self, now: int) -> None:
-        """Behave as 1029h:2 says."""
-        self._behave(self._dictionary.number(0x1029, 2), now)
-
-    def _behave(self, behaviour: int, now: int) -> None:
-        """Error behaviour of 1029h: 0 PRE-OPERATIONAL (if OPERATIONAL), 1 no change, 2 STOPPED."""
+    def behave(self, error: int, now: int) -> None:
+        """Follow 1029h: sub-index 1 communication error, 2 telemetry lost. 0 PRE-OPERATIONAL (if OPERATIONAL), 1 no change, 2 STOPPED."""
+        behaviour = self._dictionary.number(0x1029, error)
         if behaviour == 0 and self.state is NmtState.OPERATIONAL:
             self.enter(NmtState.PRE_OPERATIONAL, now)
         elif behaviour == 2 and self.communicates:

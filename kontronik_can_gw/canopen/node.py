@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen.abort import Abort
 from kontronik_can_gw.canopen.bound_values import bind_values
-from kontronik_can_gw.canopen.can_faults import CanFaults
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT, LSS_ANSWER, SDO_ANSWER
 from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.emergency import Emergencies
@@ -20,10 +19,10 @@ from kontronik_can_gw.canopen.identity import Identity
 from kontronik_can_gw.canopen.lss import LssSlave
 from kontronik_can_gw.canopen.nmt import Nmt
 from kontronik_can_gw.canopen.parameters import Parameters
+from kontronik_can_gw.canopen.pdo import Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.canopen.sync import SyncConsumer
-from kontronik_can_gw.canopen.tpdos import Tpdos
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -73,7 +72,7 @@ class Node:
         )
         self.lss = LssSlave(self.identity, partial(self._send, LSS_ANSWER))
         bind_values(dictionary, esc, gateway)
-        self.tpdos = Tpdos(dictionary, esc.protocol, partial(owner.slot, number), taken)
+        self.tpdos = Tpdos(dictionary, partial(owner.slot, number), taken)
         self._esc_objects = EscObjects(
             dictionary,
             esc,
@@ -81,9 +80,8 @@ class Node:
             self.emergencies,
             settings.device,
             partial(owner.settings_changed, number),
-            self.nmt.telemetry_lost,
+            partial(self.nmt.behave, 2),
         )
-        self.can_faults = CanFaults(self.emergencies, self.nmt, self._returned, self._repeat)
         self._timers = (self._producer, self.consumer, self.sdo, self.emergencies)
         dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
         dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS
@@ -99,32 +97,18 @@ class Node:
         return self.identity.active_node_id
 
     @property
-    def pending_node_id(self) -> int:
-        """The node-ID from the next reset on."""
-        return self.identity.pending_node_id
-
-    @property
     def claimed_node_id(self) -> int:
         """The node-ID it has; before it is powered on the one it will have."""
-        return self.pending_node_id if self.state is NmtState.INITIALISING else self.node_id
-
-    @property
-    def rejected(self) -> list[int]:
-        """Keys of stored values that were rejected at the last reset."""
-        return self.parameters.rejected
+        is_on = self.state is not NmtState.INITIALISING
+        return self.node_id if is_on else self.identity.pending_node_id
 
     # --- resets
 
-    def power_on(self, now: int) -> None:
-        """The gateway starts. A node without a node-ID stays silent until LSS gives it one."""
-        self.can_faults.power_on()
-        self.reset_node(now)
-
     def reset_node(self, now: int) -> None:
-        """NMT reset node: manufacturer's and profile objects too."""
+        """NMT reset node, and power-on: manufacturer's and profile objects too. Without a node-ID it stays silent until LSS gives one."""
         self.tpdos.stop()
         self.emergencies.close()  # nothing is sent before the boot-up message
-        self.parameters.reset_application(self.pending_node_id)
+        self.parameters.reset_application(self.identity.pending_node_id)
         self._esc_objects.apply_settings(now)
         self._reset_communication(now)
 
@@ -144,7 +128,8 @@ class Node:
         self.emergencies.configure(node_id)
         self.tpdos.release_ids()
         parameters.reject_what_breaks_rules()
-        parameters.rejected += self.tpdos.reset(node_id, now)
+        for tpdo in self.tpdos:
+            parameters.rejected += tpdo.reset(node_id, now)
         self.consumer.reset()
         self.nmt.state = NmtState.INITIALISING
         if node_id == UNCONFIGURED:
@@ -160,7 +145,6 @@ class Node:
         parameters.verify()
         self._owner.rerouted = True
         self._owner.state_changes += 1
-        self.set_due()
 
     # --- what happens
 
@@ -186,7 +170,6 @@ class Node:
             self.lss.stored(error is None)
         else:
             self.sdo.confirm(None if error is None else Abort.HARDWARE, ticket)
-        self.set_due()
 
     # --- what services give out
 
@@ -214,21 +197,23 @@ class Node:
             return
         self.emergencies.open(now)
         if self.state is NmtState.OPERATIONAL:
-            self.tpdos.start(now)
+            for tpdo in self.tpdos:
+                tpdo.start(now)
 
     def _watch_changed(self, node_id: int, lost: bool, now: int) -> None:
         """A watched heartbeat stays away, or no longer."""
         self.emergencies.set(GatewayError.HEARTBEAT_LOST, lost, now, node_id)
         if lost:
-            self.nmt.communication_error(now)
+            self.nmt.behave(1, now)
 
     def _on_download(self, variable: Variable, changed: bool, now: int) -> None:
-        self.tpdos.on_download(variable, now)
+        for tpdo in self.tpdos:
+            tpdo.on_download(variable, now)
         self.parameters.on_download(variable, changed)
         if variable.entry.index in _WITH_COB_ID:
             self._owner.rerouted = True
 
-    def _returned(self, now: int) -> None:
+    def returned(self, now: int) -> None:
         """The controller left bus-off, or the interface is back. With 1029h:1 = 0 the node boots, so that its master sets it up anew.
 
         CiA 301 asks for PRE-OPERATIONAL then; a boot-up besides is what brings a node without a master, self-starting, to work again.
@@ -237,9 +222,10 @@ class Node:
             self.reset_communication(now)
         else:
             self._producer.beat(now)
-            self._repeat(now)
+            self.repeat(now)
 
-    def _repeat(self, now: int) -> None:
+    def repeat(self, now: int) -> None:
+        """Frames were lost: what is sent on change only, and what is wrong, is sent once more."""
         self.emergencies.repeat(now)
         self.tpdos.repeat(now)
 

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from kontronik_can_gw.canopen.can_faults import CanFaults
 from kontronik_can_gw.canopen.cob_ids import (
     HEARTBEAT,
     LSS_REQUEST,
@@ -17,7 +18,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import ALL_NODES, RESETS, command
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
-from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAX_TPDOS
+from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.canopen.uses import FrameTaker, routes, uses
 from kontronik_can_gw.esc.stream import EscStream
@@ -93,13 +94,14 @@ class Nodes(Output):
         self.slot = slot
         self.settings_changed = settings_changed
         self._foreign_ids = foreign_ids or {}
-        self._routes: dict[int, list[tuple[Node, FrameTaker]]] = {}
+        self._routes: dict[int, list[FrameTaker]] = {}
         self.rerouted = True
         """A node uses other COB-IDs now."""
         self._watched: frozenset[int] = frozenset()
         self._to_watchers: deque[CanFrame] = deque()
         self._started = False
         self.nodes = [Node(n, setup, esc, gateway, self) for n, esc in enumerate(escs)]
+        self._can_faults = CanFaults(self.nodes)
 
     # --- what happens
 
@@ -108,8 +110,9 @@ class Nodes(Output):
         if not can_open:
             return
         self._started = True
+        self._can_faults.power_on()
         for node in self.nodes:
-            node.power_on(now)
+            node.reset_node(now)
         self._after(now)
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
@@ -140,34 +143,32 @@ class Nodes(Output):
         """The CAN controller's state changed, or it is down again before a frame was sent."""
         if state is before and state is not CanState.DOWN:
             return
-        for node in self.nodes:
-            node.can_faults.on_state(state, now)
-        self._after_all(now)
+        self._can_faults.on_state(state, now)
+        self._after(now)
 
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost, or for the first time."""
         if not self._started:
             self.start(now, can_open=True)
             return
-        for node in self.nodes:
-            node.can_faults.frames_pass(now)
-        self._after_all(now)
+        self._can_faults.frames_pass(now)
+        self._after(now)
 
     def held_up(self, now: int) -> None:
         for node in self.nodes:
             node.tpdos.held_up(now)
             node.consumer.held_up(now)
-        self._after_all(now)
+        self._after(now)
 
     def make_anew(self, now: int) -> None:
         """PDOs that waited to be sent were dropped: send once more what is sent on change only."""
         for node in self.nodes:
             node.tpdos.repeat(now)
-        self._after_all(now)
+        self._after(now)
 
     def collision(self, esc: int, present: bool, now: int) -> None:
         self.nodes[esc].emergencies.set(GatewayError.ID_COLLISION, present, now)
-        self._after_all(now)
+        self._after(now)
 
     def node_states(self) -> list[tuple[int, NmtState, int]]:
         return [
@@ -194,14 +195,13 @@ class Nodes(Output):
         }
 
     def overrun(self, now: int) -> None:
-        for node in self.nodes:
-            node.can_faults.overrun(now)
-        self._after_all(now)
+        self._can_faults.overrun(now)
+        self._after(now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """A node's parameter file could not be read: it runs on defaults."""
         self.nodes[esc].emergencies.set(GatewayError.PARAMETER_FILE, True, now)
-        self._after_all(now)
+        self._after(now)
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
         """The oldest request of an ESC's node to store is on disk, or failed for a reason."""
@@ -236,7 +236,7 @@ class Nodes(Output):
         if node_id == UNCONFIGURED:
             return False
         others = [other for other in self.nodes if other is not node]
-        if any(node_id in (other.node_id, other.pending_node_id) for other in others):
+        if any(node_id in (other.node_id, other.identity.pending_node_id) for other in others):
             return True
         wanted = {first + node_id for first in OF_NODE_ID}
         wanted |= {cob_id for _, _, cob_id in default_ids(node.dictionary, node_id)}
@@ -244,14 +244,8 @@ class Nodes(Output):
         return not wanted.isdisjoint(used | self._foreign_ids.keys())
 
     def _route(self, frame: CanFrame, now: int, at: int) -> None:
-        for node, taker in self._routes.get(frame.can_id, ()):
+        for taker in self._routes.get(frame.can_id, ()):
             taker(frame.data, now, at)
-            node.set_due()
-
-    def _after_all(self, now: int) -> None:
-        for node in self.nodes:
-            node.set_due()
-        self._after(now)
 
     def _after(self, now: int) -> None:
         while self._to_watchers:
@@ -266,6 +260,8 @@ class Nodes(Output):
             self._routes = {}
             for node in self.nodes:
                 for cob_id, taker in routes(node):
-                    self._routes.setdefault(cob_id, []).append((node, taker))
+                    self._routes.setdefault(cob_id, []).append(taker)
             self.receive_ids = frozenset(self._routes)
+        for node in self.nodes:
+            node.set_due()
         self.due = min([node.due for node in self.nodes])

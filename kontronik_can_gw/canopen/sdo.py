@@ -21,7 +21,7 @@ Choices where the standard leaves room:
 """
 
 from collections.abc import Callable
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
@@ -30,7 +30,6 @@ from kontronik_can_gw.canopen.sdo_transfers import (
     BlockDownload,
     BlockUpload,
     InFlight,
-    Pace,
     SegmentedDownload,
     SegmentedUpload,
     check_block_size,
@@ -60,7 +59,7 @@ class SdoServer:
     ) -> None:
         self._objects = objects
         self._send = send
-        self._pace = Pace(segment_ns)
+        self._segment_ns = segment_ns
         self._transfer: _Transfer | None = None
         self._confirming = False
         """All data is here, the result of the dictionary is pending."""
@@ -119,18 +118,23 @@ class SdoServer:
         """Let time pass: the time-out of a transfer, and the paced segments of a block upload."""
         if now < self.due:
             return
-        transfer = self._transfer
-        if isinstance(transfer, BlockUpload) and transfer.bursts:
-            transfer.advance(now)
-            self._deadline = now + TIMEOUT_NS
-        else:
+        if (upload := self._bursting) is None:
             self._abort(Abort.TIMEOUT)
+        else:
+            upload.advance(now)
+            self._deadline = now + TIMEOUT_NS
 
     @property
     def due(self) -> int:
         """When ``advance`` has something to do."""
-        bursts = isinstance(self._transfer, BlockUpload) and self._transfer.bursts
-        return self._pace.next_burst if bursts else self._deadline
+        upload = self._bursting
+        return self._deadline if upload is None else upload.next_burst
+
+    @property
+    def _bursting(self) -> BlockUpload | None:
+        """A block upload in the midst of a sub-block."""
+        transfer = self._transfer
+        return transfer if isinstance(transfer, BlockUpload) and transfer.bursts else None
 
     # ---- requests
 
@@ -152,11 +156,11 @@ class SdoServer:
             case 5:
                 self._serve_block_upload(data, now)
             case 6 if command & 1:
-                self._end_block_download(data, now)
+                self._store(self._running(BlockDownload).end(data), b"\xa1" + bytes(7), now)
             case 6:
                 self._initiate_block_download(data, now)
             case _:
-                _refuse(Abort.COMMAND)
+                raise SdoAbort(Abort.COMMAND)
 
     def _begin(self, data: bytes) -> None:
         """Leave what is going on for the transfer that an initiate request names."""
@@ -168,7 +172,7 @@ class SdoServer:
     def _running(self, kind: type[_T]) -> _T:
         """The transfer that goes on; 05040001h where it is of another kind, or there is none."""
         if not isinstance(self._transfer, kind):
-            _refuse(Abort.COMMAND)
+            raise SdoAbort(Abort.COMMAND)
         return self._transfer
 
     def _open_block_download(self) -> BlockDownload | None:
@@ -241,11 +245,6 @@ class SdoServer:
         self._in_flight.segment_seen(now)
         self._send(self._initiated(0xA4, bytes((BLOCK_SIZE,))))
 
-    def _end_block_download(self, data: bytes, now: int) -> None:
-        """The end request of a block download. Answer: A1h, 0 (7)."""
-        whole = self._running(BlockDownload).end(data)
-        self._store(whole, b"\xa1\0\0\0\0\0\0\0", now)
-
     def _serve_block_upload(self, data: bytes, now: int) -> None:
         command = data[0] & 3
         if command == 0:
@@ -273,7 +272,7 @@ class SdoServer:
             self._start_upload(value)
             return
         with_crc = bool(data[0] & 4)
-        self._transfer = BlockUpload(value, block_size, with_crc, self._pace, self._send)
+        self._transfer = BlockUpload(value, block_size, with_crc, self._segment_ns, self._send)
         self._send(self._initiated(0xC6, len(value).to_bytes(4, "little")))
 
     # ---- all transfers
@@ -295,7 +294,3 @@ class SdoServer:
         self._transfer, self._confirming = None, False
         self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
-
-
-def _refuse(code: Abort) -> NoReturn:
-    raise SdoAbort(code)

@@ -152,14 +152,6 @@ class InFlight:
         return True
 
 
-class Pace:
-    """When the next burst of segments may be sent; ``segment_ns``: distance that segments keep on average, 0: none."""
-
-    def __init__(self, segment_ns: int) -> None:
-        self.segment_ns = segment_ns
-        self.next_burst = 0
-
-
 class _Phase(Enum):
     START = auto()
     SENDING = auto()
@@ -167,19 +159,21 @@ class _Phase(Enum):
 
 
 class BlockUpload:
-    """The segments of one value, a sub-block at a time."""
+    """The segments of one value, a sub-block at a time. ``segment_ns``: distance that segments keep on average, 0: none."""
 
     def __init__(
         self,
         data: bytes,
         block_size: int,
         with_crc: bool,
-        pace: Pace,
+        segment_ns: int,
         send: Callable[[bytes], None],
     ) -> None:
+        self.next_burst = 0
+        """When more of a sub-block may be sent."""
         self._data = data
         self._with_crc = with_crc
-        self._pace = pace
+        self._segment_ns = segment_ns
         self._send = send
         self._phase = _Phase.START
         # in segments: of the whole, confirmed, of this sub-block, of this sub-block sent
@@ -228,10 +222,10 @@ class BlockUpload:
 
     def advance(self, now: int) -> None:
         """Send of a sub-block what its time has come for."""
-        if now < self._pace.next_burst:
+        if now < self.next_burst:
             return
         count = self._sub_block - self._sent
-        if self._pace.segment_ns:
+        if self._segment_ns:
             count = min(count, BURST)
         for _ in range(count):
             at = self._confirmed + self._sent
@@ -239,7 +233,7 @@ class BlockUpload:
             last = _LAST_SEGMENT if at + 1 == self._segments else 0
             segment = self._data[7 * at : 7 * at + 7].ljust(7, b"\0")
             self._send(bytes((last | self._sent,)) + segment)
-        self._pace.next_burst = now + count * self._pace.segment_ns
+        self.next_burst = now + count * self._segment_ns
 
     def _expect(self, phase: _Phase) -> None:
         if self._phase is not phase:

@@ -22,6 +22,7 @@ VERSION = 1
 VERIFY = 0x1020
 COMMUNICATION = range(0x1000, 0x2000)
 APPLICATION = range(0x2000, 0x10000)
+_WITH_COB_ID = frozenset({0x1005, 0x1014, *range(0x1800, 0x1A00)})
 
 _HEADER_START = re.compile(rb'\{"format":"kontronik-can-gw parameters","version":([0-9]{1,9})[,}]')
 _CRC = re.compile(rb'"crc32":"([0-9A-F]{8})"\}')
@@ -38,11 +39,21 @@ class Stored:
     application: Mapping[int, bytes] = field(default_factory=dict)
     """Objects 2000h..FFFFh."""
 
+    @property
+    def has_ids(self) -> bool:
+        """Whether a node-ID or COB-IDs are in it."""
+        return self.node_id is not None or any(
+            key >> 8 in _WITH_COB_ID for key in self.communication
+        )
+
+    def without_ids(self) -> "Stored":
+        """Without the node-ID and COB-IDs."""
+        left = {k: data for k, data in self.communication.items() if k >> 8 not in _WITH_COB_ID}
+        return replace(self, node_id=None, communication=left).unverified()
+
     def unverified(self) -> "Stored":
         """Without 1020h: these parameters are not, or no longer, all of the configuration that it names."""
-        left = {
-            number: data for number, data in self.communication.items() if number >> 8 != VERIFY
-        }
+        left = {key: data for key, data in self.communication.items() if key >> 8 != VERIFY}
         return replace(self, communication=left)
 
 

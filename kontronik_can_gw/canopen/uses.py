@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from kontronik_can_gw.canopen.node import Node
 
 FrameTaker = Callable[[bytes, int, int], None]
-"""Is given a frame's data, the time, and when the frame came. ``Node.set_due`` follows."""
+"""Is given a frame's data, the time, and when the frame came."""
 
 
 class Use(NamedTuple):
@@ -35,22 +35,18 @@ class Use(NamedTuple):
     """The service for which a master can choose it; that of SYNC is one for all nodes. None: it cannot be chosen."""
     own: bool = False
     """No other device on the bus may send with it."""
-    taker: FrameTaker | None = None
-    """What its frames are given to; None: the node does not listen."""
 
 
 def uses(node: "Node") -> Iterator[Use]:
     """All COB-IDs that a node sends with or listens to as its own."""
-    has_id = node.node_id != UNCONFIGURED
-    yield Use(NMT, "NMT", taker=partial(_on_nmt, node) if has_id else None)
-    yield Use(LSS_REQUEST, "LSS", taker=lambda data, now, _at: node.lss.receive(data, now))
+    yield Use(NMT, "NMT")
+    yield Use(LSS_REQUEST, "LSS")
     yield Use(LSS_ANSWER, "LSS")
-    if not has_id:
+    if node.node_id == UNCONFIGURED:
         return
     name = f"CANopen node {node.node_id}"
-    yield Use(node.sync.cob_id, "SYNC", SYNC, taker=partial(_on_sync, node))
-    requests = SDO_REQUEST + node.node_id
-    yield Use(requests, f"SDO requests to {name}", taker=partial(_on_sdo, node))
+    yield Use(node.sync.cob_id, "SYNC", SYNC)
+    yield Use(SDO_REQUEST + node.node_id, f"SDO requests to {name}")
     yield Use(HEARTBEAT + node.node_id, f"the heartbeat of {name}", own=True)
     yield Use(SDO_ANSWER + node.node_id, f"SDO answers of {name}", own=True)
     emergencies = node.emergencies
@@ -63,8 +59,11 @@ def uses(node: "Node") -> Iterator[Use]:
 
 def routes(node: "Node") -> Iterator[tuple[int, FrameTaker]]:
     """COB-IDs the node listens to, those of heartbeats that it watches too, and what takes their frames."""
-    yield from ((use.cob_id, use.taker) for use in uses(node) if use.taker is not None)
+    yield LSS_REQUEST, lambda data, now, _at: node.lss.receive(data, now)
     if node.node_id != UNCONFIGURED:
+        yield NMT, partial(_on_nmt, node)
+        yield node.sync.cob_id, partial(_on_sync, node)
+        yield SDO_REQUEST + node.node_id, partial(_on_sdo, node)
         for node_id in node.consumer.node_ids:
             yield HEARTBEAT + node_id, partial(node.consumer.receive, node_id)
 

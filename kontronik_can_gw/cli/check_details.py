@@ -5,8 +5,7 @@ import struct
 from collections.abc import Iterator, Sequence
 
 from kontronik_can_gw.canopen.nodes import Nodes
-from kontronik_can_gw.canopen.pdo import Tpdo
-from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
+from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Tpdo
 from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.export import as_toml

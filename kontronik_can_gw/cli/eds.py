@@ -14,7 +14,6 @@ from kontronik_can_gw.canopen.storage import VERIFY
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all
 from kontronik_can_gw.cli.output import write_output
-from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -39,25 +38,18 @@ _STATES_AND_COMMANDS = frozenset(
 
 
 def main(args: argparse.Namespace) -> int:
-    loaded = _loaded(args)
-    if loaded is None:
+    path = announced_config(with_nodes=True) if args.config is None else args.config
+    if path is None:
         setup = shipped_canopen([args.node_id or 1])
         escs = setup.esc_settings([EscSettings()])
     else:
+        loaded = load_all(path)
         setup, escs = canopen_of(loaded), loaded.escs
     text = setup.eds.data.decode("latin-1")  # keeps all bytes
     if args.node_id is not None:
         text = _dcf(setup, escs, args.node_id, Path(args.output).name)
     write_output(args.output, text, "latin-1")
     return 0
-
-
-def _loaded(args: argparse.Namespace) -> Loaded | None:
-    """The configuration that is named, else that of this folder or machine if it has nodes."""
-    if args.config is not None:
-        return load_all(args.config)
-    path = announced_config(with_nodes=True)
-    return None if path is None else load_all(path)
 
 
 def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, name: str) -> str:

@@ -7,7 +7,6 @@ another node or a DBC message, they are ignored with a warning.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds, without_objects
@@ -15,9 +14,9 @@ from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.node_settings import NodeSettings
-from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
+from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, decode
-from kontronik_can_gw.canopen.uses import uses
+from kontronik_can_gw.canopen.uses import Use, uses
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
@@ -142,69 +141,39 @@ def with_stored(
     escs: Sequence[EscSettings],
     foreign: Mapping[int, str],
 ) -> tuple[CanopenSetup, list[str]]:
-    """The nodes with stored parameters, except those that clash; and a warning for each of these."""
+    """The nodes with stored parameters, without the ids of those that clash; and a warning for each of these."""
     if all(each == Stored() for each in stored):
         return plain, []
     said: list[str] = []
     kept = list(stored)
-
-    def ignore(number: int, what: str, why: str, **instead: Any) -> None:
-        said.append(f"{config.esc[number].name}: the stored {what} ignored: {why}")
-        kept[number] = replace(kept[number], **instead).unverified()
-
-    def ignore_node_id(number: int, why: str) -> None:
-        ignore(number, f"node-ID {kept[number].node_id} is", why, node_id=None)
-
-    while clash := _clashing_node_ids(plain.settings, kept):
-        for number in clash:
-            ignore_node_id(number, "it cannot be this node's")
     while True:
         setup = replace(plain, stored=tuple(kept))
-        found = _clashing_nodes(setup.nodes(escs, foreign), foreign)
-        if not (clash := [number for number in found if kept[number] != Stored()]):
+        clash = [number for number in _clashing(setup, escs, foreign) if kept[number].has_ids]
+        if not clash:
             return setup, said
         for number in clash:
-            communication = kept[number].communication
-            left = {k: v for k, v in communication.items() if k >> 8 not in _WITH_COB_ID}
-            if len(left) < len(communication):
-                why = "one of them is used otherwise now"
-                ignore(number, "COB-IDs are", why, communication=left)
-            elif kept[number].node_id is not None:
-                ignore_node_id(number, "its COB-IDs are used otherwise")
-            else:
-                kept[number] = Stored()
+            said.append(
+                f"{config.esc[number].name}: the stored node-ID and COB-IDs are ignored: one of them is used otherwise now"
+            )
+            kept[number] = kept[number].without_ids()
 
 
-_WITH_COB_ID = frozenset({0x1005, 0x1014, *range(0x1800, 0x1A00)})
-
-
-def _clashing_node_ids(settings: Sequence[NodeSettings], kept: Sequence[Stored]) -> list[int]:
-    """Nodes whose stored node-ID is that of another node, or unconfigured although LSS is refused."""
-    ids = [
-        own.node_id if s.node_id is None else s.node_id
-        for own, s in zip(settings, kept, strict=True)
-    ]
-    return [
-        number
-        for number, (own, node_id) in enumerate(zip(settings, ids, strict=True))
-        if kept[number].node_id is not None
-        and (own.read_only if node_id == UNCONFIGURED else ids.count(node_id) > 1)
-    ]
-
-
-def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
-    """Nodes with a COB-ID that another service, another node or a DBC message uses."""
-    users: dict[int, list[tuple[int, str]]] = {}
-    for number, node in enumerate(nodes.nodes):
-        for cob_id, what, *_ in uses(node):
-            users.setdefault(cob_id, []).append((number, what))
+def _clashing(
+    setup: CanopenSetup, escs: Sequence[EscSettings], foreign: Mapping[int, str]
+) -> set[int]:
+    """Nodes with a COB-ID that something else uses, or that wait for a node-ID although LSS is refused."""
+    users: dict[int, list[tuple[int, Use]]] = {}
+    for number, node in enumerate(setup.nodes(escs, foreign).nodes):
+        for use in uses(node):
+            users.setdefault(use.cob_id, []).append((number, use))
     found = {
         number
         for cob_id, those in users.items()
-        if cob_id in foreign or len({what for _, what in those}) > 1
+        if cob_id in foreign or (len(those) > 1 and any(use.own for _, use in those))
         for number, _ in those
     }
-    return sorted(found)
+    pairs = enumerate(zip(setup.settings, setup.stored, strict=True))
+    return found | {n for n, (own, s) in pairs if own.read_only and s.node_id == UNCONFIGURED}
 
 
 def load_of_stored(

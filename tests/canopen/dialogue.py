@@ -307,7 +307,7 @@ class Bench:
             case "listens", _:
                 return f"listens {' '.join(f'{cob_id:03X}' for cob_id in sorted(self.listened_to))}"
             case "rejected", [node, *_]:
-                keys = sorted(self.nodes[int(node) - 1].rejected)
+                keys = sorted(self.nodes[int(node) - 1].parameters.rejected)
                 return " ".join(["rejected", node, *map(_name, keys)])
             case _:
                 raise AssertionError(f"what is {what!r}?")

@@ -59,13 +59,8 @@ class Talk(Heard):
             match option.split():
                 case ["node-id", active, pending]:
                     self.node.active_node_id, self.node.pending_node_id = int(active), int(pending)
-                case ["identity", vendor, product, revision, serial]:
-                    self.node.identity = (
-                        int(vendor, 16),
-                        int(product, 16),
-                        int(revision, 16),
-                        int(serial, 16),
-                    )
+                case ["identity", *parts]:
+                    self.node.identity = cast(Identity, tuple(int(part, 16) for part in parts))
                 case ["read-only"]:
                     self.node.writable = False
                 case ["refuses", "to", "store"]:
@@ -97,16 +92,11 @@ class Talk(Heard):
             case "node-id", _:
                 return f"node-id {self.node.active_node_id} {self.node.pending_node_id}"
             case "stores", _:
-                return " ".join(
-                    [
-                        "stores",
-                        *(str(node_id) for asked, node_id in self.node.asked if asked == "store"),
-                    ]
-                )
+                asked = [str(node_id) for verb, node_id in self.node.asked if verb == "store"]
+                return " ".join(["stores", *asked])
             case "left", _:
-                return " ".join(
-                    ["left", *(ms(time) for asked, time in self.node.asked if asked == "left")]
-                )
+                asked = [ms(time) for verb, time in self.node.asked if verb == "left"]
+                return " ".join(["left", *asked])
             case _:
                 raise AssertionError(f"what is {what!r}?")
         return what

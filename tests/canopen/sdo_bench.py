@@ -1,90 +1,55 @@
-"""A small object dictionary and an SDO server whose time is turned by hand, for the tests of the server."""
+"""An SDO server over a small object dictionary, whose time is turned by hand, for the tests of the server."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, cast
 
 from script import MS, Heard, bytes_of, hexadecimal, ms
 
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.abort import Abort
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, key
+from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.output import NEVER
 
-
-@dataclass
-class Entry:
-    """One object. ``size``: fixed length; ``most``: greatest length; ``high``: greatest value; ``late``: confirmed later."""
-
-    value: bytes = b""
-    access: str = "rw"
-    size: int | None = None
-    most: int = 65536
-    high: int | None = None
-    late: bool = False
-
-    def check_size(self, size: int | None) -> int:
-        """Returns the greatest length."""
-        most = self.most if self.size is None else self.size
-        if size is not None and not (self.size or 0) <= size <= most:
-            raise SdoAbort(Abort.TOO_LONG if size > most else Abort.TOO_SHORT)
-        return most
-
-
-def usual_entries() -> dict[tuple[int, int], Entry]:
-    return {
-        (0x1000, 0): Entry(bytes.fromhex("92010200"), "ro", size=4),
-        (0x1001, 0): Entry(b"\x05", "ro", size=1),
-        (0x1008, 0): Entry(b"KONTRONIK!", "ro", most=10),
-        (0x1017, 0): Entry(b"\xe8\x03", size=2),
-        (0x2000, 1): Entry(b"abc", "ro", most=3),
-        (0x2001, 0): Entry(b"", "ro"),
-        (0x2002, 0): Entry(b"", "wo", size=4),
-        (0x2003, 0): Entry(bytes(range(30))),
-        (0x2004, 0): Entry(b"", most=10),
-        (0x2005, 0): Entry(b"", size=4, late=True),
-        (0x2006, 0): Entry(b"\x07", size=1, high=100),
-        (0x2008, 0): Entry(bytes(8), size=8),
-    }
+_U8, _U16, _U32, _TEXT, _DOMAIN, _U64 = 0x05, 0x06, 0x07, 0x09, 0x0F, 0x1B
+_ENTRIES: list[tuple[int, int, int, str, int | bytes]] = [
+    (0x1000, 0, _U32, "ro", 0x00020192),
+    (0x1001, 0, _U8, "ro", 5),
+    (0x1008, 0, _TEXT, "ro", b"KONTRONIK!"),
+    (0x1017, 0, _U16, "rw", 1000),
+    (0x2000, 1, _TEXT, "ro", b"abc"),
+    (0x2001, 0, _TEXT, "ro", b""),
+    (0x2002, 0, _U32, "wo", 0),
+    (0x2003, 0, _DOMAIN, "rw", bytes(range(30))),
+    (0x2004, 0, _TEXT, "rw", b""),
+    (0x2005, 0, _U32, "rw", 0),
+    (0x2006, 0, _U8, "rw", 7),
+    (0x2008, 0, _U64, "rw", 0),
+]
+_HIGH = {0x2006: 100}
+PLACES = [(index, sub) for index, sub, *_ in _ENTRIES]
 
 
-@dataclass
-class Dictionary:
-    """Remembers what was asked and written."""
+class _TenBytes(Variable):
+    max_size = 10
 
-    entries: dict[tuple[int, int], Entry] = field(default_factory=usual_entries)
-    uploads: int = 0
-    checks: list[tuple[int, int, int | None]] = field(default_factory=list)
-    written: list[tuple[int, int, bytes]] = field(default_factory=list)
 
-    def entry(self, index: int, sub: int) -> Entry:
-        entry = self.entries.get((index, sub))
-        if entry is None:
-            known = any(index == other for other, _ in self.entries)
-            raise SdoAbort(Abort.NO_SUB_INDEX if known else Abort.NO_OBJECT)
-        return entry
+class Objects(Dictionary):
+    """Remembers what was written. 2004h holds 10 bytes, 2005h is confirmed later, 2006h is at most 100."""
 
-    def upload(self, index: int, sub: int, now: int) -> bytes:
-        self.uploads += 1
-        entry = self.entry(index, sub)
-        if entry.access == "wo":
-            raise SdoAbort(Abort.WRITE_ONLY)
-        return entry.value
+    def __init__(self) -> None:
+        entries = [
+            Entry(index, sub, "", kind, access, False, None, _HIGH.get(index), default, False)
+            for index, sub, kind, access, default in _ENTRIES
+        ]
+        super().__init__(Eds(b"", "", tuple(entries), {}))
+        self.written = self._note
+        self.downloads: list[tuple[int, int, bytes]] = []
+        self.variables[key(0x2004, 0)] = _TenBytes(self.find(0x2004, 0).entry)
+        self.bind(0x2005, written=lambda _now: False)
 
-    def check_download(self, index: int, sub: int, size: int | None) -> int:
-        self.checks.append((index, sub, size))
-        entry = self.entry(index, sub)
-        if entry.access == "ro":
-            raise SdoAbort(Abort.READ_ONLY)
-        return entry.check_size(size)
-
-    def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
-        entry = self.entry(index, sub)
-        entry.check_size(len(data))
-        if entry.high is not None and int.from_bytes(data, "little") > entry.high:
-            raise SdoAbort(Abort.TOO_HIGH)
-        entry.value = data
-        self.written.append((index, sub, data))
-        return not entry.late
+    def _note(self, variable: Variable, _changed: bool, _now: int) -> None:
+        entry = variable.entry
+        self.downloads.append((entry.index, entry.sub, variable.encode(variable.value)))
 
 
 class Bench(Heard):
@@ -92,8 +57,8 @@ class Bench(Heard):
 
     def __init__(self, segment_ns: int = 0) -> None:
         super().__init__()
-        self.objects = Dictionary()
-        self.server = SdoServer(cast(Any, self.objects), self._sent, segment_ns)
+        self.objects = Objects()
+        self.server = SdoServer(self.objects, self._sent, segment_ns)
         self.now = 0
         self.answers: list[bytes] = []
         """Those of the last request, and what followed it."""
@@ -130,32 +95,17 @@ class Bench(Heard):
             case "<-", _:
                 self.request(bytes_of(rest))
             case "written", _:
-                texts = [
-                    f"{index:04X}:{sub:02X}={data.hex().upper()}"
-                    for index, sub, data in self.objects.written
-                ]
+                found = self.objects.downloads
+                texts = [f"{at:04X}:{sub:02X}={data.hex().upper()}" for at, sub, data in found]
                 return " ".join(["written", *texts])
-            case "checks", _:
-                return " ".join(
-                    [
-                        "checks",
-                        *(
-                            f"{index:04X}:{sub:02X}={size}"
-                            for index, sub, size in self.objects.checks
-                        ),
-                    ]
-                )
-            case "uploads", _:
-                return f"uploads {self.objects.uploads}"
             case "server", _:
                 return f"server {'busy' if self.server.busy else 'idle'}"
             case "deadline", _:
                 due = self.server.due
                 return f"deadline {'none' if due == NEVER else ms(due)}"
             case "value", [place, "=", *data]:
-                self.objects.entries[int(place[:4], 16), int(place[5:], 16)].value = bytes_of(
-                    " ".join(data)
-                )
+                variable = self.objects.find(int(place[:4], 16), int(place[5:], 16))
+                variable.value = bytes_of(" ".join(data))
             case "reset", []:
                 self.server.reset()
             case "confirm", []:

@@ -47,12 +47,8 @@ def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
     bench.put(0, "01 00")
     for number in range(60):
         bench.wait(10)
-        bench.uart(
-            live(
-                battery_voltage=2000 + number,
-                operating_errors=(0, 1 << 17, 1 | 1 << 17, 0)[number // 15],
-            )
-        )
+        errors = (0, 1 << 17, 1 | 1 << 17, 0)[number // 15]
+        bench.uart(live(battery_voltage=2000 + number, operating_errors=errors))
         if number == 5:
             bench.uart(info(cell_count=6))
         if number % 7 == 0:
@@ -112,12 +108,9 @@ def problems(data: bytes, node_ids: tuple[int, ...] = (1,)) -> list[str]:
 
 
 def test_a_cob_id_of_emergencies_that_are_not_in_the_eds_is_taken() -> None:
-    data = without(
-        with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080").encode(), {0x1014}
-    )
-    assert (
-        "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in problems(data)[0]
-    )
+    text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080")
+    (said,) = problems(without(text.encode(), {0x1014}))
+    assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in said
 
 
 def test_a_default_pdo_that_maps_nothing_is_named() -> None:
@@ -125,9 +118,7 @@ def test_a_default_pdo_that_maps_nothing_is_named() -> None:
     check_eds(data, EscSettings())  # a board that ran so with 0.5.0 goes on
     setup = CanopenSetup(data, (NodeSettings(5),), (Stored(),), (EscSettings(),))
     (said,) = without_objects(setup.nodes(setup.esc_settings((EscSettings(),))))
-    assert said.startswith(
-        "TPDO 2 is never sent: 1A01h maps nothing, so 1801h:01 cannot be valid. "
-    )
+    assert said.startswith("TPDO 2 is never sent: 1A01h maps nothing, so 1801h:01 cannot be valid.")
 
 
 def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
@@ -135,25 +126,20 @@ def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
 
 
 def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
-    changed = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
-    check_eds(load(changed.encode(), "my.eds"), EscSettings(), [1])
-    assert (
-        "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3"
-        in problems(changed.encode(), (3,))[0]
-    )
+    text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F").encode()
+    check_eds(load(text, "my.eds"), EscSettings(), [1])
+    said = "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3"
+    assert said in problems(text, (3,))[0]
 
 
 def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
-    changed = with_key(
-        with_key(SHIPPED, "2100sub4", "DataType", "0x0005"), "2100sub4", "HighLimit", "0xFF"
-    )
-    changed = with_key(changed, "2100sub4", "DefaultValue", "0xFA")
-    eds = load(changed.encode(), "my.eds")
+    text = SHIPPED
+    for key, value in (("DataType", "0x0005"), ("HighLimit", "0xFF"), ("DefaultValue", "0xFA")):
+        text = with_key(text, "2100sub4", key, value)
+    eds = load(text.encode(), "my.eds")
     check_eds(eds, EscSettings())
-    with pytest.raises(
-        UserError,
-        match="2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says",
-    ):
+    said = "2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"
+    with pytest.raises(UserError, match=said):
         check_eds(eds, [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
 
 

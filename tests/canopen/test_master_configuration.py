@@ -47,40 +47,23 @@ def test_each_object_of_dcfgens_concise_dcf_is_accepted_and_the_pdos_are_what_th
     tmp_path: Path,
 ) -> None:
     (tmp_path / "bus.yml").write_text(BUS.format(eds=EDS))
-    command = [
-        sys.executable,
-        "-W",
-        "ignore",
-        "-c",
-        "from dcfgen.cli import main; main()",
-        "-d",
-        ".",
-    ]
-    subprocess.run([*command, "bus.yml"], cwd=tmp_path, check=True, capture_output=True)
+    program = ["-W", "ignore", "-c", "from dcfgen.cli import main; main()", "-d", ".", "bus.yml"]
+    subprocess.run([sys.executable, *program], cwd=tmp_path, check=True, capture_output=True)
     objects = list(concise((tmp_path / "left.bin").read_bytes()))
-    cob_ids = [
-        int.from_bytes(data, "little")
-        for index, sub, data in objects
-        if 0x1800 <= index < 0x1A00 and sub == 1
-    ]
-    assert cob_ids == [0x80000185, 0x185, 0x800001A0, 0x1A0, 0x80000680, 0x680], (
-        "bit 30 is 0 in all"
-    )
+    comm = [(sub, data) for index, sub, data in objects if 0x1800 <= index < 0x1A00]
+    cob_ids = [int.from_bytes(data, "little") for sub, data in comm if sub == 1]
+    wanted = [0x80000185, 0x185, 0x800001A0, 0x1A0, 0x80000680, 0x680]
+    assert cob_ids == wanted, "bit 30 is 0 in all"
 
     bench = Bench(node_ids=[5], changes=NO_HEARTBEAT)
     for index, sub, data in objects:
         assert bench.write(index, sub, data, node=5) is None, f"{index:04X}h:{sub:02X}"
-    assert [bench.number(0x1800 + n, 1, node=5) for n in (0, 1, 4)] == [0x185, 0x1A0, 0x680], (
-        "kept as written"
-    )
+    written = [bench.number(0x1800 + n, 1, node=5) for n in (0, 1, 4)]
+    assert written == [0x185, 0x1A0, 0x680], "kept as written"
     bench.start()
     bench.uart(live(battery_voltage=2442, operating_state=26, motor_current=3))
-    assert [(f.can_id, f.data[:3].hex()) for f in bench.take()] == [
-        (0x1A0, "030000"),
-        (0x385, "000000"),
-        (0x485, "000000"),
-        (0x680, "0201"),
-    ]
+    sent = [(frame.can_id, frame.data[:3].hex()) for frame in bench.take()]
+    assert sent == [(0x1A0, "030000"), (0x385, "000000"), (0x485, "000000"), (0x680, "0201")]
     bench.put(0x80, b"")
     assert [(f.can_id, f.data.hex()) for f in bench.take()] == [(0x185, "8a091a")]
     for cob_id in (0x185, 0x1A0, 0x680):
@@ -99,13 +82,8 @@ def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
 
     node = Wire(exchange).add_node(1, str(EDS))
     pdo = node.tpdo[5]
-    pdo.cob_id, pdo.enabled, pdo.rtr_allowed, pdo.trans_type, pdo.event_timer = (
-        0x1F1,
-        True,
-        True,
-        254,
-        100,
-    )
+    pdo.cob_id, pdo.trans_type, pdo.event_timer = 0x1F1, 254, 100
+    pdo.enabled = pdo.rtr_allowed = True
     pdo.add_variable(0x2000, 2)
     pdo.save()
     assert bench.number(0x1804, 1) == 0x1F1

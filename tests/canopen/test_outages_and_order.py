@@ -2,11 +2,9 @@
 
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import GATEWAY, LINK
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.transmit_queue import TransmitQueue
@@ -16,22 +14,11 @@ CRC_ERRORS = LINK << 16 | 0x0720
 SENT_FRAMES = GATEWAY << 16 | 0x0320
 
 
-def put_out(frames: list[CanFrame]) -> list[CanFrame]:
-    """As they leave a gateway whose interface was busy until now."""
-    waiting = TransmitQueue()
-    waiting.put_all(frames)
-    return waiting.take_all()
-
-
 def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
     """Only measurements are; SDO answers, emergencies and heartbeats of one id all go, in their order."""
     bench = Bench(changes=QUIET)
-    for request in (
-        "40 00 10 00 00 00 00 00",
-        "40 18 10 01 00 00 00 00",
-        "40 18 10 04 00 00 00 00",
-    ):
-        bench.put(0x601, request)
+    for place in ("00 10 00", "18 10 01", "18 10 04"):
+        bench.put(0x601, f"40 {place} 00 00 00 00")
     bench.uart(live(operating_errors=1))
     bench.uart(live())
     for command in (1, 2, 130):
@@ -39,14 +26,14 @@ def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
     bench.put(0x601, "40 00 10 00 00 00 00 00")
     frames = bench.take()
     assert [frame.can_id for frame in frames] == [0x581] * 3 + [0x81] * 2 + [0x701, 0x581]
-    assert put_out(frames) == frames
+    waiting = TransmitQueue()  # of a gateway whose interface was busy until now
+    waiting.put_all(frames)
+    assert waiting.take_all() == frames
 
 
 def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> None:
-    bench = Bench(
-        changes=QUIET,
-        stored=[Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})],
-    )
+    stored = Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})
+    bench = Bench(changes=QUIET, stored=[stored])
     assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
     for _ in range(3):
         bench.put(0, "82 01")
@@ -57,7 +44,7 @@ def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> No
 
 def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
     """Locks between gateways are taken while nothing has been sent yet."""
-    setup: CanopenSetup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
+    setup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
     gateway = Gateway([EscSettings(f"esc{n}") for n in range(3)], EMPTY, 0, canopen=setup)
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
     gateway.start(0)

@@ -1,6 +1,5 @@
 #!/bin/sh
 # Installs programs of others that tests/vcan/test_foreign_masters.py and tests/dronecan/test_foreign_reader.py use:
-#   zencan-cli  a master in Rust, by cargo             about 90 s, needs cargo and a C linker
 #   canopen     a master in JavaScript, by npm         about 10 s, needs node, npm, make, g++ and python3
 #   dronecan    a reader of DroneCAN in Rust, by cargo   about 20 s, needs cargo and a C linker
 #   tshark      Wireshark's decoder, from Debian       about 25 s, needs root or a sudo that asks nothing
@@ -11,7 +10,6 @@ set -u
 
 here=$(cd "$(dirname "$0")" && pwd)
 cache=$here/.cache
-zencan=0.0.5
 missing=0
 
 say() { echo "foreign masters: $*" >&2; }
@@ -28,16 +26,6 @@ quietly() {
 mkdir -p "$cache" || exit 1
 log=$(mktemp) || exit 1
 trap 'rm -f "$log"' EXIT
-
-# Not optimised: the tests wait for the bus, not for the master, and it builds in half the time.
-install_zencan() {
-    grep -qs "\"zencan-cli $zencan " "$cache/zencan/.crates.toml" && [ -x "$cache/zencan/bin/zencan-cli" ] && return
-    have cargo || { lacks "zencan-cli: no cargo: install Rust and run $0 again"; return; }
-    say "zencan-cli $zencan (cargo install)"
-    quietly env CARGO_PROFILE_RELEASE_OPT_LEVEL=0 CARGO_PROFILE_RELEASE_STRIP=true \
-        cargo install --locked --root "$cache/zencan" --version "$zencan" zencan-cli ||
-        lacks "zencan-cli: cargo install failed"
-}
 
 install_dronecan_reader() {
     target=$cache/dronecan_reader
@@ -83,6 +71,5 @@ install_tshark() {
 
 [ "${1:-}" = masters ] || install_tshark
 install_node_canopen
-install_zencan
 install_dronecan_reader
 exit $missing

@@ -30,7 +30,6 @@ from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
@@ -183,7 +182,7 @@ class BothSlots:
             if sum(map(bits_of, [*mapped, variable])) <= 64:
                 mapped.append(variable)
         times = (chance.choice((0, 0, 5, 20, 25)) * MS, chance.choice((0, 0, 7, 500)) * MS)
-        plan = compile_pdo(mapped, PROTOCOLS[0])
+        plan = compile_pdo(mapped)
         return SlotSettings(plan, chance.randrange(1, 0x700), chance.random() < 0.8, *times)
 
 

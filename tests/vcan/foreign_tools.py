@@ -1,4 +1,4 @@
-"""CANopen masters and a decoder of others, run as processes. tests/foreign/install.sh gets them."""
+"""A CANopen master and a decoder of others, run as processes. tests/foreign/install.sh gets them."""
 
 import json
 import os
@@ -16,7 +16,6 @@ from vcan_tools import LIMIT_S, Recorded
 
 FOREIGN = Path(__file__).resolve().parents[1] / "foreign"
 PACKAGES = FOREIGN / ".cache"
-ZENCAN = PACKAGES / "zencan" / "bin" / "zencan-cli"
 NODE_CANOPEN = PACKAGES / "node" / "node_modules" / "canopen"
 
 
@@ -24,29 +23,6 @@ def need(there: bool, what: str) -> None:
     """Skip a test whose foreign program was not to be had; the test run names it."""
     if not there:
         pytest.skip(f"{what} is not installed: run tests/foreign/install.sh")
-
-
-class Zencan:
-    """zencan-cli on an interface. It waits 150 ms for an answer, by a clock that is slower for it."""
-
-    def __init__(self, interface: str, folder: Path) -> None:
-        need(ZENCAN.exists() and shutil.which("cc") is not None, "zencan-cli or cc")
-        self._interface = interface
-        self._clock = folder / "slow_clock.so"
-        command = ["cc", "-shared", "-fPIC", "-o", str(self._clock), str(FOREIGN / "slow_clock.c")]
-        subprocess.run(command, check=True)
-
-    def __call__(self, command: str, slower: int = 200) -> str:
-        """What it prints for one command. It exits with 0 even when it reports an error."""
-        run = subprocess.run(
-            [str(ZENCAN), self._interface, "-c", command],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=4 * LIMIT_S,
-            env=os.environ | {"LD_PRELOAD": str(self._clock), "SLOWER": str(slower)},
-        )
-        return run.stdout.strip()
 
 
 class Refused(Exception):

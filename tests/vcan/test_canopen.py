@@ -1,14 +1,11 @@
-"""ESCs -> gateway process with two CANopen nodes, the DBC beside them -> vcan -> the canopen library as master.
+"""ESCs -> gateway process with two CANopen nodes, the DBC beside them -> vcan -> the canopen library as master."""
 
-One gateway serves most tests; each begins with its nodes reset.
-"""
-
-import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from encoding import Identity
-from vcan_tools import SERIAL, Chain, Master, Recorded, canopen_table, chain, wait_for
+from vcan_tools import Chain, Master, Recorded, canopen_table, chain, wait_for
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 
@@ -24,7 +21,7 @@ class Nodes:
 
     def __init__(self, run: Chain, master: Master) -> None:
         self.run, self.master, self.watch = run, master, run.watch
-        self.begin = 0
+        self.begin = len(run.watch.recorded)
 
     def of(self, can_id: int) -> list[Recorded]:
         """Frames since the test's beginning."""
@@ -32,15 +29,6 @@ class Nodes:
 
     def states(self, node: int) -> list[int]:
         return [frame.data[0] for frame in self.of(0x700 + node)]
-
-    def reset(self) -> None:
-        self.begin = len(self.watch.recorded)
-        for node in (1, 2):
-            self.master.node(node).nmt.state = "RESET"
-            wait_for(lambda node=node: BOOT_UP in self.states(node), "boot-up")  # type: ignore[misc]
-            self.master.write(node, *TIMEOUT, 60_000, 2)
-        self.run.catch_up()
-        self.begin = len(self.watch.recorded)
 
     def go(self, node: int, state: int) -> None:
         """Command a state and wait for the heartbeat that tells it."""
@@ -51,24 +39,19 @@ class Nodes:
         )
 
 
-@pytest.fixture(scope="module")
-def module_nodes(module_vcan: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
-    folder = tmp_path_factory.mktemp("nodes")
+@pytest.fixture
+def nodes(vcan: str, tmp_path: Path) -> Iterator[Nodes]:
     identities = Identity(1), Identity(2, Layout.LEGACY, cells=12)
     with (
-        chain(module_vcan, folder, *identities, toml=canopen_table(folder / "store")) as run,
-        Master(module_vcan) as master,
+        chain(vcan, tmp_path, *identities, toml=canopen_table(tmp_path / "store")) as run,
+        Master(vcan) as master,
         run.running() as gateway,
     ):
         wait_for(lambda: len(run.watch.boot_ups) == 2, "boot-ups")
+        for node in (1, 2):
+            master.write(node, *TIMEOUT, 60_000, 2)
         yield Nodes(run, master)
         assert gateway.end() == 0, gateway.log
-
-
-@pytest.fixture
-def nodes(module_nodes: Nodes) -> Nodes:
-    module_nodes.reset()
-    return module_nodes
 
 
 def test_heartbeats_and_nmt_commands(nodes: Nodes) -> None:
@@ -99,58 +82,3 @@ def test_heartbeats_and_nmt_commands(nodes: Nodes) -> None:
         wait_for(lambda begin=begin: BOOT_UP in nodes.states(1)[begin:], command)  # type: ignore[misc]
         assert (master.number(1, 0x1017), master.number(1, *TIMEOUT)) == (1000, kept), command
     assert BOOT_UP not in nodes.states(2), "the other node has not noticed"
-
-
-@pytest.mark.parametrize("at_sync", [False, True])
-def test_all_pdos_of_a_moment_show_one_frame(nodes: Nodes, at_sync: bool) -> None:
-    """(Each value of a PDO is judged besides: that it was sent by this ESC, and never an older one after a newer one.)"""
-    master = nodes.master
-    tpdo = master.node(1).tpdo
-    tpdo.read()  # type: ignore[no-untyped-call]
-    heard: list[tuple[int, ...]] = []
-    tpdo[1].add_callback(lambda pdo: heard.append(tuple(value.raw for value in pdo)))
-    for number in (1, 2, 3, 4):
-        tpdo[number].inhibit_time = tpdo[number].event_timer = 0
-        tpdo[number].trans_type = 1 if at_sync else 254
-        tpdo[number].save()
-    nodes.go(1, OPERATIONAL)
-    assert master.number(1, 0x1018, 4) == SERIAL  # after it no PDO comes that tells how it begins
-    nodes.run.catch_up()
-    ids = [pdo + 1 for pdo in (PDOS if at_sync else PDOS[:3])]
-    shown = []
-    held_up = nodes.run.held_up
-    for n in range(1, 21):
-        begin = len(nodes.watch.recorded)
-        nodes.run.feed(0)
-        if at_sync:
-            master.network.sync.transmit()
-
-        def came(begin: int = begin) -> list[Recorded]:
-            return [frame for frame in nodes.watch.recorded[begin:] if frame.can_id in ids]
-
-        wait_for(
-            lambda came=came: [f.can_id for f in came()] == ids or nodes.run.held_up > held_up,  # type: ignore[misc]
-            f"the PDOs of frame {n}",
-        )
-        if nodes.run.held_up > held_up:
-            return  # what waited to be sent was dropped and made anew
-        fed = nodes.run.escs[0]
-        sent = fed.live(len(fed.sent) - 1)
-        one, two, three, *_ = (frame.data for frame in came())
-        assert struct.unpack("<IHh", one) == (
-            sent.electrical_speed,
-            sent.battery_voltage,
-            sent.battery_current,
-        )
-        assert struct.unpack("<hhH", two[:6]) == (
-            sent.motor_current,
-            sent.peak_current,
-            sent.consumed_charge,
-        )
-        assert struct.unpack("<HHH", three[:6]) == (
-            sent.bec_voltage,
-            sent.pwm_input,
-            sent.bec_current,
-        )
-        shown.append((sent.electrical_speed, sent.battery_voltage, sent.battery_current))
-    wait_for(lambda: heard[-20:] == shown, "the library hears them too")

@@ -1,10 +1,9 @@
-"""CANopen masters of others (zencan-cli in Rust, canopen for node in JavaScript) against the gateway; tshark decodes what they said.
+"""A CANopen master of others (canopen for node, in JavaScript) against the gateway; tshark decodes what they said.
 
-They come from tests/foreign/install.sh; none of them shares code with the gateway or with its usual test master.
+It comes from tests/foreign/install.sh and shares no code with the gateway or with its usual test master.
 """
 
 import itertools
-import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -17,7 +16,6 @@ from foreign_tools import (
     NODE_CANOPEN,
     NodeMaster,
     Refused,
-    Zencan,
     has_tshark,
     need,
     tshark,
@@ -44,7 +42,6 @@ LOSS_MS = 10_000
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 # CiA 301 data types: bytes of a number; strings and domains have any length
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
-SAVE = int.from_bytes(b"save", "little")
 READ_ONLY, WRITE_ONLY = 0x06010002, 0x06010001
 NO_OBJECT, NO_SUB, TOO_HIGH, TOO_LOW = 0x06020000, 0x06090011, 0x06090031, 0x06090032
 TOO_LONG, NO_DATA, DEVICE_STATE = 0x06070012, 0x08000024, 0x08000022
@@ -54,17 +51,23 @@ def canopen_only(
     interface: str, run: Bench, folder: Path, node_id: int, timeout_ms: int = 60_000
 ) -> str:
     """A configuration with nodes and no DBC."""
-    parts = [
-        f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 500000\n[dbc]\nenabled = false\n'
-    ]
-    parts += [
-        f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{folder}"\n'
-    ]
-    parts += [
+    escs = "".join(
         f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ntelemetry_timeout_ms = {timeout_ms}\n'
         for port in run.ports
-    ]
-    return "\n".join(parts)
+    )
+    return f"""
+[can]
+interface = "socketcan"
+channel = "{interface}"
+bitrate = 500000
+[dbc]
+enabled = false
+[canopen]
+enabled = true
+node_id = {node_id}
+serial = {SERIAL}
+store = "{folder}"
+{escs}"""
 
 
 def start_nodes(
@@ -85,135 +88,6 @@ def sent_speeds(run: Bench, index: int = 0) -> set[tuple[int, int, int]]:
     return {(d.electrical_speed, d.battery_voltage, d.battery_current) for d in run.live(index)}
 
 
-# --- zencan-cli
-
-
-@pytest.fixture
-def zencan(vcan: str, tmp_path_factory: pytest.TempPathFactory) -> Zencan:
-    return Zencan(vcan, tmp_path_factory.mktemp("clock"))
-
-
-def test_zencan_scans_reads_writes_and_stores(
-    vcan: str, zencan: Zencan, start_gateway: Start, tmp_path: Path
-) -> None:
-    with bench(EscOptions(), EscOptions()) as run, Candump(vcan) as dump:
-        start_nodes(vcan, start_gateway, run, tmp_path, 5)
-        wait_for(lambda: len(dump.of(0x705)) >= 2 and len(dump.of(0x706)) >= 2, "heartbeats")
-
-        found = zencan("scan", slower=10)  # it waits for a dozen that are not there
-        assert re.findall(r"^Node (\d+):", found, re.MULTILINE) == ["5", "6"], found
-        for serial in (SERIAL, SERIAL + 1):
-            identity = (
-                f"vendor: 0, product: {PRODUCT:X}, revision: {REVISION:X}, serial: {serial:X}"
-            )
-            assert identity in found, found
-        assert found.count("Device Name: 'KONTRONIK ESC gateway'") == 2, found
-        assert "Unknown" not in re.sub("Unknown State", "", found), found
-
-        def read(index: int, sub: int, kind: str, node: int = 5) -> str:
-            return zencan(f"read {node} {index:#x} {sub} {kind}").removeprefix("Value: ")
-
-        assert read(0x1008, 0, "utf8") == "KONTRONIK ESC gateway"  # segmented
-        assert read(0x2101, 1, "u8") == "5"
-        assert read(0x2101, 1, "u8", node=6) == "6"
-        assert int(read(0x2000, 2, "u16")) in {data.battery_voltage for data in run.live(0)}
-        assert int(read(0x2000, 12, "i8")) in {data.power_stage_temperature for data in run.live(0)}
-
-        def refusal(command: str) -> str:
-            said = zencan(command)
-            assert re.search("[Ee]rror", said), said
-            return said.rsplit(" ", 1)[1]
-
-        assert refusal("read 5 0x2222 0") == "NoSuchObject"
-        assert refusal("read 5 0x2000 0x22") == "NoSuchSubIndex"
-        assert refusal("read 5 0x2102 1") == "WriteOnly"
-        assert refusal("write 5 0x2000 1 u32 1") == "ReadOnly"
-        assert refusal("write 5 0x2100 1 u8 0") == "ValueTooLow"
-        assert refusal("write 5 0x2100 1 u8 101") == "ValueTooHigh"
-        assert refusal("write 5 0x2100 1 u16 7") == "DataTypeMismatchLengthHigh"
-
-        assert zencan("write 5 0x2100 1 u8 14") == "Wrote 1 bytes"
-        assert read(0x2100, 1, "u8") == "14"
-        assert read(0x2100, 1, "u8", node=6) == "7"  # the other node's is its own
-        # zencan 0.0.5 has the letters of the signature in the wrong order ("evas"): nothing may be stored
-        assert refusal("save-objects 5") == "CantStore"
-        assert not list(tmp_path.rglob("*.params")), "stored without the signature"
-        assert zencan(f"write 5 0x1010 1 u32 {SAVE}") == "Wrote 4 bytes"
-        assert list(tmp_path.rglob("*")), "nothing was stored"
-        zencan("nmt reset-app 5")
-        wait_for(
-            lambda: len([f for f in dump.of(0x705) if f.data == b"\0"]) == 2, "a second boot-up"
-        )
-        assert read(0x2100, 1, "u8") == "14"
-        assert len([f for f in dump.of(0x706) if f.data == b"\0"]) == 1  # the other was not reset
-
-
-def test_zencan_switches_states_and_remaps_a_pdo(
-    vcan: str, zencan: Zencan, start_gateway: Start, tmp_path: Path
-) -> None:
-    new = tmp_path / "remap.toml"
-    new.write_text("""
-        [tpdo.4]
-        enabled = true
-        cob_id = 0x2F0
-        rtr_disabled = true
-        transmission_type = 254
-        mappings = [{ index = 0x2000, sub = 2, size = 16 }, { index = 0x2000, sub = 1, size = 32 }]
-
-        [[store]]
-        index = 0x1017
-        sub = 0
-        type = "u16"
-        value = 100
-    """)
-    with bench(EscOptions()) as run, Candump(vcan) as dump:
-        start_nodes(vcan, start_gateway, run, tmp_path, 9)
-
-        def last_state() -> int:
-            return dump.of(0x709)[-1].data[0]
-
-        wait_for(lambda: len(dump.of(0x709)) >= 2, "a heartbeat")
-        assert [frame.data[0] for frame in dump.of(0x709)][:2] == [BOOT_UP, PRE_OPERATIONAL]
-
-        assert zencan(f"load-config 9 {new}") == ""  # it only says what failed
-        wait_for(lambda: len(dump.of(0x709)) >= 10, "heartbeats each 100 ms")
-        seen = zencan("scan-pdo-config 9")
-        blocks = re.split(r"TPDO\d:", seen)[1:]
-        assert len(blocks) == 6, seen
-        assert "valid=true, COB=Std(0x189), transmission_type=254" in blocks[0], seen
-        assert "valid=true, COB=Std(0x2F0), transmission_type=254".lower() in blocks[4].lower(), (
-            seen
-        )
-        mapped = re.findall(r"index=(0x\w+), sub=(\d+), size=(\d+)", blocks[4])
-        assert mapped == [("0x2000", "2", "16"), ("0x2000", "1", "32")], seen
-        assert "valid=false" in blocks[5], seen
-
-        pdo_ids = {0x189, 0x289, 0x389, 0x489, 0x2F0}
-        assert not [frame for frame in list(dump.frames) if frame.can_id in pdo_ids], (
-            "a PDO while PRE-OPERATIONAL"
-        )
-        zencan("nmt start 9")
-        wait_for(lambda: last_state() == OPERATIONAL, "OPERATIONAL")
-        wait_for(lambda: len(dump.of(0x2F0)) >= 20 and len(dump.of(0x189)) >= 20, "PDOs")
-        zencan("nmt stop all")
-        wait_for(lambda: last_state() == STOPPED, "STOPPED")
-        assert "Timeout" in zencan("read 9 0x1000 0", slower=1)
-        count = len([frame for frame in list(dump.frames) if frame.can_id in pdo_ids])
-        before = len(dump.of(0x709))
-        wait_for(lambda: len(dump.of(0x709)) >= before + 5, "heartbeats while STOPPED")
-        assert len([frame for frame in list(dump.frames) if frame.can_id in pdo_ids]) == count
-
-        wanted = sent_speeds(run)
-        assert {struct.unpack("<IHh", frame.data) for frame in dump.of(0x189)} <= wanted
-        assert {struct.unpack("<HI", frame.data)[::-1] for frame in dump.of(0x2F0)} <= {
-            s[:2] for s in wanted
-        }
-
-        zencan("nmt reset-comms 9")
-        wait_for(lambda: last_state() == PRE_OPERATIONAL, "PRE-OPERATIONAL")
-        assert zencan("read 9 0x1017 0 u16") == "Value: 1000"  # not stored: the default again
-
-
 # --- canopen for node
 
 
@@ -222,6 +96,13 @@ def node_master(vcan: str) -> Iterator[NodeMaster]:
     need(NODE_CANOPEN.exists(), "canopen for node")
     with NodeMaster(vcan) as master:
         yield master
+
+
+def refusal(transfer: Callable[..., object], *arguments: object, **more: object) -> int | None:
+    """The code of a transfer that is refused."""
+    with pytest.raises(Refused) as refused:
+        transfer(*arguments, **more)
+    return refused.value.code
 
 
 def scanned(master: NodeMaster, serial: int) -> dict[str, int]:
@@ -243,38 +124,29 @@ def test_node_canopen_polls_every_object_of_the_eds(
         wait_for(lambda: bool(run.info(0)), "an info frame")
         objects = node_master("eds", file=str(EDS))
         assert len(objects) > 200
+        upload, download = node_master.upload, node_master.download
         for index, sub, name, data_type, access in objects:
             where = f"{index:04X}:{sub} {name}"
             if access == "wo":
-                with pytest.raises(Refused) as refused:
-                    node_master.upload(5, index, sub)
-                assert refused.value.code == WRITE_ONLY, where
+                assert refusal(upload, 5, index, sub) == WRITE_ONLY, where
                 continue
-            if index == 0x1003 and sub:
-                with pytest.raises(Refused) as refused:  # nothing has happened yet
-                    node_master.upload(5, index, sub)
-                assert refused.value.code == NO_DATA, where
+            if index == 0x1003 and sub:  # nothing has happened yet
+                assert refusal(upload, 5, index, sub) == NO_DATA, where
                 continue
-            got = node_master.upload(5, index, sub)
+            got = upload(5, index, sub)
             assert len(got) == SIZES.get(data_type, len(got)), f"{where}: {got.hex()}"
             if access in ("ro", "const"):
-                with pytest.raises(Refused) as refused:
-                    node_master.download(5, index, sub, got or b"\0")
-                assert refused.value.code == READ_ONLY, where
+                assert refusal(download, 5, index, sub, got or b"\0") == READ_ONLY, where
             if access == "const":
-                assert node_master.upload(5, index, sub, block=True) == got, where
+                assert upload(5, index, sub, block=True) == got, where
 
         known = {(index, sub) for index, sub, *_ in objects}
         indices = {index for index, _ in known}
         for index in sorted({neighbour for i in indices for neighbour in (i - 1, i + 1)} - indices):
-            with pytest.raises(Refused) as refused:
-                node_master.upload(5, index)
-            assert refused.value.code == NO_OBJECT, hex(index)
+            assert refusal(upload, 5, index) == NO_OBJECT, hex(index)
         for index in sorted(indices):
             sub = 1 + max(s for i, s in known if i == index)
-            with pytest.raises(Refused) as refused:
-                node_master.upload(5, index, sub)
-            assert refused.value.code == NO_SUB, (hex(index), sub)
+            assert refusal(upload, 5, index, sub) == NO_SUB, (hex(index), sub)
 
         file = EDS.read_bytes()
         assert node_master.upload(5, 0x1021, block=True) == file
@@ -291,16 +163,11 @@ def test_node_canopen_downloads_in_every_way(
         for value, block in ((11, False), (12, True)):
             node_master.download(5, 0x2100, 2, u32(value), block)
             assert node_master.upload(5, 0x2100, 2) == u32(value)
-        for data, code in (
-            (b"\0", TOO_LOW),
-            (b"\x65", TOO_HIGH),
-            (b"\1\2", TOO_LONG),
-            (b"\1\2\3\4\5\6", TOO_LONG),
-        ):
+        too_long = {b"\1\2": TOO_LONG, b"\1\2\3\4\5\6": TOO_LONG}
+        for data, code in {b"\0": TOO_LOW, b"\x65": TOO_HIGH, **too_long}.items():
             for block in (False, True):
-                with pytest.raises(Refused) as refused:
-                    node_master.download(5, 0x2100, 1, data, block)
-                assert refused.value.code == code, (data, block)
+                found = refusal(node_master.download, 5, 0x2100, 1, data, block)
+                assert found == code, (data, block)
         assert node_master.upload(5, 0x2100, 1) == b"\7"
         node_master.download(5, 0x1010, 1, b"save")
         assert list(tmp_path.rglob("*")), "nothing was stored"
@@ -326,10 +193,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
         wait_for(
             lambda: node_master.states(7) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat"
         )
-        ids = [
-            node_master("receivePdo", node=7, file=str(EDS), number=number)
-            for number in (1, 2, 3, 4)
-        ]
+        ids = [node_master("receivePdo", node=7, file=str(EDS), number=n) for n in (1, 2, 3, 4)]
         assert ids == [0x187, 0x287, 0x387, 0x487]
         assert not node_master.of("pdo")
         node_master("nmt", command="startNode", node=7)
@@ -346,9 +210,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
 
         run.stop()
         wait_for(lambda: len(node_master.of("emergency")) >= 3, "telemetry lost")
-        with pytest.raises(Refused) as refused:
-            node_master.upload(7, 0x2000, 1)
-        assert refused.value.code == DEVICE_STATE
+        assert refusal(node_master.upload, 7, 0x2000, 1) == DEVICE_STATE
         assert node_master.upload(7, 0x2020, 1)[0] & 0x3F == 4  # lost
         sent = run.live(0)
         counts = Counter(told["cob_id"] for told in node_master.of("pdo"))
@@ -399,9 +261,8 @@ def test_node_canopen_names_nodes_by_lss(
             ):
                 assert node_master("lss", command=name) == identity[field]
             for wrong in (0, 128, 254):
-                with pytest.raises(Refused) as refused:
-                    node_master("lss", command="configureNodeId", args=[wrong])
-                assert refused.value.code == 1, wrong
+                code = refusal(node_master, "lss", command="configureNodeId", args=[wrong])
+                assert code == 1, wrong
             node_master("lss", command="configureNodeId", args=[node_id])
             node_master("lss", command="storeConfiguration")
             node_master("waiting")
@@ -449,8 +310,7 @@ def test_tshark_reads_what_was_said(
             name = node_master.upload(0x55, 0x1008)
             assert node_master.upload(0x55, 0x1008, block=True) == name
             for index, sub in ((0x2222, 0), (0x2000, 0x22), (0x2102, 1)):
-                with pytest.raises(Refused):
-                    node_master.upload(0x55, index, sub)
+                refusal(node_master.upload, 0x55, index, sub)
             node_master.download(0x55, 0x2100, 2, u32(3))
             node_master.download(0x55, 0x2100, 2, u32(4), block=True)
             node_master("receivePdo", node=0x55, file=str(EDS), number=1)
@@ -472,19 +332,11 @@ def test_tshark_reads_what_was_said(
     def of(cob_id: int) -> list[SimpleNamespace]:
         return [f for f in frames if int(f.can_id, 0) == cob_id]
 
-    states = [int(f.state, 0) for f in of(0x755)]
-    assert [state for state, _ in itertools.groupby(states)] == [
-        BOOT_UP,
-        PRE_OPERATIONAL,
-        OPERATIONAL,
-        STOPPED,
-    ]
+    states = [state for state, _ in itertools.groupby(int(f.state, 0) for f in of(0x755))]
+    assert states == [BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED]
     assert [int(f.nmt_command, 0) for f in of(0)] == [1, 2]
-    aborts = [
-        (int(f.sdo_index, 0), int(f.sdo_sub, 0), int(f.sdo_abort, 0))
-        for f in of(0x5D5)
-        if is_abort(f)
-    ]
+    parts = [(f.sdo_index, f.sdo_sub, f.sdo_abort) for f in of(0x5D5) if is_abort(f)]
+    aborts = [tuple(int(part, 0) for part in each) for each in parts]
     assert aborts == [(0x2222, 0, NO_OBJECT), (0x2000, 0x22, NO_SUB), (0x2102, 1, WRITE_ONLY)]
     echoed = [f.sdo_abort for f in of(0x655) if is_abort(f)]
     assert len(echoed) == len(aborts), "the master returns an abort; one more would be its own"

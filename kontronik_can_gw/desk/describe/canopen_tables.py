@@ -8,9 +8,8 @@ from pathlib import PurePath
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.data_types import TYPE_NAMES
 from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.eds_object import Entry
-from kontronik_can_gw.canopen.eds_sections import Problems, read_sections
+from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.eds_sections import read_sections
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -66,12 +65,8 @@ def _pdos(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
                     "type": tpdo.type,
                     "inhibit_ms": number(Fraction(tpdo.inhibit_ns, MS)),
                     "event_ms": number(Fraction(tpdo.event_ns, MS)),
-                    "mapped": [f"{_place(entry)} {entry.name}" for entry in entries],
+                    "mapped": [f"{entry.place} {entry.name}" for entry in entries],
                 }
-
-
-def _place(entry: Entry) -> str:
-    return f"{entry.index:04X}h:{entry.sub:02X}"
 
 
 def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
@@ -80,7 +75,7 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
     default = entry.default.decode("latin-1") if isinstance(entry.default, bytes) else entry.default
     name = eds.object_names[entry.index]
     return {
-        "object": _place(entry),
+        "object": entry.place,
         "name": entry.name if entry.name.startswith(name) else f"{name}: {entry.name}",
         "type": TYPE_NAMES[entry.data_type],
         "access": entry.access,
@@ -98,7 +93,7 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
 
 def _comments(eds: Eds) -> list[str]:
     """The lines of [Comments]."""
-    found = read_sections(eds.data, Problems(eds.name)).get("comments")
+    found = read_sections(eds.data, []).get("comments")
     keys = {} if found is None else found.values
     lines = {int(key[4:]): line for key, line in keys.items() if re.fullmatch(r"line\d+", key)}
     return [lines[n] for n in sorted(lines) if lines[n]]
