@@ -207,9 +207,6 @@ FORMS: dict[str, Callable[[bytes], list[str]]] = {
     "eds": eds,
     "dcf": dcf,
     "table": table,
-    "keys": lambda data: [
-        f"{key}: {_cell(value)}" for key, value in sorted(json.loads(data).items())
-    ],
     "last line": lambda data: data.decode("utf-8").splitlines()[-1:],
     "nothing": lambda data: [],
     "columns": lambda data: [

@@ -5,11 +5,9 @@ Names of files, or parts of them, restrict it: ``python tests/golden/record.py f
 
 import argparse
 import os
-import re
 import sys
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from difflib import unified_diff
 from pathlib import Path
 
@@ -45,49 +43,17 @@ def changes(file: Path, new: str) -> list[str]:
 
 
 def differences(file: Path, old: str, new: str) -> list[str]:
-    """The same of two texts for a file."""
-    if old == new:
-        return []
-    name = str(file.relative_to(HERE))
-    if file.parent.name == "commands":
-        return [f"{name}: {line}" for line in _in_cases(old, new)]
-    lines = [*_in_frames(old, new), *_in_lines(old.splitlines(), new.splitlines())]
-    return [f"{name}: {line}" for line in lines]
-
-
-def _in_frames(old: str, new: str) -> Iterator[str]:
-    """How many frames of which ids are gone or new."""
-    before, after = (
-        Counter(re.findall(r"^[\d.]+ -> \w+#.*", text, re.MULTILINE)) for text in (old, new)
-    )
-    for what, lines in (("gone", before - after), ("new", after - before)):
-        if lines:
-            ids = Counter(re.findall(r"-> (\w+)", " ".join(lines)))
-            counts = ", ".join(f"{can_id} {count}x" for can_id, count in ids.items())
-            yield f"{len(lines)} of {before.total()} frames are {what} ({counts})"
-
-
-def _in_lines(old: Sequence[str], new: Sequence[str]) -> Iterator[str]:
-    found = [
-        line
-        for line in unified_diff(old, new, n=0, lineterm="")
-        if not re.match(r"---|\+\+\+|@@", line)
-    ]
-    for line in found[:LINES]:
-        shown = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in line)
-        yield shown if len(shown) < 300 else shown[:297] + "..."
-    if len(found) > LINES:
-        yield f"... and {len(found) - LINES} more lines"
-
-
-def _in_cases(old: str, new: str) -> Iterator[str]:
+    """The same of two texts for a file: of each case its title, and lines."""
     before, after = commands.cases(old), commands.cases(new)
+    found = []
     for title in dict.fromkeys([*before, *after]):
-        if before.get(title) != after.get(title):
-            yield title
-            yield from (
-                f"    {line}" for line in _in_lines(before.get(title, []), after.get(title, []))
-            )
+        pair = before.get(title, []), after.get(title, [])
+        lines = [repr(line)[1:-1] for line in unified_diff(*pair, n=0, lineterm="")][3:]
+        if lines:
+            found.append(f"{file.relative_to(HERE)}: {title}")
+            found += [f"    {line[:300]}" for line in lines[:LINES]]
+            found += [f"    ... and {len(lines) - LINES} more lines"] * (len(lines) > LINES)
+    return found
 
 
 def main() -> int:

@@ -49,8 +49,7 @@ def test_what_is_golden_is_right(file: Path) -> None:
     [
         ("flights/v4.txt", "-> 688#000000C0", "-> 688#000000BF"),  # a voltage of 10 mV less
         ("flights/v4.txt", "-> 688#", "-> 698#"),
-        ("dialogues/sdo.txt", "2000:03 = CBFF", "2000:03 = CBFE"),
-        ("commands/decode.txt", "battery_voltage: 24.96*7 ", "battery_voltage: 24.96*6 "),
+        ("dialogues/sync_of_three.txt", "-> 382#581F", "-> 382#591F"),
     ],
 )
 def test_the_judge_sees_what_is_wrong(tmp_path: Path, name: str, old: str, new: str) -> None:
@@ -62,29 +61,12 @@ def test_the_judge_sees_what_is_wrong(tmp_path: Path, name: str, old: str, new: 
     assert judge.judge(file).wrong
 
 
-def test_a_change_is_said_in_words(tmp_path: Path) -> None:
-    old = "0.100 -> 688#0102\n0.200 -> 688#0304\n0.300 -> 690#00\n0.400 - \n"
-    new = "0.100 -> 688#0102\n0.200 -> 688#0305\n0.301 -> 690#00\n0.350 -> 701#05\n0.400 -\n"
-    file = record.HERE / "flights/none.txt"
+def test_a_change_is_said_in_words() -> None:
+    old = "## one\n$ check\n! old\n=> 2\n\n## two\n$ check\n=> 0\n"
+    file = record.HERE / "commands/none.txt"
     assert record.differences(file, old, old) == []
-    assert record.differences(file, old, new) == [
-        "flights/none.txt: 2 of 3 frames are gone (688 1x, 690 1x)",
-        "flights/none.txt: 3 of 3 frames are new (688 1x, 690 1x, 701 1x)",
-        "flights/none.txt: -0.200 -> 688#0304",
-        "flights/none.txt: -0.300 -> 690#00",
-        "flights/none.txt: -0.400 - ",
-        "flights/none.txt: +0.200 -> 688#0305",
-        "flights/none.txt: +0.301 -> 690#00",
-        "flights/none.txt: +0.350 -> 701#05",
-        "flights/none.txt: +0.400 -",
-    ]
-    case = "## one\n$ check\n! old\n=> 2\n\n## two\n$ check\n=> 0\n"
-    found = record.differences(record.HERE / "commands/none.txt", case, case.replace("old", "new"))
-    assert found == [
-        "commands/none.txt: one",
-        "commands/none.txt:     -! old",
-        "commands/none.txt:     +! new",
-    ]
+    found = record.differences(file, old, old.replace("old", "new"))
+    assert found == ["commands/none.txt: one", "    -! old", "    +! new"]
 
 
 def test_only_the_adapter_knows_the_product() -> None:

@@ -1,14 +1,10 @@
-"""A loop that turns in C, with pseudo terminals and a local socket: what it records, replayed by the core in Python, gives what it sent."""
+"""A loop that turns in C, with a kernel that is played: what it records, replayed by the core in Python, gives what it sent."""
 
 import logging
-import os
 import random
-import socket
 import struct
-import threading
-import time
-import tty
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,7 +21,6 @@ from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import Replay
-from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -34,22 +29,9 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
 from kontronik_can_gw.output import NEVER, Output
-from kontronik_can_gw.runtime import can_link
-from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.native_poller import NativePoller
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
-
-_HEAD = struct.Struct("=IBBBB")
-
-
-class LocalBus(socket.socket):
-    """One end of a local socket pair, which has no options of CAN."""
-
-    def setsockopt(self, *_: object) -> None:
-        pass
 
 
 def _nodes(escs: Sequence[EscSettings], wanted: bool) -> CanopenSetup | None:
@@ -61,172 +43,42 @@ def _nodes(escs: Sequence[EscSettings], wanted: bool) -> CanopenSetup | None:
     return CanopenSetup(shipped_eds(), settings, (Stored(),) * count, tuple(escs))
 
 
-class World:
-    """A loop with recorder, its ESCs' wires, and what comes out.
+ESCS = (EscSettings("esc1"),)
 
-    ``is_slow``: the bus takes what is sent only now and then. ``has_nodes``: each ESC has a CANopen node.
-    """
+
+class InC:
+    """A loop that turns in C, in a played world. ``turns``: when the loop itself turned."""
 
     def __init__(
-        self, seed: int, is_slow: bool, monkeypatch: pytest.MonkeyPatch, has_nodes: bool = False
+        self,
+        patch: pytest.MonkeyPatch,
+        layout: Layout | None = None,
+        escs: Sequence[EscSettings] = ESCS,
+        **more: Any,
     ) -> None:
-        self.chance = chance = random.Random(seed)
-        self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
-        self.layout = layout(chance, self.escs)
-        self.is_slow = is_slow
-        pairs = [os.openpty() for _ in self.escs]
-        for _, terminal in pairs:
-            tty.setraw(terminal)
-        self.wires = [wire for wire, _ in pairs]
-        self.entries: list[Entry] = []
-        ours, self.bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 if is_slow else 1 << 20)
-        port = LocalBus(fileno=ours.detach())
-        monkeypatch.setattr(can_link, "open_can", lambda _: SocketCanPort(port, port.close))
-        self.canopen = _nodes(self.escs, has_nodes)
-        begun = time.monotonic_ns()
-        arguments = (self.escs, self.layout, begun)
-        self.gateway = RecordedGateway(self.put, *arguments, canopen=self.canopen)
-        self.begun = self.gateway.status.started_ns
-        self.poller = NativePoller(self.gateway)
-        ports = [os.ttyname(terminal) for _, terminal in pairs]
-        self.loop = Loop(self.gateway, ports, CanConfig(channel="lo", fd=True), poller=self.poller)
-        if not is_slow:  # then nothing is dropped, however slow the machine is
-            monkeypatch.setattr(self.loop.can.transmitter, "max_turn_ns", lambda: 3600 * SECOND)
-        for _, terminal in pairs:
-            os.close(terminal)
-        self.received: list[tuple[int, bytes]] = []
-
-    def put(
-        self, now: int, kind: int, esc: int, data: bytes, flags: int, came: int | None = None
-    ) -> None:
-        self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
-
-    def feed(self, turns: int) -> None:
-        """Bytes of all ESCs in pieces of any size, at any time, until there were ``turns`` turns in C; then the wires are cut."""
-        chance = self.chance
-        data = dict.fromkeys(self.wires, b"")
-        for _ in range(100_000):
-            if self.poller.count >= turns:
-                break
-            for wire, rest in data.items():
-                size = chance.choice((1, 10, 40, 40, 44, 80, 400))
-                rest = rest or stream(chance)
-                os.write(wire, rest[:size])
-                data[wire] = rest[size:]
-            time.sleep(chance.choice((0, 0, 0.0003, 0.002)))
-        for wire in self.wires:
-            os.close(wire)
-        self.loop.stop()
-
-    def receive(self) -> None:
-        while data := self.bus.recv(72):
-            can_id, length, *_ = _HEAD.unpack_from(data)
-            assert len(data) in (16, 72)
-            self.received.append((can_id, data[8 : 8 + length]))
-            if self.is_slow and self.chance.random() < 0.02:
-                time.sleep(0.01)
-
-    def run(self, turns: int) -> None:
-        threads = [
-            threading.Thread(target=self.receive),
-            threading.Thread(target=self.feed, args=(turns,)),
-        ]
+        patch.setenv(load.PURE, "0")
+        self.world = world = wire_world.World(len(escs))
+        self.loop = wire_world.loop_in(world, patch, escs, layout, **more)
+        self.bus, self.begun = world.bus, world.now
+        self.turns: list[int] = []
+        _count(patch, self.loop, "_serve", lambda: self.turns.append(world.now))
         self.loop.open()
-        for thread in threads:
-            thread.start()
-        self.loop.run()
-        for thread in threads:
-            thread.join()
-        self.bus.close()
+        self.loop.begin()
 
-    def replayed(self, monkeypatch: pytest.MonkeyPatch) -> list[CanFrame]:
-        monkeypatch.setenv(load.PURE, "1")
-        load.library.cache_clear()
-        gateway = Gateway(self.escs, self.layout, self.begun, canopen=self.canopen)
-        assert gateway.core.language == "Python"
-        replay = Replay(gateway)
-        frames = [timed.frame for timed in replay.follow(self.entries)]
-        assert replay.rejected == 0
-        return frames
+    def feed(self, frames: Iterable[LiveData]) -> None:
+        """Each 10 ms one, from the beginning on."""
+        for n, data in enumerate(frames):
+            wire = encode(data, WireLayout.V4)
+            self.world.wires[0].put(wire, [self.begun + n * 10 * MS] * len(wire))
 
+    def run(self, seconds: float) -> None:
+        """Until so long after the beginning."""
+        wire_world.run(self.loop, self.world, self.begun + round(seconds * SECOND))
 
-@pytest.fixture(autouse=True)
-def _core_in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.delenv(load.PURE, raising=False)
-    library = load.library
-    library.cache_clear()
-    if library()[0] is None:
-        pytest.skip(f"the core in C: {library()[1]}")
-    yield
-    library.cache_clear()
-
-
-def on_the_wire(frames: Sequence[CanFrame]) -> list[tuple[int, bytes]]:
-    return [(f.can_id | (EXTENDED if f.extended else 0), f.data) for f in frames]
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_what_is_sent_is_what_a_replay_in_python_sends(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world = World(seed, False, monkeypatch)
-    world.run(200)
-    assert world.poller.count >= 200
-    assert world.received == on_the_wire(world.replayed(monkeypatch))
-    assert len(world.received) == world.gateway.status.sent_frames > 0
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_with_nodes_too_what_is_sent_is_what_a_replay_in_python_sends(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nearly each live frame has other error bits. Order within an id: queue and slots take turns in Python's transmit queue."""
-    world = World(seed, False, monkeypatch, has_nodes=True)
-    world.run(300)
-    replayed = on_the_wire(world.replayed(monkeypatch))
-    for can_id in {number for number, _ in replayed}:
-        received = [data for number, data in world.received if number == can_id]
-        assert received == [data for number, data in replayed if number == can_id]
-    assert len(world.received) == len(replayed) == world.gateway.status.sent_frames
-    assert sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed) > 500
-
-
-@pytest.mark.parametrize("has_nodes", [True, False])
-def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebody_wants_it(
-    has_nodes: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The loop comes round for housekeeping, and heartbeats; an emergency goes in front of what the core sends in its turn."""
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    escs = (EscSettings("esc1"),)
-    loop = wire_world.loop_in(world, monkeypatch, escs, canopen=_nodes(escs, has_nodes))
-    events: list[int] = []
-    turns: list[int] = []
-    _count(monkeypatch, loop._poller, "_follow", lambda: events.append(_found(loop)))
-    _count(monkeypatch, loop, "_serve", lambda: turns.append(world.now))
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    for n in range(400):
-        frame = encode(LiveData(operating_errors=n // 2 % 2 << 20), WireLayout.V4)
-        wire.put(frame, [begun + n * 10 * MS] * len(frame))
-    wire_world.run(loop, world, begun + 4 * SECOND)
-    assert len(turns) < 4 * 4
-    states = [found for found in events if found & Event.STATE]
-    emergencies = [(at, f) for at, f in world.bus.sent if f.can_id == EMERGENCY + 1]
-    assert len(emergencies) == (199 if has_nodes else 0)
-    assert (len(states) > 150) if has_nodes else not states
-    for at, _ in emergencies:
-        together = [frame.can_id for when, frame in world.bus.sent if when == at]
-        assert together[0] in (EMERGENCY + 1, HEARTBEAT + 1)
-        assert len(together) > 1
-    loop.close()
-
-
-def _found(loop: Loop) -> int:
-    found: int = loop._poller._turns.state.found  # type: ignore[attr-defined]
-    return found & 0xFF
+    def fill_bus(self, frame_ns: int) -> None:
+        self.bus.frame_ns = frame_ns
+        while self.bus.send(CanFrame(0x100, b"")) is Sent.OK:
+            pass
 
 
 def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], None]) -> None:
@@ -240,6 +92,108 @@ def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], 
     patch.setattr(of, name, noted)
 
 
+class Recorded(InC):
+    """One that is recorded, with random ESCs, layout and bytes. ``has_nodes``: each ESC has a CANopen node."""
+
+    def __init__(self, seed: int, patch: pytest.MonkeyPatch, has_nodes: bool = False) -> None:
+        chance = random.Random(seed)
+        self.entries: list[Entry] = []
+        self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
+        self.layout = layout(chance, self.escs)
+        self.canopen = _nodes(self.escs, has_nodes)
+        patch.setattr(wire_world, "Gateway", partial(RecordedGateway, self._put))
+        super().__init__(patch, self.layout, self.escs, canopen=self.canopen)
+        self.status = self.loop.gateway.status
+        for wire in self.world.wires:
+            at = self.begun
+            while at < self.begun + 2 * SECOND:
+                data = stream(chance)
+                step = chance.choice(
+                    (0, wire_world.NS_PER_BYTE)
+                )  # handed over at once, or as on the wire
+                wire.put(data, [at + n * step for n in range(1, len(data) + 1)])
+                at += len(data) * wire_world.NS_PER_BYTE
+                at += chance.choice((0, MS, 6 * MS, 6 * MS, 6 * MS, 300 * MS))
+
+    def _put(
+        self, now: int, kind: int, esc: int, data: bytes, flags: int, came: int | None = None
+    ) -> None:
+        self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
+
+    def sent(self) -> list[tuple[int, bytes]]:
+        """What the bus took, to the end."""
+        self.run(2.5)
+        self.loop.end()
+        assert len(self.bus.sent) == self.status.sent_frames
+        return on_the_wire(frame for _, frame in self.bus.sent)
+
+    def replayed(self, patch: pytest.MonkeyPatch) -> list[tuple[int, bytes]]:
+        patch.setattr(load, "library", lambda: (None, ""))
+        gateway = Gateway(self.escs, self.layout, self.begun, canopen=self.canopen)
+        assert gateway.core.language == "Python"
+        replay = Replay(gateway)
+        frames = [timed.frame for timed in replay.follow(self.entries)]
+        assert replay.rejected == 0
+        return on_the_wire(frames)
+
+
+@pytest.fixture(autouse=True)
+def _core_in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv(load.PURE, raising=False)
+    library = load.library
+    library.cache_clear()
+    if library()[0] is None:
+        pytest.skip(f"the core in C: {library()[1]}")
+    yield
+    library.cache_clear()
+
+
+def on_the_wire(frames: Iterable[CanFrame]) -> list[tuple[int, bytes]]:
+    return [(f.can_id | (EXTENDED if f.extended else 0), f.data) for f in frames]
+
+
+@pytest.mark.parametrize("has_nodes", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_sent_is_what_a_replay_in_python_sends(
+    seed: int, has_nodes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With nodes, order within an id: queue and slots take turns in Python's transmit queue. Nearly each frame has other error bits."""
+    it = Recorded(seed, monkeypatch, has_nodes)
+    sent, replayed = it.sent(), it.replayed(monkeypatch)
+    assert it.loop._poller.count > 100 > len(it.turns)  # type: ignore[attr-defined]
+    assert len(sent) == len(replayed) > 0
+    if not has_nodes:
+        assert sent == replayed
+    for can_id in {number for number, _ in replayed}:
+        received = [data for number, data in sent if number == can_id]
+        assert received == [data for number, data in replayed if number == can_id]
+    emergencies = sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed)
+    assert (emergencies > 100) == has_nodes
+
+
+@pytest.mark.parametrize("has_nodes", [True, False])
+def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebody_wants_it(
+    has_nodes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop comes round for housekeeping, and heartbeats; an emergency goes in front of what the core sends in its turn."""
+    it = InC(monkeypatch, canopen=_nodes(ESCS, has_nodes))
+    poller: Any = it.loop._poller
+    events: list[int] = []
+    _count(monkeypatch, poller, "_follow", lambda: events.append(poller._turns.state.found))
+    it.feed(LiveData(operating_errors=n // 2 % 2 << 20) for n in range(400))
+    it.run(4)
+    assert len(it.turns) < 4 * 4
+    states = [found for found in events if found & Event.STATE]
+    emergencies = [(at, f) for at, f in it.bus.sent if f.can_id == EMERGENCY + 1]
+    assert len(emergencies) == (199 if has_nodes else 0)
+    assert (len(states) > 150) if has_nodes else not states
+    for at, _ in emergencies:
+        together = [frame.can_id for when, frame in it.bus.sent if when == at]
+        assert together[0] in (EMERGENCY + 1, HEARTBEAT + 1)
+        assert len(together) > 1
+    it.loop.close()
+
+
 class Beacon(Output):
     """A measurement of its own each 20 ms: the newest wins, unless it is ``queued``."""
 
@@ -247,8 +201,7 @@ class Beacon(Output):
 
     def __init__(self, queued: bool) -> None:
         super().__init__()
-        self.due = 0
-        self.count = 0
+        self.due = self.count = 0
         self._queued = queued
 
     def next_deadline(self) -> int:
@@ -266,33 +219,20 @@ def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
     queued: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With telemetry and without; on a full bus what is queued waits, of what is not the newest alone."""
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    escs = (EscSettings("esc1"),)
     beacon = Beacon(queued)
-    loop = wire_world.loop_in(world, monkeypatch, escs, further=[lambda *_: beacon])
-    turns: list[int] = []
-    _count(monkeypatch, loop, "_serve", lambda: turns.append(world.now))
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    for n in range(300):
-        frame = encode(LiveData(consumed_charge=n), WireLayout.V4)
-        wire.put(frame, [begun + n * 10 * MS] * len(frame))
-    wire_world.run(loop, world, begun + 5 * SECOND)
-    sent = [(at, f) for at, f in world.bus.sent if f.can_id == 0x700]
-    assert [f.data for _, f in sent] == [struct.pack("<I", 1 + n) for n in range(len(sent))]
+    it = InC(monkeypatch, further=[lambda *_: beacon])
+    it.feed(LiveData(consumed_charge=n) for n in range(300))
+    it.run(5)
+    sent = [f.data for _, f in it.bus.sent if f.can_id == 0x700]
+    assert sent == [struct.pack("<I", 1 + n) for n in range(len(sent))]
     assert 200 < len(sent) == beacon.count <= 251
-    assert len(turns) < 5 * 4
-    world.bus.frame_ns = 300 * MS
-    while world.bus.send(CanFrame(0x100, b"")) is Sent.OK:
-        pass
-    wire_world.run(loop, world, begun + 5500 * MS)
-    waiting = [f for f in loop.can.transmitter.queue.in_order() if f.can_id == 0x700]
+    assert len(it.turns) < 5 * 4
+    it.fill_bus(300 * MS)
+    it.run(5.5)
+    waiting = [f for f in it.loop.can.transmitter.queue.in_order() if f.can_id == 0x700]
     assert waiting[-1].data == struct.pack("<I", beacon.count)
-    assert (len(waiting) > 10) == queued
-    assert len(waiting) == 1 or queued
-    loop.close()
+    assert len(waiting) > 10 if queued else len(waiting) == 1
+    it.loop.close()
 
 
 def test_a_foreign_frame_with_our_id_is_over_after_ten_seconds_between_turns_in_c(
@@ -300,85 +240,60 @@ def test_a_foreign_frame_with_our_id_is_over_after_ten_seconds_between_turns_in_
 ) -> None:
     """No output has a deadline of its own; the next one is a new one, which is said."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    loop = wire_world.loop_in(world, monkeypatch)
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    wire.stream(begun, begun + 40 * SECOND, 10 * MS)
-    conflicts = loop.gateway.conflicts
+    it = InC(monkeypatch)
+    it.world.wires[0].stream(it.begun, it.begun + 40 * SECOND, 10 * MS)
+    conflicts = it.loop.gateway.conflicts
     for came in (1, 25):
-        world.bus.came(0x100, bytes(8), begun + came * SECOND)
-        wire_world.run(loop, world, begun + (came + 9) * SECOND)
+        it.bus.came(0x100, bytes(8), it.begun + came * SECOND)
+        it.run(came + 9)
         assert conflicts.next_deadline() < NEVER
-        wire_world.run(loop, world, begun + (came + 11) * SECOND)
+        it.run(came + 11)
         assert conflicts.next_deadline() == NEVER
-    wire_world.run(loop, world, begun + 39 * SECOND)
-    said = [
-        r.getMessage().split(": ")[2].split()[0]
-        for r in caplog.records
-        if "else sends" in r.getMessage()
-    ]
+    it.run(39)
+    texts = [record.getMessage() for record in caplog.records]
+    said = [text.split(": ")[2].split()[0] for text in texts if "else sends" in text]
     assert said == ["somebody", "nobody", "somebody", "nobody"]
-    loop.close()
+    it.loop.close()
 
 
 def test_the_kernel_is_asked_for_the_interface_each_second_between_turns_in_c(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    loop = wire_world.loop_in(world, monkeypatch)
-    loop.open()
-    loop.begin()
+    it = InC(monkeypatch)
     asked: list[int] = []
 
     def ask(now: int) -> None:
         asked.append(now)
-        loop.can.controller.due = now + SECOND
+        it.loop.can.controller.due = now + SECOND
 
-    monkeypatch.setattr(loop.can, "ask", ask)
-    loop.can.controller.due = world.now
-    begun = world.now
-    world.wires[0].stream(begun, begun + 10 * SECOND, 10 * MS)
-    wire_world.run(loop, world, begun + 10 * SECOND)
-    gaps = [later - at for at, later in pairwise([begun, *asked, world.now])]
+    monkeypatch.setattr(it.loop.can, "ask", ask)
+    it.loop.can.controller.due = it.begun
+    it.world.wires[0].stream(it.begun, it.begun + 10 * SECOND, 10 * MS)
+    it.run(10)
+    gaps = [later - at for at, later in pairwise([it.begun, *asked, it.world.now])]
     assert max(gaps) <= 1600 * MS
     assert len(asked) < 12
-    loop.close()
+    it.loop.close()
 
 
 def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_is_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """That the bus took nothing counts from then on: it is no stall, and nothing is lost."""
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    escs = (EscSettings("esc1"),)
-    nothing = Layout("", "", ())
-    loop = wire_world.loop_in(world, monkeypatch, escs, nothing, canopen=_nodes(escs, True))
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    for n in range(600):
-        frame = encode(LiveData(operating_errors=(n >= 530) << 20), WireLayout.V4)
-        wire.put(frame, [begun + n * 10 * MS] * len(frame))
-    wire_world.run(loop, world, begun + SECOND)
-    assert 0x181 in dict(world.bus.take())
-    world.bus.came(0, b"\x80\x01")  # pre-operational: heartbeats and emergencies remain
-    wire_world.run(loop, world, begun + 5295 * MS)  # between two heartbeats
-    world.bus.frame_ns = 30 * MS
-    while world.bus.send(CanFrame(0x700, b"")) is Sent.OK:
-        pass
-    wire_world.run(loop, world, begun + 6 * SECOND)
-    status, transmitter = loop.can._gateway.status, loop.can.transmitter
+    it = InC(monkeypatch, Layout("", "", ()), canopen=_nodes(ESCS, True))
+    it.feed(LiveData(operating_errors=(n >= 530) << 20) for n in range(600))
+    it.run(1)
+    assert 0x181 in dict(it.bus.take())
+    it.bus.came(0, b"\x80\x01")  # pre-operational: heartbeats and emergencies remain
+    it.run(5.295)  # between two heartbeats
+    it.fill_bus(30 * MS)
+    it.run(6)
+    status, transmitter = it.loop.gateway.status, it.loop.can.transmitter
     assert (transmitter.is_stalled, status.dropped_frames) == (False, 0)
-    (at,) = [
-        at for at, f in world.bus.sent if f.can_id == EMERGENCY + 1 and at > begun + 4 * SECOND
-    ]
-    assert at < begun + 5600 * MS
-    loop.close()
+    sent = [at - it.begun for at, f in it.bus.sent if f.can_id == EMERGENCY + 1]
+    (at,) = [at for at in sent if at > 4 * SECOND]
+    assert at < 5600 * MS
+    it.loop.close()
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -386,17 +301,16 @@ def test_where_the_bus_does_not_take_all_the_newest_values_are_sent(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was replaced is missing; nothing else comes, and nothing twice or in another order of its id."""
-    world = World(seed, True, monkeypatch)
-    world.run(200)
-    status = world.gateway.status
-    assert len(world.received) == status.sent_frames
-    replayed = on_the_wire(world.replayed(monkeypatch))
+    it = Recorded(seed, monkeypatch)
+    it.bus.frame_ns = 20 * MS
+    sent, replayed = it.sent(), it.replayed(monkeypatch)
     for can_id in {number for number, _ in replayed}:
         all_of_it = iter([data for number, data in replayed if number == can_id])
-        got = [data for number, data in world.received if number == can_id]
+        got = [data for number, data in sent if number == can_id]
         assert all(any(data == other for other in all_of_it) for data in got)
-    waiting = len(world.loop.can.transmitter.queue)
-    assert status.sent_frames + status.replaced_frames + waiting == len(replayed)
+    waiting = len(it.loop.can.transmitter.queue)
+    assert it.status.replaced_frames > 0
+    assert len(sent) + it.status.replaced_frames + waiting == len(replayed)
 
 
 @pytest.mark.extended
@@ -412,18 +326,14 @@ import os, pathlib, sys
 del os.environ["LD_PRELOAD"]  # the compiler needs none
 os.environ["KONTRONIK_PURE"] = "0"
 import pytest, native_world, sanitized, test_hold_ups, test_turns_in_c
-from kontronik_can_gw.native import binding, load
-
 patch = pytest.MonkeyPatch()
-plain = binding.load(pathlib.Path(sys.argv[1]))
-patch.setattr(load, "library", lambda: (plain, ""))
-for seed, is_slow, has_nodes in ((0, False, True), (1, True, False), (5, False, True)):
-    with pytest.MonkeyPatch.context() as each:
-        world = test_turns_in_c.World(seed, is_slow, each, has_nodes)
-        world.run(80)
-        print(len(world.received))
 faked = native_world.library(sanitized.SANITIZED)
 patch.setattr(native_world, "library", lambda: faked)
+for seed, frame_ns, has_nodes in ((0, 0, True), (1, 20_000_000, False), (5, 0, True)):
+    with pytest.MonkeyPatch.context() as each:
+        it = test_turns_in_c.Recorded(seed, each, has_nodes)
+        it.bus.frame_ns = frame_ns
+        print(len(it.sent()))
 hold_ups = test_hold_ups.test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true
 for seed in range(3):
     hold_ups.hypothesis.inner_test(seed, 60, 10, 0.05, seed % 2, seed % 3)
