@@ -129,8 +129,6 @@ def options_of(index: int, seconds: float) -> EscOptions:
     jive, kosmik = Device.JIVEPRO, Device.KOSMIK
     return EscOptions(
         device=kosmik if index % 2 == 0 else jive,
-        cell_count=CELLS,
-        capacity=1300 + 100 * index,
         faults=Faults(
             dropout=Dropout(2 * SECOND, min(400 * SECOND, int(length / 3.7)) + index * 7 * MS),
             errors=(
