@@ -1,19 +1,16 @@
 """``convert``: recordings to tables, CAN logs and plain bytes."""
 
 import argparse
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, number_from, option
 from kontronik_can_gw.cli.bus_layout import given_layout
-from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.progress import Progress
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
@@ -24,14 +21,12 @@ from kontronik_can_gw.desk.recordings.convert import (
     SUFFIXES,
     TABLES,
     Output,
-    reason,
     to_bytes,
     to_log,
     to_table,
 )
 from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, Input, open_input
 from kontronik_can_gw.desk.recordings.log_input import CanLogInput
-from kontronik_can_gw.desk.recordings.spool import is_stream, spooled
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -106,41 +101,23 @@ def main(args: argparse.Namespace, opened_by: Callable[..., Input] = open_input)
     form = _format(args)
     _check(args, form)
     try:
-        with _ended_by_signals():
+        with stopping_on_signals(_interrupt):
             _convert(args, form, opened_by)
-    except KeyboardInterrupt as end:
+    except KeyboardInterrupt:
         say("stopped: nothing is written" if args.output != "-" else "stopped", args.command)
-        return 143 if isinstance(end, _Ended) else 130
+        return 130
     return 0
 
 
-class _Ended(KeyboardInterrupt):
-    """SIGTERM, or the terminal was closed: it ends as by Ctrl-C."""
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """SIGTERM and SIGHUP leave no half file either; what is ignored (nohup) stays ignored."""
-
-    def end(_number: int, _frame: object) -> None:
-        raise _Ended
-
-    is_main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGTERM, signal.SIGHUP) if is_main else ()
-    changed = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
-    for number in changed:
-        signal.signal(number, end)
-    try:
-        yield
-    finally:
-        for number in changed:
-            signal.signal(number, signal.SIG_DFL)
+def _interrupt() -> None:
+    raise KeyboardInterrupt
 
 
 def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input]) -> None:
     target = None if args.output == "-" else Path(args.output)
     begun = time.monotonic()
-    with _opened(args, opened_by) as recording:
+    rate = args.live_rate or LIVE_RATE
+    with opened_by(Path(args.input), given_layout(args), rate) as recording:
         if args.live_rate is not None and not recording.times_assumed:
             raise UserError(
                 f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
@@ -148,13 +125,13 @@ def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input
         conversion = _conversion(args, form, recording)
         name, size = Path(args.input).name or recording.name, recording.size or None
         try:
-            with Progress(name, size, target is None) as progress, Output(target, form) as out:
+            with Progress(name, size, target is None) as progress, Output(target) as out:
                 summary = conversion(recording, out, progress.reach)
         except BrokenPipeError:
             raise
         except OSError as error:
             where = target or "standard output"
-            raise RunError(f"{where}: cannot be written: {reason(error)}.") from None
+            raise RunError(f"{where}: cannot be written: {error.strerror}.") from None
         _report(args, form, recording, summary, time.monotonic() - begun)
 
 
@@ -188,15 +165,6 @@ def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
     if not recording.others:
         return "nothing in it can be converted: it has no CAN frame."
     return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
-
-
-def _opened(args: argparse.Namespace, opened_by: Callable[..., Input]) -> Input:
-    """The recording; of a pipe with a bar while it is read into a file."""
-    source, layout, rate = Path(args.input), given_layout(args), args.live_rate or LIVE_RATE
-    if is_stream(source):
-        with Progress(f"reading {source}", None, args.output == "-") as progress:
-            source = spooled(source, progress.reach)
-    return opened_by(source, layout, rate)
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:

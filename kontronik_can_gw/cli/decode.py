@@ -4,7 +4,7 @@ import argparse
 
 from kontronik_can_gw.cli import convert, make_parser
 from kontronik_can_gw.cli.arguments import option
-from kontronik_can_gw.desk.recordings.bytes_input import BytesInput
+from kontronik_can_gw.desk.recordings.inputs import open_bytes
 
 OPTIONS = (
     option("FILE", "file of UART bytes, or - for standard input"),
@@ -23,4 +23,4 @@ def main(args: argparse.Namespace) -> int:
     form = "csv" if args.csv else "jsonl"
     given = make_parser(["convert"]).parse_args(["convert", "--to", form, "--", args.file, "-"])
     given.command = args.command
-    return convert.main(given, BytesInput)
+    return convert.main(given, open_bytes)

@@ -18,7 +18,7 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "A simulated ESC, the gateway, the canopen package as master of its node, and the monitor, which knows the DBC. "
+    "A simulated ESC, the gateway, a CANopen master that starts its node, and the monitor, which knows the DBC. "
     "Exit code: 0 at its end, 2 wrong usage. The same with ports and a bus: simulate, run, monitor."
 )
 
@@ -27,6 +27,6 @@ def main(args: argparse.Namespace) -> int:
     stop, end, bus = Event(), time.monotonic() + args.seconds, DemoBus(args.seed)
     monitor = Monitor(bus.bus)
     with stopping_on_signals(stop.set):
-        watch(bus, monitor, None, lambda: stop.is_set() or time.monotonic() >= end)
+        watch(bus, monitor, lambda: stop.is_set() or time.monotonic() >= end)
     say(f"{monitor.view.frames} CAN frames decoded")
     return 0

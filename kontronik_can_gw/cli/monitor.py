@@ -27,7 +27,6 @@ OPTIONS = (
     option("--speed FACTOR", "play FILE faster by this factor (0.01 to 1000, default 1)", type=number_from(0.01, 1000, "factor")),
     option("--once", "one line of JSON with everything, then end"),
     option("--timeout S", f"--once: maximum time to wait (default {_ONCE_S:g})", type=number_from(0.1, 3600)),
-    option("--interval S", "time between screens (default 0.15; lines: 1)", type=number_from(0.1, 3600)),
 )
 # fmt: on
 EPILOG = """\
@@ -66,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     with _source_of(args) as source, stopping_on_signals(stop.set):
         monitor = Monitor(source.bus)
         if not args.once:
-            watch(source, monitor, args.interval, stop.is_set)
+            watch(source, monitor, stop.is_set)
             count = monitor.view.frames
             say(f"{count} frames of {monitor.file} seen on {source.name}, none sent")
             return 0

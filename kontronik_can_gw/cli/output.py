@@ -27,9 +27,7 @@ def write_output(where: str, text: str, encoding: str = "utf-8") -> None:
 def _write_file(path: Path, data: bytes) -> None:
     try:
         with Output(path, what="-o") as out:
-            file = out.open()
-            assert not isinstance(file, Path)
-            file.write(data)
+            out.open().write(data)
             out.is_whole = True
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror}. Give another -o.") from None

@@ -15,8 +15,6 @@ from kontronik_can_gw.cli.terminals import terminals
 from kontronik_can_gw.desk.pty import run
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.esc.kontronik.simulator import (
-    FLIGHT,
-    IDLE,
     SECOND_NS,
     Device,
     Dropout,
@@ -80,8 +78,7 @@ OPTIONS = (
     "what ESC",
     option("--esc N", "number of ESCs, 1..1000 (default 1)", type=number_from(1, 1000, "number of ESCs", kind=int), default=1),
     option("--device", "default: kosmik, in the legacy layout jivepro", choices=tuple(_DEVICES)),
-    option("--layout", "mixed: odd ESCs v4, even ones legacy (default: legacy for jivepro, else v4)", choices=("v4", "legacy", "mixed")),
-    option("--idle", "the motor never runs (default: a repeating flight of 50 s)"),
+    option("--layout", "default: legacy for jivepro, else v4", choices=("v4", "legacy")),
     option("--seed N", "seed of all that is random (default 0)", type=int, default=0),
     "where to, and how long",
     option("--link PATH", "symbolic link to the pseudo terminal; {n} is the ESC's number, from 1"),
@@ -123,31 +120,22 @@ def main(args: argparse.Namespace) -> int:
         raise UserError(f"--out {args.out}: has no end. Give --seconds.")
     if args.out is not None and args.link is not None:
         raise UserError("--link: there is no pseudo terminal with --out. Give one of the two.")
-    escs = []
-    for index in range(args.esc):
-        chosen = _options(args, index + 1)
-        # spread over the period, since real ESCs are not synchronized
-        start_ns = chosen.period_ns * index // args.esc
-        escs.append(SimulatedEsc(chosen, seed=args.seed + index, start_ns=start_ns))
+    device = args.device or ("jivepro" if args.layout == "legacy" else "kosmik")
+    options = EscOptions(
+        device=_DEVICES[device],
+        layout=None if args.layout is None else Layout(args.layout),
+        faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
+    )
+    # spread over the period, since real ESCs are not synchronized
+    escs = [
+        SimulatedEsc(options, args.seed + index, options.period_ns * index // args.esc)
+        for index in range(args.esc)
+    ]
     if args.out is not None:
         _to_files(escs, args.out, args.seconds)
     else:
         _to_terminals(escs, args.link, args.seconds)
     return 0
-
-
-def _options(args: argparse.Namespace, number: int) -> EscOptions:
-    """Options of the ESC with this number, from 1."""
-    layout = args.layout
-    if layout == "mixed":
-        layout = "v4" if number % 2 else "legacy"
-    usual = "jivepro" if layout == "legacy" else "kosmik"
-    return EscOptions(
-        device=_DEVICES[args.device or usual],
-        layout=None if layout is None else Layout(layout),
-        profile=IDLE if args.idle else FLIGHT,
-        faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
-    )
 
 
 def _to_files(escs: list[SimulatedEsc], path: str, time_ns: int) -> None:
@@ -185,9 +173,11 @@ def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | Non
         def complain(index: int) -> None:
             """Report once that the gateway transmits to the ESC."""
             if index not in guilty:
-                guilty[index] = f"{names[index]} {opened[index].path}: "
-                said = f"the gateway transmits to the ESC: {opened[index].first_received.hex(' ')}"
-                print(f"ERROR: {guilty[index]}{said}", file=sys.stderr)
+                first = opened[index].first_received.hex(" ")
+                guilty[index] = (
+                    f"{names[index]} {opened[index].path}: the gateway transmits to the ESC: {first}"
+                )
+                print(f"ERROR: {guilty[index]}", file=sys.stderr)
 
         run(
             list(zip(escs, opened, strict=True)),
@@ -199,15 +189,8 @@ def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | Non
         for index, terminal in enumerate(opened):
             lost = terminal.dropped_bytes
             dropped = f", {lost} bytes dropped (nobody read)" if lost else ""
-            print(
-                f"{names[index]}: {frames[index]} frames, {intact[index]} of them intact{dropped}",
-                file=sys.stderr,
-            )
+            counts = f"{frames[index]} frames, {intact[index]} of them intact{dropped}"
+            print(f"{names[index]}: {counts}", file=sys.stderr)
     if guilty:
-        raise RunError(
-            *(
-                f"{where}{opened[index].received} bytes came from the gateway, beginning with "
-                f"{opened[index].first_received.hex(' ')}. Nothing may ever be sent to an ESC: turn echo and writing off."
-                for index, where in sorted(guilty.items())
-            )
-        )
+        remedy = "Nothing may ever be sent to an ESC: turn echo and writing off."
+        raise RunError(*(f"{guilty[index]}. {remedy}" for index in sorted(guilty)))

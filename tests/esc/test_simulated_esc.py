@@ -19,7 +19,6 @@ from kontronik_can_gw.esc.kontronik import (
 )
 from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,
-    IDLE,
     Dropout,
     ErrorWindow,
     EscOptions,
@@ -59,9 +58,6 @@ any_options = st.builds(
     EscOptions,
     device=st.sampled_from(Device),
     layout=st.sampled_from([None, *Layout]),
-    cell_count=st.integers(1, 100),
-    capacity=st.integers(100, 50_000),
-    max_current=st.floats(1, 600),
     period_ns=st.integers(1_000_000, 10 * S),
     info_every=st.integers(0, 20),
     profile=st.lists(phases, min_size=1, max_size=6).map(tuple),
@@ -160,7 +156,8 @@ def test_error_bits_are_set_when_asked_and_only_then() -> None:
         ErrorWindow(SelfTestError.TEST_EEPROM_SIZE, 3 * S, 3 * S),
     )
     idle = 1 << OperatingError.PROGRAMMING_ALLOWED
-    for sent in sends(10, EscOptions(profile=IDLE, faults=Faults(errors=errors))):
+    off = (Phase("idle", 60, 0, OperatingState.MotorOff),)
+    for sent in sends(10, EscOptions(profile=off, faults=Faults(errors=errors))):
         at = sent.time_ns / S
         if isinstance(sent.data, LiveData):
             expected = idle | (1 if 5 <= at < 7 else 0) | (1 << 8 if at >= 6 else 0)

@@ -1,11 +1,11 @@
 """An hour of telemetry through every command that reads recordings, and each result read back by libraries that are not ours.
 
-    python tests/hour/hour_programme.py [--minutes 60] [--escs 1] [--folder DIR]
+    python tests/hour/hour_programme.py [--minutes 60] [--folder DIR]
 
-Makes a capture of so many minutes without waiting (hour_recording.py), converts, decodes and reports it by the real commands as
-processes of their own, converts the CAN logs back, reads every file by pandas, pyarrow, python-can and cantools (hour_check.py),
-and compares every value of every row with what the simulated ESCs meant (hour_truth.py). Prints a table of times and peak memory.
-Exits with 1 and the first differences where anything is not equal.
+Makes a capture of so many minutes without waiting, converts, decodes and reports it by the real commands as processes of their own,
+converts the CAN logs back, reads every file by pandas, json, pyarrow, python-can, asammdf and cantools, and compares every value of every
+row with what the simulated ESC meant (hour_truth.py); of what only the gateway knows (rates, counters, states) with the first table.
+Prints a table of times and peak memory. Exits with 1 and the first differences where anything is not equal.
 """
 
 import argparse
@@ -15,9 +15,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,25 @@ if __name__ == "__main__":
     tests = Path(__file__).resolve().parents[1]
     sys.path[:0] = [str(tests.parent), str(tests), str(tests / "capture")]
 
+import numpy as np
+from hour_truth import (
+    MS,
+    OPERATING_ERRORS,
+    SECOND,
+    SELFTEST_ERRORS,
+    Floats,
+    Times,
+    Truth,
+    value_name,
+)
+
+ROWS = 20_000
+SLACK = 1e-7
+"""cantools multiplies by 0.001 what is compared with the float nearest to the decimal; no signal is finer than 0.001."""
+LOGS = {"log": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4": "mf4-log"}
+FLAGS = {*OPERATING_ERRORS, *SELFTEST_ERRORS}
+BESIDE_FLAGS = ("operating_state", "operating_state_raw", "power_stage_temperature", "variant", "firmware_main", "device_raw")  # fmt: skip
+"""Where all of these that a message has are not available, its flags are not either."""
 # A process's peak memory counts that of the process it was started from: so commands are started by a small one.
 _MEASURE = """
 import json, os, subprocess, sys, time
@@ -38,173 +58,427 @@ print(json.dumps([child.returncode, took, used.ru_utime + used.ru_stime, used.ru
 
 
 @dataclass
-class Result:
-    """A line of the table."""
+class Verdict:
+    """How a comparison went."""
 
-    name: str
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
     rows: int = 0
-    peak_mb: float = 0.0
-    size_mb: float = 0.0
-    read_by: str = ""
     values: int = 0
-    differences: int = 0
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        return not self.problems and self.values > 0
+
+    def compare(self, what: str, got: Any, wanted: Any, slack: float = 0.0) -> None:
+        """Two columns, of which NaN is equal to NaN."""
+        if len(got) != len(wanted):
+            self.problems.append(f"{what}: {len(got)}, must be {len(wanted)}")
+            return
+        self.values += len(got)
+        bad = np.flatnonzero(
+            ~((np.abs(got - wanted) <= slack) | (np.isnan(got) & np.isnan(wanted)))
+        )
+        if len(bad):
+            first = bad[0]
+            self.problems.append(
+                f"{what}: {len(bad)} differ; the first, {first}: {got[first]}, must be {wanted[first]}"
+            )
+
+
+# --- tables
+
+Chunk = tuple[Any, Any, Mapping[str, Any]]
+"""Neighbouring rows: seconds, Unix times (pandas, or ns), values by the head of their column."""
+
+
+def csv_chunks(path: Path) -> Iterator[Chunk]:
+    """By pandas. Only what is empty is missing: a word such as NotAvailable in its place would be a mistake."""
+    import pandas as pd  # type: ignore[import-untyped]
+
+    options: dict[str, Any] = {"keep_default_na": False, "na_values": [""], "low_memory": False}
+    if int(pd.__version__.partition(".")[0]) < 3:
+        options["float_precision"] = "round_trip"
+    for frame in pd.read_csv(path, chunksize=ROWS, **options):
+        values = {head: frame[head] for head in frame.columns if head not in ("Time [s]", "Utc")}
+        yield frame["Time [s]"], frame["Utc"], values
+
+
+def jsonl_chunks(path: Path) -> Iterator[Chunk]:
+    """By json."""
+    with path.open(encoding="utf-8") as file:
+        while rows := [json.loads(line) for line in islice(file, ROWS)]:
+            values = {name: [row[name] for row in rows] for name in rows[0]}
+            yield values.pop("Time"), values.pop("Utc", None), values
+
+
+def parquet_chunks(path: Path) -> Iterator[Chunk]:
+    """By pyarrow."""
+    from pyarrow import parquet  # type: ignore[import-untyped]
+
+    for batch in parquet.ParquetFile(path).iter_batches(ROWS):
+        wall = batch.column("Utc").cast("int64").to_numpy(zero_copy_only=False)
+        found = {head: batch.column(head) for head in batch.schema.names}
+        values = {
+            head: column.to_pylist()
+            if hasattr(column, "dictionary")
+            else column.cast("float64").to_numpy(zero_copy_only=False)
+            for head, column in found.items()
+            if head not in ("Time [s]", "Utc")
+        }
+        yield found["Time [s]"].to_numpy(), wall, values
+
+
+READERS: dict[str, tuple[str, Callable[[Path], Iterator[Chunk]]]] = {
+    "csv": ("pandas", csv_chunks),
+    "jsonl": ("json", jsonl_chunks),
+    "parquet": ("pyarrow", parquet_chunks),
+}
+
+
+def numbers(values: Any, texts: Mapping[str, float]) -> Floats:
+    """A column as numbers; of texts those of the DBC, whose names a table may spell with other capitals."""
+    array = np.asarray(values, dtype=object)
+    if not any(isinstance(value, str) for value in array):
+        return array.astype(np.float64)
+    return np.array(
+        [texts.get(v.casefold(), -999.0) if isinstance(v, str) else np.nan for v in array]
+    )
+
+
+def nanoseconds(seconds: Any) -> Times:
+    found: Times = np.rint(np.asarray(seconds, dtype=np.float64) * 1e9).astype(np.int64)
+    return found
+
+
+def unix_ns(wall: Any) -> Times:
+    """Of ISO 8601 texts, or of ns as they are."""
+    import pandas as pd
+
+    if isinstance(wall, np.ndarray):
+        return wall
+    stamps = pd.Series(pd.to_datetime(pd.Series(wall), format="ISO8601", utc=True))
+    found: Times = stamps.astype("datetime64[ns, UTC]").astype(np.int64).to_numpy()
+    return found
+
+
+def table_of(path: Path, truth: Truth) -> tuple[Times, Times | None, dict[str, Floats]]:
+    """The whole table as numbers: times, Unix times, values by name. AssertionError for a unit that is not the value's."""
+    times: list[Times] = []
+    walls: list[Times] = []
+    columns: dict[str, list[Floats]] = {}
+    for seconds, wall, values in READERS[path.suffix[1:]][1](path):
+        times.append(nanoseconds(seconds))
+        if wall is not None:
+            walls.append(unix_ns(wall))
+        for head, column in values.items():
+            name, _, unit = head.partition(" [")
+            if path.suffix != ".jsonl" and name in truth.units:
+                assert unit.rstrip("]") == truth.units[name], f"{head}: is in {truth.units[name]!r}"
+            columns.setdefault(name, []).append(numbers(column, truth.texts.get(name, {})))
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    return np.concatenate(times), np.concatenate(walls) if walls else None, whole
+
+
+def check_table(truth: Truth, seen: dict[str, Floats], path: Path) -> Verdict:
+    """A table of the recording. ``seen``: of the first one, what the truth does not know."""
+    times, wall, values = table_of(path, truth)
+    verdict = Verdict(rows=len(times))
+    verdict.compare("Time", times, truth.row_ns - truth.row_ns[0], 500)
+    # text cuts at a microsecond, Parquet keeps nanoseconds
+    tolerance = 0 if path.suffix == ".parquet" else 999
+    verdict.compare("Utc", wall, truth.wall_ns(truth.row_ns), tolerance)
+    wanted = truth.rows()
+    if not seen:
+        seen |= {name: column for name, column in values.items() if name not in wanted}
+    wanted |= seen
+    for name in sorted(wanted.keys() ^ values.keys()):
+        verdict.problems.append(f"{name}: is {'missing' if name in wanted else 'too much'}")
+    for name in wanted.keys() & values.keys():
+        verdict.compare(name, values[name], wanted[name])
+    return verdict
+
+
+# --- CAN logs
+
+
+def check_log(truth: Truth, path: Path) -> Verdict:
+    """A log of all frames: ids, bytes, times as they were handed to the interface, by python-can (MF4: by asammdf below it)."""
+    import can
+
+    options: dict[str, Any] = {"relative_timestamp": False} if path.suffix == ".asc" else {}
+    times, ids, data = [], [], []
+    with can.LogReader(path, **options) as reader:
+        for message in reader:
+            assert message.dlc == 8 and not message.is_extended_id and not message.is_rx, message
+            times.append(message.timestamp)
+            ids.append(message.arbitration_id)
+            data.append(bytes(message.data))
+    verdict = Verdict(rows=len(times))
+    # a converted log goes on with the clock as it began
+    wall = truth.wall_ns(truth.sent_ns[:1])[0] + truth.sent_ns - truth.sent_ns[0]
+    # its own microsecond, and half of what a float of Unix seconds can tell apart
+    verdict.compare("time", nanoseconds(times), wall, 750 + 600 * (path.suffix == ".trc"))
+    verdict.compare("id", np.array(ids), truth.sent_ids)
+    got = np.frombuffer(b"".join(data), "<u8")
+    verdict.compare(
+        "data",
+        np.flatnonzero(got != truth.sent_data) if len(got) == len(truth.sent_data) else got,
+        [],
+    )
+    return verdict
+
+
+class Decoded:
+    """The frames that were handed to the interface, by cantools; equal ones are decoded once."""
+
+    def __init__(self, truth: Truth) -> None:
+        self._truth = truth
+        self.frames = {
+            can_id: self._table(can_id, np.flatnonzero(truth.sent_ids == can_id))
+            for can_id in np.unique(truth.sent_ids).tolist()
+        }
+        """By id: when they were sent, and a column for each value (alive counters by their signal's name)."""
+
+    def _table(self, can_id: int, rows: Times) -> tuple[Times, dict[str, Floats]]:
+        message = self._truth.database.get_message_by_frame_id(can_id)
+        unique, at = np.unique(self._truth.sent_data[rows], return_inverse=True)
+        found = [message.decode_simple(int(bits).to_bytes(8, "little")) for bits in unique.tolist()]
+        columns = {}
+        for signal in message.signals:
+            name = signal.name if signal.name.endswith("Alive") else value_name(signal.name)
+            of_it = [self._number(name, values[signal.name]) for values in found]
+            columns[name] = np.array(of_it, np.float64)[at]
+        return self._truth.sent_ns[rows], columns
+
+    def _number(self, name: str, value: Any) -> float:
+        text = str(value)
+        if text in ("NotAvailable", "Error"):
+            return np.nan
+        return self._truth.texts[name][text.casefold()] if hasattr(value, "value") else float(value)
+
+    def check_sent(self, _: Path) -> Verdict:
+        """Every signal of every frame against what the ESC meant."""
+        verdict = Verdict(rows=len(self._truth.sent_ns))
+        for times, columns in self.frames.values():
+            wanted = self._truth.frames(times)
+            for name, values in columns.items():
+                if name.endswith("Alive"):
+                    verdict.compare(name, np.diff(values) % 15, np.ones(len(values) - 1))
+                elif name in FLAGS:  # a flag has no code for not available
+                    verdict.compare(name, values, np.nan_to_num(wanted[name]))
+                elif name in wanted:
+                    verdict.compare(name, values, wanted[name], SLACK)
+        return verdict
+
+    def check_table(self, path: Path) -> Verdict:
+        """The CSV of a CAN log: in each row the newest value of each signal while it is fresh."""
+        times, _, values = table_of(path, self._truth)
+        verdict = Verdict(rows=len(times))
+        begun = times + self._truth.sent_ns[0]
+        until = np.append(begun[1:], 1 << 62) - 1500  # its own microsecond
+        for can_id, (sent, columns) in self.frames.items():
+            cycle = self._truth.database.get_message_by_frame_id(can_id).cycle_time
+            # three cycles, at least 250 ms; a second where it comes with telemetry only
+            life = max(250, 3 * cycle) * MS if cycle else SECOND
+            at = np.searchsorted(sent, until, "right") - 1
+            fresh = (at >= 0) & (begun - sent[np.maximum(at, 0)] <= life)
+            beside = [columns[name] for name in BESIDE_FLAGS if name in columns]
+            valid = ~np.all(np.isnan(beside), axis=0) if beside else np.full(len(sent), True)
+            for name, column in columns.items():
+                if name not in values:
+                    continue
+                shown = np.where(valid, column, np.nan) if name in FLAGS else column
+                newest = np.where(fresh, shown[np.maximum(at, 0)], np.nan)
+                verdict.compare(name, values[name], newest, SLACK)
+        return verdict
+
+    def check_last(self, path: Path) -> Verdict:
+        """What ``monitor --once`` says: the values of each message's last frame."""
+        verdict = Verdict(rows=1)
+        [told] = json.loads(path.read_text(encoding="utf-8"))["escs"]
+        for _, columns in self.frames.values():
+            for name, column in columns.items():
+                if name in told["values"] and name != "data_age":  # which goes on
+                    got = numbers([told["values"][name]], self._truth.texts[name])
+                    verdict.compare(name, got, column[-1:], SLACK)
+        return verdict
+
+
+# --- bytes and the report
+
+
+def check_bytes(truth: Truth, path: Path) -> Verdict:
+    """The UART bytes of the ESC."""
+    verdict = Verdict(rows=1)
+    got = np.fromfile(path, np.uint8).astype(int)
+    verdict.compare("bytes", got, np.frombuffer(truth.wire, np.uint8).astype(int))
+    return verdict
+
+
+def check_decoded(truth: Truth, path: Path) -> Verdict:
+    """The JSON lines of ``decode``: live frames in their order, 100 a second, every field as meant."""
+    times, _, values = table_of(path, truth)
+    verdict = Verdict(rows=len(times))
+    wanted = truth.frames(truth.live_ns)
+    verdict.compare("Time", times, np.arange(len(truth.live_ns)) * 10 * MS, 500)
+    for name in truth.live:
+        if name != "bec_current":  # of a JIVEPro none, as soon as an info frame has told what it is
+            verdict.compare(name, values[name], wanted[name])
+    return verdict
+
+
+def check_report(truth: Truth, path: Path) -> Verdict:
+    """The report's page: rows and extremes as the truth has them."""
+    verdict = Verdict(rows=1)
+    text = path.read_text(encoding="utf-8").replace("\u202f", "")  # between thousands
+    rows = truth.rows()
+    for words in (
+        f"{len(truth.row_ns)} rows",
+        f"<b>{np.nanmax(rows['battery_power']):.0f} W</b>",
+        f"<b>{np.nanmax(rows['battery_current']):.1f} A</b>",
+        f"<b>{np.nanmin(rows['battery_voltage']):.2f} V</b>",
+        f"<b>{np.nanmax(rows['power_stage_temperature']):.0f} °C</b>",
+    ):
+        verdict.values += 1
+        if words not in text:
+            verdict.problems.append(f"{path.name}: does not say {words!r}")
+    return verdict
+
+
+# --- the programme
 
 
 @dataclass
 class Step:
-    """A command, the file that it makes, and what is compared. ``check`` gives a Verdict."""
+    """A command, in whose words OUT is the file that it makes (else it prints that), and what is compared."""
 
     name: str
-    arguments: list[str]
+    words: list[str]
     output: Path
     read_by: str
-    check: partial[Any]
-    to_output: bool = False
-    """What it prints is the result."""
+    check: Callable[[Path], Verdict]
+    verdict: Verdict = field(default_factory=Verdict)
+    measured: tuple[float, ...] = ()
+    """Wall seconds, CPU seconds, peak memory in MB."""
+
+    def run(self) -> None:
+        """RuntimeError where the command failed."""
+        is_made = "OUT" in self.words
+        output = self.output.with_name("output.txt") if is_made else self.output
+        words = [str(self.output) if word == "OUT" else word for word in self.words]
+        program = [sys.executable, "-m", "kontronik_can_gw", *words]
+        command = [sys.executable, "-c", _MEASURE, str(output), *program]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        code, *self.measured = json.loads(done.stdout)
+        if code:
+            raise RuntimeError(f"exit code {code}: {done.stderr.strip()}")
+        self.verdict = self.check(self.output)
+
+    def line(self) -> str:
+        """Of a Markdown table."""
+        seconds, cpu, peak = self.measured
+        rate = f"{self.verdict.rows / cpu:,.0f}".replace(",", " ") if self.verdict.rows > 1 else ""
+        size, values = (
+            self.output.stat().st_size / 1e6,
+            f"{self.verdict.values:,}".replace(",", " "),
+        )
+        return f"| {self.name} | {seconds:.1f} | {cpu:.1f} | {rate} | {peak:.0f} | {size:.1f} | {values} | {self.read_by} |"
 
 
-def measured(arguments: list[str], output: Path) -> tuple[float, float, float]:
-    """Wall seconds, CPU seconds and peak memory in MB of a command, whose output goes to a file. RuntimeError where it failed."""
-    command = [
-        sys.executable,
-        "-c",
-        _MEASURE,
-        str(output),
-        sys.executable,
-        "-m",
-        "kontronik_can_gw",
-    ]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=True)
-    code, *found = json.loads(done.stdout)
-    if code:
-        raise RuntimeError(f"exit code {code}: {done.stderr.strip()}")
-    seconds, cpu, peak = found
-    return seconds, cpu, peak
-
-
-def steps_of(folder: Path, truth: Any) -> list[Step]:
+def steps_of(folder: Path, truth: Truth) -> list[Step]:
     """All that is done with the capture."""
-    import hour_check as check
-
-    capture = str(truth.recording.path)
-    one_esc = len(truth.escs) == 1
-    decoded = check.Decoded(truth)
-    frames: dict[str, check.Frames] = {}
-    by_can = "python-can, cantools"
-    steps: list[Step] = []
-
-    def step(
-        name: str,
-        words: list[str],
-        output: str,
-        read_by: str,
-        compare: Callable[..., Any],
-        *of: Any,
-    ) -> None:
-        """A command whose words have OUT for the file that it makes; one without it prints what is to be there."""
-        path = folder / output
-        arguments = [str(path) if word == "OUT" else word for word in words]
-        check_it = partial(compare, *of, path)
-        steps.append(Step(name, arguments, path, read_by, check_it, "OUT" not in words))
-
-    def compare_log(path: Path) -> Any:
-        verdict, found = check.check_log(path, truth, decoded)
-        frames.setdefault(path.suffix, found)
-        return verdict
-
-    def compare_table_of_log(form: str, path: Path) -> Any:
-        return check.check_table_of_log(path, truth, frames[f".{form}"], decoded)
-
+    capture, decoded, seen = str(truth.path), Decoded(truth), dict[str, Floats]()
     convert = ["convert", capture, "OUT"]
-    for form, library in check.TABLES.items():
-        step(f"convert to {form}", convert, f"hour.{form}", library, check.check_table, truth)
-    for form in check.LOGS:
-        step(f"convert to {form}", convert, f"hour.{form}", by_can, compare_log)
-    for form in check.LOGS if one_esc else ():
-        words = ["convert", str(folder / f"hour.{form}"), "OUT"]
-        compare = f"pandas against {by_can}", compare_table_of_log, form
-        step(f"convert {form} to csv", words, f"of_{form}.csv", *compare)
-    for index in range(len(truth.escs)):
-        name = f"esc{index + 1}"
-        words = convert if one_esc else [*convert, "--esc", name]
-        step("convert to bin", words, f"{name}.bin", "numpy", check.check_bytes, truth, index)
-        words = ["decode", str(folder / f"{name}.bin")]
-        compare_decoded = check.check_decoded, truth, index
-        step("decode the bin", words, f"{name}.decoded.jsonl", "json", *compare_decoded)
-    words = ["report", capture, "-o", "OUT"]
-    step("report", words, "hour.html", "its text", check.check_report, truth)
-    words = ["monitor", capture, "--once"]
-    of_last = "json against cantools", check.check_last, truth, decoded
-    step("monitor --once", words, "last.json", *of_last)
-    return steps
-
-
-def run(steps: list[Step], folder: Path, say: Callable[[str], None] = print) -> list[Result]:
-    """Run all commands in their order, and compare each result."""
-    results = []
-    for step in steps:
-        result = Result(step.name, read_by=step.read_by)
-        output = step.output if step.to_output else folder / "output.txt"
-        result.seconds, result.cpu_seconds, result.peak_mb = measured(step.arguments, output)
-        result.size_mb = step.output.stat().st_size / 1e6
-        verdict = step.check()
-        result.rows, result.values = verdict.rows, verdict.values
-        result.differences = verdict.differences + (not verdict.values)
-        say(f"{step.name}: {result.values} values compared, {result.differences} differ")
-        for line in verdict.problems:
-            say(f"    {line}")
-        results.append(result)
-    return results
-
-
-def table(results: list[Result]) -> str:
-    """The results as a Markdown table."""
-    heads = ("seconds", "CPU s", "rows/CPU s", "peak MB", "size MB", "values compared")
-    lines = [f"| | {' | '.join(heads)} | read back by |", "|---" + "|---:" * 6 + "|---|"]
-    for one in results:
-        rate = f"{one.rows / one.cpu_seconds:,.0f}".replace(",", " ") if one.rows > 10 else ""
-        differ = f" ({one.differences} differ)" if one.differences else ""
-        values = f"{one.values:,}".replace(",", " ") + differ
-        numbers = f"{one.seconds:.1f} | {one.cpu_seconds:.1f} | {rate} | {one.peak_mb:.0f}"
-        lines.append(f"| {one.name} | {numbers} | {one.size_mb:.1f} | {values} | {one.read_by} |")
-    return "\n".join(lines)
+    steps = [
+        Step(
+            f"convert to {form}",
+            convert,
+            folder / f"hour.{form}",
+            library,
+            partial(check_table, truth, seen),
+        )
+        for form, (library, _) in READERS.items()
+    ]
+    for form, to in LOGS.items():
+        log = folder / f"hour.{form}"
+        by = "asammdf, python-can" if form == "mf4" else "python-can"
+        steps.append(
+            Step(f"convert to {form}", [*convert, "--to", to], log, by, partial(check_log, truth))
+        )
+        words = ["convert", str(log), "OUT"]
+        table = folder / f"of_{form}.csv"
+        steps.append(
+            Step(
+                f"convert {form} to csv",
+                words,
+                table,
+                "pandas against cantools",
+                decoded.check_table,
+            )
+        )
+    dump = folder / "esc1.bin"
+    return [
+        *steps,
+        Step("the CAN frames", convert, folder / "sent.log", "cantools", decoded.check_sent),
+        Step("convert to bin", convert, dump, "numpy", partial(check_bytes, truth)),
+        Step(
+            "decode the bin",
+            ["decode", str(dump)],
+            folder / "decoded.jsonl",
+            "json",
+            partial(check_decoded, truth),
+        ),
+        Step(
+            "report",
+            ["report", capture, "-o", "OUT"],
+            folder / "hour.html",
+            "its text",
+            partial(check_report, truth),
+        ),
+        Step(
+            "monitor --once",
+            ["monitor", capture, "--once"],
+            folder / "last.json",
+            "json against cantools",
+            decoded.check_last,
+        ),
+    ]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--escs", type=int, default=1)
     parser.add_argument("--folder", type=Path, help="a new one, in which the files are kept")
     args = parser.parse_args()
-    if not 0.5 <= args.minutes <= 600 or not 1 <= args.escs <= 8:
-        parser.error("--minutes 0.5 to 600, --escs 1 to 8")
-    from hour_recording import record
-    from hour_truth import Truth
-
+    if not 0.5 <= args.minutes <= 600:
+        parser.error("--minutes 0.5 to 600")
     folder = args.folder or Path(tempfile.mkdtemp(prefix="hour."))
     if args.folder:
         folder.mkdir(parents=True)
     try:
         begun = time.monotonic()
-        seconds = args.minutes * 60
-        truth = Truth(record(folder / "hour.kcap", seconds, args.escs))
-        size = (folder / "hour.kcap").stat().st_size / 1e6
-        head = (
-            f"{args.minutes:g} minutes of {args.escs} ESC: {truth.recording.telemetry_frames} telemetry frames, {len(truth.row_ns)} rows, "
-            f"{len(truth.sent_ns)} CAN frames; capture of {size:.1f} MB, made in {time.monotonic() - begun:.0f} s"
+        truth = Truth(folder / "hour.kcap", args.minutes * 60)
+        size, took = truth.path.stat().st_size / 1e6, time.monotonic() - begun
+        counts = f"{len(truth.live_ns)} live frames, {len(truth.row_ns)} rows, {len(truth.sent_ns)} CAN frames"
+        print(
+            f"{args.minutes:g} minutes: {counts}; capture of {size:.1f} MB, made in {took:.0f} s",
+            flush=True,
         )
-        print(head, flush=True)
-        results = run(steps_of(folder, truth), folder, lambda text: print(text, flush=True))
+        print(
+            "| | seconds | CPU s | rows/CPU s | peak MB | size MB | values compared | read back by |"
+        )
+        print("|---" + "|---:" * 6 + "|---|")
+        steps = steps_of(folder, truth)
+        for step in steps:
+            step.run()
+            print(step.line(), *step.verdict.problems[:12], sep="\n    ", flush=True)
     finally:
         if args.folder is None:
             shutil.rmtree(folder, ignore_errors=True)
-    print(f"\n{head}\n\n{table(results)}")
-    bad = [one.name for one in results if one.differences]
+    bad = [step.name for step in steps if not step.verdict.ok]
+    values = sum(step.verdict.values for step in steps)
     print(
-        f"\n{sum(one.values for one in results)} values compared, "
-        + (f"not equal: {', '.join(bad)}" if bad else "all equal")
+        f"\n{values} values compared, " + (f"not equal: {', '.join(bad)}" if bad else "all equal")
     )
     return 1 if bad else 0
 

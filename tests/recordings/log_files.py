@@ -47,12 +47,6 @@ def write_log(
 ) -> None:
     """By our writer."""
     first = items[0][0] if items else 0
-    if format_ == "mf4":
-        writer = CanLogWriter(path, format_, wall_start_ns, first)
-        for item in items:
-            writer.write(*item)
-        writer.close()
-        return
     with path.open("wb") as file:
         writer = CanLogWriter(file, format_, wall_start_ns, first, name=path.name)
         for item in items:

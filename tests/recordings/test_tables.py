@@ -254,13 +254,12 @@ def test_any_values_read_back_equal(
     rows.sort(key=lambda row: row[0])
     path = tmp_path / f"any.{form}"
     table = Table(FIELDS, has_utc)
-    with (
-        path.open("wb") as file,
-        _table_writer(path if form == "parquet" else file, form, table) as writer,
-    ):
+    with path.open("wb") as file:
+        writer = _table_writer(file, form, table)
         for time_ns, wall_ns, values in rows:
             columns = [[value] for value in values]
             writer.write(Block([time_ns], columns, wall_ns - time_ns))
+        writer.close()
     found = READ[form](path, {field.name: field for field in FIELDS})
     assert len(found) == len(rows)
     for cells, (time_ns, wall_ns, values) in zip(found, rows, strict=True):

@@ -33,7 +33,7 @@ FAULTS = Faults(
     ),
     swaps=(Swap(70 * S, Device.KOLIBRI),),
 )
-OPTIONS = (EscOptions(faults=FAULTS), EscOptions(device=Device.JIVEPRO, max_current=80))
+OPTIONS = (EscOptions(faults=FAULTS), EscOptions(device=Device.JIVEPRO))
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ COUNT = """((key, name) => {
 
 def flown(*names: str) -> Flight:
     bus = shipped_bus(*names)
-    options = [EscOptions(faults=FAULTS), EscOptions(max_current=80)]
+    options = [EscOptions(faults=FAULTS), EscOptions()]
     return analysed(analysis_of(bus), simulated(bus, 60, options))
 
 

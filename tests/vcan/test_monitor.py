@@ -23,7 +23,7 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
         gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
         gateway.wait_for_line("esc1: /dev/pts")
         run.start()
-        shown = GatewayProcess(None, "--channel", vcan, "--interval", 0.25, command="monitor")
+        shown = GatewayProcess(None, "--channel", vcan, command="monitor")
         out = shown.out
         try:
 

@@ -22,25 +22,25 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 
 REFRESH_S = 0.15
+_LINES_S = 1.0
+"""Time between tables without a terminal."""
 _QUIT = ("q", "\x03", "\x04")
 
 Stopped = Callable[[], bool]
 
 
-def watch(source: Source, monitor: Monitor, interval: float | None, stopped: Stopped) -> None:
+def watch(source: Source, monitor: Monitor, stopped: Stopped) -> None:
     """Show the source until a key, ``stopped``, or without a terminal the end of a file."""
     console = Console(highlight=False)
     monitor.advance(source.now())
     if console.is_terminal and not console.is_dumb_terminal:
-        _live(console, source, monitor, interval or REFRESH_S, stopped)
+        _live(console, source, monitor, stopped)
     else:
-        _lines(source, monitor, interval or 1.0, stopped)
+        _lines(source, monitor, stopped)
 
 
-def _live(
-    console: Console, source: Source, monitor: Monitor, interval: float, stopped: Stopped
-) -> None:
-    """Draw the screen each ``interval`` seconds and after each key."""
+def _live(console: Console, source: Source, monitor: Monitor, stopped: Stopped) -> None:
+    """Draw the screen again and again, and after each key."""
     page, due = 0, time.monotonic()
     with _keys() as fd, Live(console=console, screen=True, auto_refresh=False) as live:
         while not stopped():
@@ -48,7 +48,7 @@ def _live(
             if now >= due:
                 lines = screen(monitor, source, console.size, page, fd is not None)
                 live.update(Text("\n").join(lines), refresh=True)
-                due = max(due + interval, now + interval / 2)
+                due = max(due + REFRESH_S, now + REFRESH_S / 2)
             source.pump(monitor.take, min(due, now + 0.1))
             monitor.advance(source.now())
             if fd is not None and select.select([fd], [], [], 0)[0]:
@@ -99,10 +99,10 @@ def _keys() -> Iterator[int | None]:
             termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
-def _lines(source: Source, monitor: Monitor, interval: float, stopped: Stopped) -> None:
+def _lines(source: Source, monitor: Monitor, stopped: Stopped) -> None:
     """Print notices and the table again and again, without terminal control."""
     while not stopped() and not source.ended:
-        due = time.monotonic() + interval
+        due = time.monotonic() + _LINES_S
         while time.monotonic() < due and not source.ended and not stopped():
             source.pump(monitor.take, due)
         monitor.advance(source.now())

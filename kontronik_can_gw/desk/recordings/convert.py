@@ -3,13 +3,11 @@
 Each conversion returns what it wrote, in words; None where the recording has nothing of it, and then nothing was written.
 """
 
-import gc
 import os
-import re
 import sys
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
@@ -19,7 +17,9 @@ if TYPE_CHECKING:
     from kontronik_can_gw.capture.replay import TimedFrame
     from kontronik_can_gw.desk.recordings.fields import Table
     from kontronik_can_gw.desk.recordings.recording import Input
+    from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
     from kontronik_can_gw.desk.recordings.tables.rows import Choice
+    from kontronik_can_gw.desk.recordings.tables.text import TextTable
     from kontronik_can_gw.native.offline import Frames
 
 TABLES = ("csv", "jsonl", "parquet")
@@ -42,8 +42,6 @@ ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """What may go to standard output: it is text, and is written from its beginning to its end."""
 STREAMS = (*ON_SCREEN, BYTES)
 """What may go through a pipe."""
-_BY_PATH = ("parquet", "mf4-log")
-"""What a library writes that opens the file itself."""
 _CLOCK_SET_NS = _DISORDER_NS = 1_000_000_000
 """How far a clock must be set to be worth a word; how far frames of several interfaces may stand out of order."""
 
@@ -55,58 +53,52 @@ class Output:
     a person gives it.
     """
 
-    def __init__(self, target: Path | None, form: str = "", what: str = "file") -> None:
+    def __init__(self, target: Path | None, what: str = "file") -> None:
         self.is_whole = False
         self.name = "" if target is None else target.name
-        self._target = target
+        self._target, self._what = target, what
         self._part: Path | None = None
         if target is not None and (not target.exists() or target.is_file()):
             self._part = Path(os.path.realpath(target)).with_name(f"{target.name}.part")
-            if os.path.lexists(self._part):  # another's
-                self._part = self._part.with_name(f"{target.name}.{os.getpid()}.part")
-        self._what = what
-        self._by_path = form in _BY_PATH
         self._file: IO[bytes] | None = None
 
-    def open(self) -> "IO[bytes] | Path":
-        """What to write to: open for bytes, or a path. RunError where it cannot be opened."""
+    def open(self) -> IO[bytes]:
+        """What to write to. RunError where it cannot be opened."""
         if self._target is None:
             return sys.stdout.buffer
-        path = self._part or self._target
         try:
-            self._file = open(path, "wb", opener=_own_file if self._part else None)  # noqa: SIM115
+            if self._part is None:
+                self._file = self._target.open("wb")
+            else:
+                self._part.unlink(missing_ok=True)
+                self._file = self._part.open("xb")  # follows no link that somebody put there
         except OSError as error:
             raise RunError(
                 f"{self._target}: cannot be written: {error.strerror}. Give another {self._what}."
             ) from None
-        if not self._by_path:
-            return self._file
-        self._file.close()  # it can be written: a library would report it otherwise, or make folders
-        return path
+        return self._file
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
+        is_kept = kind is None and self.is_whole
         if kind is None and self._target is None:
             sys.stdout.flush()
-        if self._file is not None:
-            # what is buffered of a file that is not kept may find no room
-            with suppress(*([] if kind is None and self.is_whole else [OSError])):
-                self._file.close()
+        if self._file is None:
+            return
+        # what is buffered of a file that is not kept may find no room
+        with suppress(*([] if is_kept else [OSError])):
+            self._file.flush()
+            if is_kept and self._part is not None:
+                os.fsync(self._file.fileno())
+            self._file.close()
         if self._part is None or self._target is None:
             return
-        if kind is not None or not self.is_whole:
+        if is_kept:
+            self._part.replace(os.path.realpath(self._target))
+        else:
             self._part.unlink(missing_ok=True)
-            return
-        with self._part.open("rb") as file:
-            os.fsync(file.fileno())
-        self._part.replace(os.path.realpath(self._target))
-
-
-def _own_file(path: str, flags: int) -> int:
-    """Open what was not there, and follow no link that somebody put there."""
-    return os.open(path, flags | os.O_EXCL | os.O_NOFOLLOW, 0o666)
 
 
 Reached = Callable[[int], None]
@@ -123,34 +115,30 @@ def to_table(
     if table is None:
         return None
     count, last_ns = 0, 0
-    with _table_writer(out.open(), form, table) as writer, _settled():
+    writer = _table_writer(out.open(), form, table)
+    try:
         for block in blocks:
             writer.write(block)
             count += len(block)
             last_ns = block.times[-1] - table.origin_ns
             reached(recording.position)
-    out.is_whole = True
-    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {last_ns / 1e9:.3f} s"
-
-
-@contextmanager
-def _table_writer(target: IO[bytes] | Path, form: str, table: "Table") -> Iterator[Any]:
-    """What has ``write`` for blocks of rows; RunError where a library is missing."""
-    writer: Any
-    if isinstance(target, Path):
-        from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
-
-        writer = ParquetTable(target, table)
-    else:
-        from kontronik_can_gw.desk.recordings.tables.text import TextTable
-
-        writer = TextTable(target, table, is_json=form == "jsonl")
-    try:
-        yield writer
         writer.close()
     except BaseException:
         writer.discard()
         raise
+    out.is_whole = True
+    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {last_ns / 1e9:.3f} s"
+
+
+def _table_writer(file: IO[bytes], form: str, table: "Table") -> "ParquetTable | TextTable":
+    """What has ``write`` for blocks of rows; RunError where a library is missing."""
+    if form == "parquet":
+        from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
+
+        return ParquetTable(file, table)
+    from kontronik_can_gw.desk.recordings.tables.text import TextTable
+
+    return TextTable(file, table, is_json=form == "jsonl")
 
 
 def to_log(
@@ -224,9 +212,7 @@ def _cut(
 
 def to_bytes(recording: "Input", out: Output, reached: Reached, esc: int) -> str | None:
     """To the plain bytes of one ESC."""
-    file = out.open()
-    assert not isinstance(file, Path)
-    count = 0
+    file, count = out.open(), 0
     for data in recording.esc_bytes(esc):
         file.write(data)
         count += len(data)
@@ -237,22 +223,5 @@ def to_bytes(recording: "Input", out: Output, reached: Reached, esc: int) -> str
     return f"{_many(count, 'byte')} of {recording.bus.escs[esc].name}"
 
 
-@contextmanager
-def _settled() -> Iterator[None]:
-    """What is there by now is not looked at by the garbage collector: rows that are held would make it look often."""
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-
-
 def _many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
-def reason(error: OSError) -> str:
-    """Why nothing could be written, in the system's words; pyarrow says its own, with the number in it."""
-    if number := re.search(r"\[errno (\d+)\]", str(error)):
-        return os.strerror(int(number[1]))
-    return error.strerror or (str(error).strip().splitlines() or ["no reason given"])[0]

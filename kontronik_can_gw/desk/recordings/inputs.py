@@ -14,7 +14,7 @@ from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.log_input import CanLogInput
 from kontronik_can_gw.desk.recordings.recording import Input
-from kontronik_can_gw.desk.recordings.spool import is_stream, spooled
+from kontronik_can_gw.desk.recordings.spool import spooled
 from kontronik_can_gw.errors import RunError, UserError
 
 __all__ = ["LIVE_RATE", "BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
@@ -29,8 +29,7 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
     standard input, which is read to its end first. ``layout``: of CAN logs and plain
     bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
     """
-    if is_stream(path):
-        path = spooled(path)
+    path = spooled(path)
     parts = _parts(path)
     if parts is not None:
         return CaptureInput(parts, layout)
@@ -54,6 +53,11 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
     raise UserError(
         f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_HEAD // 1024} kB"
     )
+
+
+def open_bytes(path: Path, layout: BusLayout | None, live_rate: float) -> Input:
+    """Open the bytes of one ESC, whatever is in them."""
+    return BytesInput(spooled(path), layout, live_rate)
 
 
 def _parts(path: Path) -> list[Path] | None:

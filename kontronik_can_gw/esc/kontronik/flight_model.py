@@ -11,7 +11,12 @@ from kontronik_can_gw.esc.kontronik.states import (
 )
 
 _STANDING = frozenset(state for state in OperatingState if state <= OperatingState.StandBy)
-_INT16 = 32_767
+_CELLS = 6
+_CAPACITY = 5000
+"""mAh of the battery. When less than a fifth is left at the profile's end, a fresh one is plugged in: the ESC powers up anew, its log
+and charge begin again."""
+_MAX_CURRENT = 120.0
+"""A in the motor at full throttle."""
 _AMBIENT = 22.0
 """°C"""
 _VARIANT = 120
@@ -34,13 +39,13 @@ class FlightModel:
     """Battery, motor and heat of one ESC since its power-up, stepped once a period."""
 
     def __init__(self, options: EscOptions, device: Device, seed: int) -> None:
-        self._options = options
+        self._profile = options.profile
         self._device = device
         self._dt = options.period_ns / 1e9
         self._random = Random(f"model {seed}").random
         self._measures_battery_peak = device.peak_current_of == "battery"
         self._supplies_bec_current = device not in _SUPPLIES_NO_BEC_CURRENT
-        self._strength = options.max_current * (0.95 + 0.1 * self._random())
+        self._strength = _MAX_CURRENT * (0.95 + 0.1 * self._random())
         self._stage_temperature = _AMBIENT + 4 + 2 * self._random()
         self._bec_temperature = _AMBIENT + 6 + 2 * self._random()
         self._power_up()
@@ -61,11 +66,11 @@ class FlightModel:
     def _enter_next_phase(self) -> None:
         self._phase_s -= self.phase.duration_s
         self._next_phase += 1
-        profile = self._options.profile
+        profile = self._profile
         at = self._next_phase - len(POWER_UP)
         if at < 0:
             self.phase = POWER_UP[self._next_phase]
-        elif at and at % len(profile) == 0 and self._charge > 0.8 * self._options.capacity:
+        elif at and at % len(profile) == 0 and self._charge > 0.8 * _CAPACITY:
             self._power_up()
         else:
             self.phase = profile[at % len(profile)]
@@ -97,18 +102,16 @@ class FlightModel:
 
         A propeller: current with the square of the speed and with the acceleration.
         """
-        options, dt, speed = self._options, self._dt, self._speed
-        cells = options.cell_count
-        state_of_charge = max(self._full - self._charge / options.capacity, 0.0)
-        open_voltage = cells * (3.5 + 0.7 * state_of_charge)
-        full_speed = 3.8 * cells * _SPEED_PER_VOLT
+        dt, speed = self._dt, self._speed
+        state_of_charge = max(self._full - self._charge / _CAPACITY, 0.0)
+        open_voltage = _CELLS * (3.5 + 0.7 * state_of_charge)
+        full_speed = 3.8 * _CELLS * _SPEED_PER_VOLT
         motor_current = battery_current = 0.0
         part = speed / full_speed
         if drive > 0:
             lag = open_voltage * drive * _SPEED_PER_VOLT - speed
-            if (
-                lag > -0.03 * full_speed
-            ):  # else it turns faster: nothing is driven until the speed is down
+            # else it turns faster: nothing is driven until the speed is down
+            if lag > -0.03 * full_speed:
                 motor_current = self._strength * (
                     0.75 * part * part + min(max(lag, 0) / full_speed, 0.4) + 0.01
                 )
@@ -123,23 +126,17 @@ class FlightModel:
             if speed < 400:
                 speed = 0.0
         self._speed = speed
-        return (
-            motor_current,
-            battery_current,
-            open_voltage - battery_current * cells * 0.3 / options.max_current,
-        )
+        voltage = open_voltage - battery_current * _CELLS * 0.3 / _MAX_CURRENT
+        return motor_current, battery_current, voltage
 
     def _heat(self, motor_current: float, bec_current: float) -> None:
         """A first-order lag each. At full load the power stage settles about 60 K above ambient."""
-        options, dt = self._options, self._dt
-        stage = self._stage_temperature
-        stage += (4 + 60 * abs(motor_current) / options.max_current + _AMBIENT - stage) * min(
-            dt / 25, 1.0
-        )
-        self._stage_temperature = stage
-        bec = self._bec_temperature
-        bec += (5 + 4 * bec_current + 0.2 * (stage - _AMBIENT) + _AMBIENT - bec) * min(dt / 40, 1.0)
-        self._bec_temperature = bec
+        stage, bec, dt = self._stage_temperature, self._bec_temperature, self._dt
+        settled = 4 + 60 * abs(motor_current) / _MAX_CURRENT + _AMBIENT
+        stage += (settled - stage) * min(dt / 25, 1.0)
+        settled = 5 + 4 * bec_current + 0.2 * (stage - _AMBIENT) + _AMBIENT
+        bec += (settled - bec) * min(dt / 40, 1.0)
+        self._stage_temperature, self._bec_temperature = stage, bec
 
     def _in_steps(
         self,
@@ -149,30 +146,28 @@ class FlightModel:
         bec_current: float,
         errors: int,
     ) -> LiveData:
-        """As the ESC says it. What could leave its wire type is kept inside."""
-        battery_raw = min(max(round(battery_current * 10), -_INT16), _INT16)
-        motor_raw = min(max(round(motor_current * 10), -_INT16), _INT16)
+        """As the ESC says it."""
+        battery_raw, motor_raw = round(battery_current * 10), round(motor_current * 10)
         peak = battery_raw if self._measures_battery_peak else motor_raw
         if peak > 0:
-            peak = min(peak + peak // 8, _INT16)
-            self._peak = max(self._peak, peak)
+            self._peak = max(self._peak, peak + peak // 8)
         if self.phase.state in _STANDING:
             errors |= 1 << OperatingError.PROGRAMMING_ALLOWED
         throttle = round(self._throttle)
         return LiveData(
             electrical_speed=round(self._speed),
-            battery_voltage=min(max(round(voltage * 100), 0), 65_535),
+            battery_voltage=round(voltage * 100),
             battery_current=battery_raw,
             motor_current=motor_raw,
             peak_current=self._peak,
-            consumed_charge=min(int(self._charge), 65_535),
+            consumed_charge=int(self._charge),
             bec_current=round(bec_current * 1000) if self._supplies_bec_current else 0,
             bec_voltage=round((8.03 - 0.02 * bec_current) * 1000),
             pwm_input=1001 + (9 * throttle if throttle > 0 else throttle),
             throttle=throttle,
             output_opening=abs(throttle) if self._speed > 0 else 0,
-            power_stage_temperature=min(max(round(self._stage_temperature), -128), 127),
-            bec_temperature=min(max(round(self._bec_temperature), -128), 127),
+            power_stage_temperature=round(self._stage_temperature),
+            bec_temperature=round(self._bec_temperature),
             operating_errors=errors,
             operating_state=self.phase.state,
             timing=20,
@@ -195,11 +190,10 @@ class FlightModel:
 
     def info(self, selftest_errors: int) -> InfoData:
         """The info data now: extremes of all live data since power-up, sent or not."""
-        options = self._options
         return InfoData(
             device_and_variant=device_and_variant(self._device, _VARIANT),
             firmware_word=_FIRMWARE,
             selftest_errors=selftest_errors,
-            cell_count=options.cell_count,
+            cell_count=_CELLS,
             **self._log,
         )

@@ -9,7 +9,6 @@ battery voltage of 0.00 V before the motor has run, the peak current as a held m
 """
 
 import math
-from collections.abc import Iterator
 from random import Random
 from typing import NamedTuple
 
@@ -18,7 +17,6 @@ from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import Data
 from kontronik_can_gw.esc.kontronik.flight_model import FlightModel
 from kontronik_can_gw.esc.kontronik.simulator_options import FLIGHT as FLIGHT
-from kontronik_can_gw.esc.kontronik.simulator_options import IDLE as IDLE
 from kontronik_can_gw.esc.kontronik.simulator_options import POWER_UP as POWER_UP
 from kontronik_can_gw.esc.kontronik.simulator_options import SECOND_NS as SECOND_NS
 from kontronik_can_gw.esc.kontronik.simulator_options import Dropout as Dropout
@@ -56,9 +54,7 @@ class Sent(NamedTuple):
 class SimulatedEsc:
     """One ESC. The first frame leaves at ``start_ns``."""
 
-    def __init__(
-        self, options: EscOptions | None = None, *, seed: int = 0, start_ns: int = 0
-    ) -> None:
+    def __init__(self, options: EscOptions | None = None, seed: int = 0, start_ns: int = 0) -> None:
         options = options or EscOptions()
         faults = options.faults
         self.next_ns = start_ns
@@ -73,13 +69,10 @@ class SimulatedEsc:
         self._info_due = False
         self._model = FlightModel(options, options.device, seed)
         self._swaps = list(reversed(faults.swaps))
-        self._errors = faults.errors
-        self._dropout = faults.dropout
+        self._faults = faults
         self._random = Random(f"faults {seed}")
         self._noise_step = math.log(faults.noise / (1 + faults.noise)) if faults.noise else 0.0
-        self._losses = _Hits(faults.lost_bytes, Random(f"losses {seed}"))
-        self._flips = _Hits(faults.flipped_bits, Random(f"flips {seed}"))
-        self._faulty = bool(faults.noise or faults.lost_bytes or faults.flipped_bits)
+        self._losses, self._flips = Random(f"losses {seed}"), Random(f"flips {seed}")
 
     @property
     def phase(self) -> str:
@@ -116,14 +109,11 @@ class SimulatedEsc:
                 self._info_due = True
                 length = 40 if self.layout is Layout.V4 else 38
                 self.next_ns = now_ns + min(length * BYTE_NS, options.period_ns // 2)
-        if self._dropout is not None:
-            duration, interval = self._dropout
+        if self._faults.dropout is not None:
+            duration, interval = self._faults.dropout
             if since_start % interval >= interval - duration:
                 return None
-        frame = encode(data, self.layout)
-        if not self._faulty:
-            return Sent(now_ns, data, frame, frame, True)
-        return self._spoil(now_ns, data, frame)
+        return self._spoiled(now_ns, data, encode(data, self.layout))
 
     def _plug_in(self, swap: Swap) -> None:
         self.device = swap.device
@@ -135,30 +125,22 @@ class SimulatedEsc:
 
     def _word(self, kind: type[OperatingError] | type[SelfTestError], since_start: int) -> int:
         word = 0
-        for bit, start, duration in self._errors:
-            if (
-                isinstance(bit, kind)
-                and since_start >= start
-                and (duration is None or since_start < start + duration)
-            ):
+        for bit, start, duration in self._faults.errors:
+            end = math.inf if duration is None else start + duration
+            if isinstance(bit, kind) and start <= since_start < end:
                 word |= 1 << bit
         return word
 
-    def _spoil(self, now_ns: int, data: Data, frame: bytes) -> Sent:
-        body: bytes | bytearray = frame
-        flips = self._flips.within(8 * len(frame))
-        losses = self._losses.within(len(frame))
-        if flips or losses:
-            body = bytearray(frame)
-            for bit in flips:
-                body[bit // 8] ^= 1 << bit % 8
-            for at in reversed(losses):
-                del body[at]
-        wire = bytes(body)
-        intact = not flips and not losses
-        if self._noise_step:
-            wire = self._noise() + wire
-        return Sent(now_ns, data, frame, wire, intact)
+    def _spoiled(self, now_ns: int, data: Data, frame: bytes) -> Sent:
+        flips = _hits(self._faults.flipped_bits, self._flips, 8 * len(frame))
+        losses = _hits(self._faults.lost_bytes, self._losses, len(frame))
+        body = bytearray(frame)
+        for bit in flips:
+            body[bit // 8] ^= 1 << bit % 8
+        for at in reversed(losses):
+            del body[at]
+        noise = self._noise() if self._noise_step else b""
+        return Sent(now_ns, data, frame, noise + body, not flips and not losses)
 
     def _noise(self) -> bytes:
         """Random bytes, geometric in number; one in eight ends with the beginning of a header."""
@@ -170,33 +152,6 @@ class SimulatedEsc:
         return noise
 
 
-class _Hits:
-    """Positions hit independently with one probability, drawn as distances: free where nothing is hit."""
-
-    __slots__ = ("_distances", "_left")
-
-    def __init__(self, probability: float, random: Random) -> None:
-        self._distances = _distances(probability, random)
-        self._left = next(self._distances)
-
-    def within(self, length: int) -> list[int]:
-        """The positions hit in the next ``length`` places, ascending."""
-        hits = []
-        while self._left < length:
-            hits.append(int(self._left))
-            self._left += 1 + next(self._distances)
-        self._left -= length
-        return hits
-
-
-def _distances(probability: float, random: Random) -> Iterator[float]:
-    """Numbers of places not hit between two hits."""
-    if probability <= 0:
-        while True:
-            yield math.inf
-    if probability >= 1:
-        while True:
-            yield 0
-    scale = math.log1p(-probability)
-    while True:
-        yield math.log(1 - random.random()) // scale
+def _hits(probability: float, random: Random, length: int) -> list[int]:
+    """Which of the next ``length`` places are hit, each with this probability."""
+    return [at for at in range(length) if random.random() < probability] if probability else []

@@ -45,9 +45,6 @@ FLIGHT = (
 )
 """The profile, 50 s, repeated for ever."""
 
-IDLE = (Phase("idle", 60, 0, OperatingState.MotorOff),)
-"""A motor that never runs."""
-
 
 class Dropout(NamedTuple):
     """The line is silent for the last ``duration_ns`` of every ``interval_ns``."""
@@ -95,13 +92,6 @@ class EscOptions:
     device: Device = Device.KOSMIK
     layout: Layout | None = None
     """None: the device's usual one."""
-    cell_count: int = 6
-    """1..100"""
-    capacity: int = 5000
-    """mAh of the battery, 100..50000. When less than a fifth is left at the profile's end, a fresh one is plugged in: the
-    ESC powers up anew, its log and charge begin again."""
-    max_current: float = 120.0
-    """Motor current at full throttle in A, 1..600."""
     period_ns: int = 10_000_000
     """From live frame to live frame, 100 µs..10 s."""
     info_every: int = 100

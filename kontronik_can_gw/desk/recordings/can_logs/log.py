@@ -53,9 +53,7 @@ def log_format(path: Path) -> str | None:
 def reader_of(format_: str) -> Callable[..., Any]:
     """What reads a format: made from an open file and a Damage, it gives TimedFrames; RunError where a library is missing."""
     if format_ in _LINES:
-        return {"candump": text.CandumpReader, "asc": text.AscReader, "trc": text.TrcReader}[
-            format_
-        ]
+        return {"candump": text.CandumpReader, "asc": text.AscReader}.get(format_, text.TrcReader)
     from kontronik_can_gw.desk.recordings.can_logs import library
 
     return {"blf": library.BlfReader, "mf4": library.Mf4Reader}[format_]

@@ -1,16 +1,18 @@
 """Readers of candump logs, Vector ASC and PEAK TRC. A line that cannot be read is counted, the next one is read again.
 
-Times stay whole numbers of nanoseconds. ASC, which has no public specification, is read as python-can reads it. Error and remote frames
-and other events are left out.
+Times stay whole numbers of nanoseconds, of TRC of microseconds. ASC, which has no public specification, is read as python-can reads it;
+the lines of TRC by python-can itself. Error and remote frames and other events are left out.
 """
 
+import io
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
-from typing import BinaryIO
+from datetime import datetime
+from typing import Any, BinaryIO
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.lean import without_asammdf
 
 SECOND_NS = 1_000_000_000
 OLDEST_WALL_S = 631_152_000
@@ -23,11 +25,25 @@ _HEAD_LINES = 200
 _SHOWN = 8
 
 
-def is_possible(frame: CanFrame) -> bool:
-    """True where a frame with this id and number of bytes exists on a CAN bus."""
-    size = len(frame.data)
+def checked(item: TimedFrame) -> TimedFrame:
+    """The frame. ValueError where none with this id and number of bytes exists on a CAN bus."""
+    frame, size = item.frame, len(item.frame.data)
     in_range = 0 <= frame.can_id <= (0x1FFFFFFF if frame.extended else 0x7FF)
-    return in_range and (size in FD_LENGTHS if frame.fd else size <= 8)
+    if not in_range or not (size in FD_LENGTHS if frame.fd else size <= 8):
+        raise ValueError
+    return item
+
+
+def frame_of(message: Any) -> TimedFrame | None:
+    """The frame of a message of python-can; None for one without data. ValueError where it is damaged."""
+    if message.is_error_frame or message.is_remote_frame:
+        return None
+    data, dlc = bytes(message.data), message.dlc
+    if (dlc > 15 and not message.is_fd) or len(data) < (dlc if message.is_fd else min(dlc, 8)):
+        raise ValueError
+    frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
+    time_ns = round(message.timestamp * SECOND_NS)
+    return checked(TimedFrame(time_ns, frame, message.is_rx))
 
 
 class Damage:
@@ -85,13 +101,10 @@ class TextReader:
         while line := self._file.readline(LONGEST_LINE):
             try:
                 item = self._frame(line) if line.strip() else None
-                if item is not None and not is_possible(item.frame):
-                    raise ValueError
+                if item is not None:
+                    yield checked(item)
             except (ValueError, LookupError):  # of numbers, texts, lengths
                 self._damage.line(number)
-            else:
-                if item is not None:
-                    yield item
             number += line.endswith(b"\n")
 
     def _read_head(self, lines: list[bytes]) -> None:
@@ -243,14 +256,9 @@ def asc_time(words: list[str]) -> int | None:
 
 # --- PEAK TRC
 
-_TRC_COLUMNS = {"1.0": "NOIlD", "1.1": "NOdIlD", "1.3": "NOBdIRlD", "2.0": "NOTIdlD"}
-"""By version, in the letters of $COLUMNS; later ones say them."""
-_TRC_FRAMES = {"DT": False, "FD": True, "FB": True, "FE": True, "BI": True}
-"""Types of lines with a frame; True: one of CAN FD."""
 _TRC_HEAD = re.compile(
     rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE
 )
-_DAY_ZERO = datetime(1899, 12, 30, tzinfo=UTC)
 
 
 def trc_line(line: bytes) -> "re.Match[bytes] | None":
@@ -259,50 +267,28 @@ def trc_line(line: bytes) -> "re.Match[bytes] | None":
 
 
 class TrcReader(TextReader):
-    """PEAK TRC, file versions 1.0 to 2.1."""
-
-    _columns = "NOIlD"
+    """PEAK TRC, file versions 1.0, 1.1, 1.3, 2.0 and 2.1."""
 
     def _read_head(self, lines: list[bytes]) -> None:
-        for line in lines:
-            key, _, value = line.decode("latin-1").strip().partition("=")
-            if key == ";$FILEVERSION":
-                self._columns = _TRC_COLUMNS.get(value, "NOTBIdRLD")
-            elif key == ";$COLUMNS":
-                self._columns = value.replace(",", "")
-            elif key == ";$STARTTIME":
-                try:
-                    started = _DAY_ZERO + timedelta(days=float(value))
-                except (ValueError, OverflowError):
-                    continue
-                if started.timestamp() >= OLDEST_WALL_S:
-                    since = started - datetime(1970, 1, 1, tzinfo=UTC)
-                    self.wall_start_ns = since // timedelta(microseconds=1) * 1000
+        with without_asammdf():
+            from can.io.trc import TRCFileVersion, TRCReader
+        head = b"".join(line for line in lines if line.startswith(b";")).decode("latin-1")
+        self._parser = parser = TRCReader(io.StringIO(head))
+        try:
+            parser._extract_header()
+        except (ValueError, OverflowError):
+            self._damage.notes.append("its head is damaged")
+        if parser.file_version is TRCFileVersion.UNKNOWN and "$FILEVERSION=" in head:
+            parser._parse_cols = lambda _: None
+            self._damage.notes.append("its file version is not known")
+        if parser._start_time >= OLDEST_WALL_S:
+            self.wall_start_ns = round(parser._start_time * 1e6) * 1000
+        parser._start_time = 0.0
 
     def _frame(self, line: bytes) -> TimedFrame | None:
         text = line.decode("ascii").strip()
         if text.startswith(";"):
             return None
-        words = text.split(maxsplit=len(self._columns) - 1)
-        found = {"T": "DT", "d": "Rx", "D": ""} | dict(zip(self._columns, words, strict=False))
-        int(found["N"].removesuffix(")"))
-        kind, direction = found["T"], found["d"]
-        if not (kind.isalpha() and kind.isupper() and len(kind) == 2):
-            raise ValueError
-        if kind not in _TRC_FRAMES or found["I"] == "FFFFFFFF" or found["D"] == "RTR":
-            return None
-        if direction not in ("Rx", "Tx"):
-            if direction.isalpha():  # Warng and the like
-                return None
-            raise ValueError
-        is_fd = _TRC_FRAMES[kind]
-        size = FD_LENGTHS[int(found["L"])] if "L" in found else int(found["l"])
-        size = size if is_fd else min(size, 8)
-        data = bytes.fromhex("".join(found["D"].split()[:size]))
-        if len(data) != size:
-            raise ValueError
-        milliseconds = found["O"] if "." in found["O"] else found["O"] + ".0"
-        frame = CanFrame(int(found["I"], 16), data, len(found["I"]) > 4, is_fd)
-        return TimedFrame(
-            _nanoseconds(milliseconds.encode()) // 1_000_000 * 1000, frame, direction == "Rx"
-        )
+        message = self._parser._parse_cols(tuple(text.split(maxsplit=self._parser._num_columns)))
+        found = None if message is None else frame_of(message)
+        return found and found._replace(time_ns=round(found.time_ns, -3))

@@ -1,12 +1,12 @@
-"""Writes CAN frames as candump log, as ASC, BLF or TRC by python-can's writers, and as MF4 bus logging.
+"""Writes CAN frames as candump log, and as ASC, BLF, TRC or MF4 bus logging by python-can's writers.
 
-The same frames give the same bytes: no file says when it was written.
+The same frames give the same bytes, but for MF4: no other file says when it was written.
 """
 
 import io
+import warnings
 from collections.abc import Callable, Mapping
-from datetime import datetime
-from pathlib import Path
+from datetime import UTC, datetime, timedelta
 from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
@@ -27,9 +27,9 @@ _LATEST_NS = 1 << 61
 class CanLogWriter:
     """Writes one log.
 
-    ``file``: open for bytes, stays open; of MF4 a path. ``wall_start_ns``: Unix time in ns of time 0, None where unknown.
+    ``file``: open for bytes, stays open. ``wall_start_ns``: Unix time in ns of time 0, None where unknown.
     ``first_ns``: time of the first frame, where an ASC, BLF, TRC or MF4 file with the Unix time begins.
-    ``name``: what the file will be called (TRC says it).
+    ``name``: what the file will be called (TRC says it). ``provenance``: for the header of MF4, as it is known at the end.
     """
 
     write: Callable[[int, CanFrame, bool], None]
@@ -37,7 +37,7 @@ class CanLogWriter:
 
     def __init__(
         self,
-        file: "IO[bytes] | Path",
+        file: IO[bytes],
         format_: str,
         wall_start_ns: int | None,
         first_ns: int = 0,
@@ -58,16 +58,17 @@ class CanLogWriter:
             unit = 1000 if format_ == "mf4" else _MS
             start_ns = (wall_start_ns + first_ns) // unit * unit
             self._base_ns = start_ns - wall_start_ns
-        if isinstance(file, Path):
-            self._mf4(file, start_ns, provenance or {})
-        elif format_ == "candump":
-            self._candump(file, wall_start_ns or 0, channel)
-        elif format_ == "asc":
-            self._asc(file, None if wall_start_ns is None else start_ns)
-        elif format_ == "blf":
-            self._blf(file, start_ns)
-        else:
-            self._trc(file, start_ns, name)
+        match format_:
+            case "candump":
+                self._candump(file, wall_start_ns or 0, channel)
+            case "asc":
+                self._asc(file, None if wall_start_ns is None else start_ns)
+            case "blf":
+                self._blf(file, start_ns)
+            case "trc":
+                self._trc(file, start_ns, name)
+            case _:
+                self._mf4(file, start_ns, provenance or {})
 
     def write_all(self, frames: "Frames | list[TimedFrame]", origin_ns: int) -> None:
         """Add frames, whose times are those of a recording that begins at ``origin_ns``."""
@@ -118,7 +119,7 @@ class CanLogWriter:
     def _blf(self, file: IO[bytes], start_ns: int) -> None:
         with without_asammdf():
             from can import BLFWriter
-        writer = BLFWriter(file)  # type: ignore[arg-type]
+        writer = BLFWriter(_Unclosed(file))
         writer.start_timestamp = 0.0
         # half a nanosecond more: the writer cuts where it should round
         self._through(writer.on_message_received, 0.5)
@@ -127,9 +128,7 @@ class CanLogWriter:
             last = writer.stop_timestamp or 0.0
             writer.start_timestamp = start_ns / SECOND_NS
             writer.stop_timestamp = writer.start_timestamp + last
-            held, writer.file = writer.file, _Unclosed(file)  # type: ignore[assignment]
             writer.stop()
-            writer.file = held
 
         self.close = close
 
@@ -152,14 +151,32 @@ class CanLogWriter:
         self._through(take)
         self.close = self.discard = text.detach
 
-    def _mf4(self, path: Path, start_ns: int, provenance: Mapping[str, str]) -> None:
-        from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Log
+    def _mf4(self, file: IO[bytes], start_ns: int, provenance: Mapping[str, str]) -> None:
+        from kontronik_can_gw.desk.recordings.can_logs.library import mf4_library
 
-        log = Mf4Log(path, start_ns, provenance)
-        base_ns, self.close, self.discard = self._base_ns, log.save, log.discard
-        self.write = lambda time_ns, frame, received: log.write(
-            max(0, time_ns - base_ns), frame, received
+        with warnings.catch_warnings(action="ignore"):
+            writer = mf4_library().MF4Writer(file)
+        header = writer._mdf.header
+        header.start_time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(
+            microseconds=start_ns // 1000
         )
+        header.abs_time = start_ns  # asammdf itself goes through a float
+        writer._start_time = writer.last_timestamp = 0.0
+
+        def take(message: "Message") -> None:
+            message.channel = 1
+            # a master channel only rises
+            message.timestamp = max(message.timestamp, writer.last_timestamp)
+            writer.on_message_received(message)
+
+        def close() -> None:
+            header.comment = "\n".join(f"{key}: {value}" for key, value in provenance.items())
+            with warnings.catch_warnings(action="ignore"):
+                writer._mdf.save(file, compression=2)  # stop() closes the file
+                writer._mdf.close()
+
+        self._through(take)
+        self.close, self.discard = close, writer._mdf.close
 
     def _through(self, take: "Callable[[Message], None]", more_ns: float = 0.0) -> None:
         """Write by one of python-can's writers. Times go in seconds since the start, for which a float is exact enough."""

@@ -2,8 +2,7 @@
 
 import json
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
@@ -21,7 +20,7 @@ class ParquetTable:
     Flags int8, whole numbers int64 (uint64 where they need it), others float64, texts dictionaries of strings; null where not available.
     """
 
-    def __init__(self, path: Path, table: Table) -> None:
+    def __init__(self, file: IO[bytes], table: Table) -> None:
         try:
             import pyarrow as pa  # type: ignore[import-untyped]
             from pyarrow import compute, parquet
@@ -62,7 +61,7 @@ class ParquetTable:
         # a dictionary costs more than it saves where every value is another one, or takes one byte
         plain = [f"{TIME} [s]", *(one.header for one in table.fields if one.kind is Kind.FLAG)]
         self._writer: Any = parquet.ParquetWriter(
-            str(path),
+            file,
             self._schema,
             use_dictionary=[name for name in self._schema.names if name not in plain],
             memory_pool=pa.system_memory_pool(),  # the others keep what they were given once
