@@ -30,31 +30,9 @@ OWN = {
 }
 """Of our own rooms that are large, what may be there; the others are the gateway itself."""
 NEVER = (
-    *(
-        "asammdf",
-        "numpy",
-        "pandas",
-        "pyarrow",
-        "rich",
-        "pygments",
-        "jsonschema",
-        "paho",
-        "shtab",
-        "PIL",
-        "lxml",
-    ),
-    *(
-        "pytest",
-        "hypothesis",
-        "prometheus_client",
-        "tkinter",
-        "curses",
-        "multiprocessing",
-        "unittest",
-        "pydoc",
-        "doctest",
-    ),
-)
+    "asammdf numpy pandas pyarrow rich pygments jsonschema paho shtab PIL lxml pytest hypothesis "
+    "prometheus_client tkinter curses multiprocessing unittest pydoc doctest"
+).split()
 """Said once more by name, also of the standard library: the list above could be widened without a thought."""
 CONFIGURATIONS = {
     "DBC": ("", CANTOOLS),
@@ -75,7 +53,7 @@ import atexit, sys
 sys.path.append({standin!r})
 {extra}
 from standin import use
-use("unix:{bus}")
+use("{bus}")
 sys.path.pop()
 
 from kontronik_can_gw.runtime import locks
