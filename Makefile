@@ -7,9 +7,9 @@ help:
 	@echo 'make demo      show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
 	@echo 'make test      ruff, mypy, tests, the core of the tests on a real vcan   (ARGS="--only lint|types|unit|vcan -- -k crc")'
 	@echo 'make test-all  what make test leaves out: faults, systemd, browser, broker, CANopen masters of others'
-	@echo '                                        (ARGS="--only faults|tools|masters --keep FOLDER")'
+	@echo '                                        (ARGS="--only faults|tools|masters")'
 	@echo 'make release   by hand, on a quiet machine, for hours: faults on emulated hardware, random faults, a recorded hour'
-	@echo '                                        (ARGS="--only qemu|soak|hour|put-in|machines|fuzz|wheels|deb --keep FOLDER")'
+	@echo '                                        (ARGS="--only qemu|soak|hour|put-in|machines|fuzz|wheels|deb")'
 	@echo 'make soak      random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
 	@echo 'make hour      a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
 	@echo 'make bench     speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
@@ -39,7 +39,7 @@ release:
 
 soak:
 	@tests/bootstrap.sh release
-	@.venv/bin/python tests/faults/soak.py $(ARGS)
+	@.venv/bin/python tests/faults/programme.py soak $(ARGS)
 
 hour:
 	@tests/bootstrap.sh lint

@@ -1,6 +1,6 @@
 """Runs one tier of the project's checks: what `make test`, `make test-all` and `make release` call.
 
-    python tests/run.py test|test-all|release [--only STEP]... [--keep FOLDER] [-- PYTEST-ARGUMENTS...]
+    python tests/run.py test|test-all|release [--only STEP]... [-- PYTEST-ARGUMENTS...]
 
 test      lint (ruff), types (mypy), unit (pytest on this machine), vcan (pytest on a real vcan: this kernel's, or a VM's)
 test-all  what `test` leaves out: faults (the fault programme in User Mode Linux) and, by the marker "extended", tools (the service
@@ -12,7 +12,6 @@ release   by hand, on a quiet machine: qemu (the fault programme on emulated har
 The lanes of a tier run side by side. A step runs once, and what it prints appears when it ends. Exit code 0: all that ran has
 passed. What could not be run is listed with the line that enables it; with CI=true that and each skipped test is a failure. The
 last line has the totals, `N passed, M failed, K skipped`; a fault that was not judged, for want of processor time, counts as skipped.
---keep FOLDER keeps the results of the fault programme as JSON.
 """
 
 import argparse
@@ -45,17 +44,17 @@ MESSAGE = 2000
 PYTEST = "python -m pytest -q --junitxml={report}"
 ON_VCAN = f"KCG_VCAN=1 HYPOTHESIS_STORAGE_DIRECTORY={{scratch}} python tests/vm/vm_run.py --timeout=1500 --rw={{scratch}} -- {PYTEST} "
 ON_VCAN += "-p no:cacheprovider tests/vcan"
-FAULTS = "python tests/faults/{} --out={{keep}}/faults_{}.json --junit={{report}}"
+FAULTS = "python tests/faults/programme.py {0} --junit={{report}}"
 STEPS = {
     "lint": "ruff check . && ruff format --check .",
     "types": "mypy",
     "unit": f"{PYTEST} -n logical --maxprocesses=8 -m 'not extended' --ignore=tests/vcan {{args}}",
     "vcan": f"{ON_VCAN} -m 'not extended' {{args}}",
-    "faults": FAULTS.format("programme.py", "uml"),
+    "faults": FAULTS.format("uml"),
     "tools": f"{PYTEST} -m extended --ignore=tests/vcan {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
-    "qemu": FAULTS.format("qemu_programme.py", "qemu"),
-    "soak": FAULTS.format("soak.py", "soak") + " --minutes=60",
+    "qemu": FAULTS.format("qemu"),
+    "soak": FAULTS.format("soak") + " --minutes=60",
     "hour": "python tests/hour/hour_programme.py",
     "put-in": "python tests/mutants/put_in_faults.py",
     "wheels": "python tests/native/wheels.py {scratch}",
@@ -164,16 +163,14 @@ def missing(step: str) -> str:
     return ""
 
 
-def run(
-    step: str, limit_s: float, scratch: Path, keep: Path, arguments: Sequence[str], live: bool
-) -> Result:
+def run(step: str, limit_s: float, scratch: Path, arguments: Sequence[str], live: bool) -> Result:
     """Run a step; its output comes at once if ``live``, else as a whole at its end."""
     result = Result(step)
     if lacking := missing(step):
         result.note, result.enable = f"there is no {lacking}", NEEDS[step][1]
         return result
     report = scratch / f"{step}.xml"
-    words = {"report": report, "scratch": scratch, "keep": keep}
+    words = {"report": report, "scratch": scratch}
     quoted = {key: shlex.quote(str(value)) for key, value in words.items()}
     command = STEPS[step].format(args=shlex.join(arguments), **quoted)
     with printing:
@@ -269,7 +266,6 @@ def main() -> int:
     )
     parser.add_argument("tier", choices=TIERS)
     parser.add_argument("--only", action="append", choices=STEPS, metavar="STEP")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER")
     args = parser.parse_args(own)
     lanes = [
         [step for step in lane if args.only is None or step in args.only]
@@ -285,13 +281,10 @@ def main() -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda number, _frame: leave(folder, number))
         scratch = Path(folder)
-        keep = args.keep.resolve() if args.keep else scratch
-        keep.mkdir(parents=True, exist_ok=True)
 
         def run_lane(lane: Sequence[str]) -> list[Result]:
             return [
-                run(step, LIMIT_S[args.tier], scratch, keep, arguments, len(lanes) == 1)
-                for step in lane
+                run(step, LIMIT_S[args.tier], scratch, arguments, len(lanes) == 1) for step in lane
             ]
 
         with ThreadPoolExecutor(len(lanes)) as pool:

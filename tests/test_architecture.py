@@ -170,17 +170,6 @@ def test_the_run_path_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_what_runs_does_not_import_asammdf() -> None:
-    code = (
-        "import sys; from pathlib import Path; from kontronik_can_gw.config.keys import CanConfig, shipped; "
-        "from kontronik_can_gw.dbc.reader import load_database; from kontronik_can_gw.runtime.open_can import open_can; "
-        "load_database(shipped('dbc/kontronik_esc.dbc')); open_can(CanConfig('virtual', 'x')).close(); "
-        "print([m for m in ('asammdf', 'numpy', 'pandas', 'rich', 'canopen') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_only_the_packer_makes_functions_of_text() -> None:
     """``signals/packer.py`` generates a function from a plan's numbers, and nobody else sees the text."""
     makers = {

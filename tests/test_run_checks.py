@@ -9,7 +9,7 @@ import run as checks
 
 CASES = {
     "passed": "<testcase classname='a' name='b'/>",
-    "failed": "<testcase><failure/></testcase>",
+    "failed": "<testcase name='crc'><failure message='3 is not 4'>trace</failure></testcase>",
     "broken": "<testcase><error/></testcase>",
     "skipped": "<testcase><skipped message='no such tool'/></testcase>",
     "not judged": "<testcase><skipped message='not judged: 31 % of the processor time was taken'/></testcase>",
@@ -25,7 +25,7 @@ def step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         report.write_text(f"<testsuite>{''.join(CASES[case] for case in cases)}</testsuite>")
         copy = f"cp {report} {{report}}; " if cases else ": {report}; "
         monkeypatch.setitem(checks.STEPS, "unit", f"echo ran >>{tmp_path}/ran; {copy}{command}")
-        result = checks.run("unit", 60, tmp_path, tmp_path, arguments, False)
+        result = checks.run("unit", 60, tmp_path, arguments, False)
         assert (tmp_path / "ran").read_text() == "ran\n", "once, whatever came of it"
         return result
 
@@ -49,34 +49,39 @@ def test_a_step_is_what_its_report_and_its_exit_code_say(
 ) -> None:
     result = step(command, *cases)
     assert (result.passed, result.failed, len(result.skipped), result.state) == (*counts, state)
+    assert (".crc: 3 is not 4" in result.failures) == ("failed" in cases)
 
 
 def test_a_choice_that_fits_no_test_of_a_step_is_no_failure_of_it(step: Any) -> None:
     assert step("exit 5", arguments=("-k", "crc")).state == "passed"
 
 
-@pytest.mark.parametrize(("command", "state"), [("true", "passed"), ("exit 1", "FAILED")])
+@pytest.mark.parametrize(
+    ("command", "limit_s", "failed", "note"),
+    [
+        ("true", 60, 0, ""),
+        ("exit 1", 60, 1, ""),
+        ("sleep 600", 0.1, 1, "no end within 0.1 s"),
+    ],
+)
 def test_a_step_without_tests_is_one_check(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, state: str
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    command: str,
+    limit_s: float,
+    failed: int,
+    note: str,
 ) -> None:
     monkeypatch.setitem(checks.STEPS, "lint", command)
-    result = checks.run("lint", 60, tmp_path, tmp_path, (), False)
-    assert (result.passed + result.failed, result.state) == (1, state)
-
-
-def test_a_step_that_does_not_end_is_ended_and_has_failed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setitem(checks.STEPS, "lint", "sleep 600")
-    result = checks.run("lint", 0.1, tmp_path, tmp_path, (), False)
-    assert (result.state, result.note) == ("FAILED", "no end within 0.1 s")
+    result = checks.run("lint", limit_s, tmp_path, (), False)
+    assert (result.passed, result.failed, result.note) == (1 - failed, failed, note)
 
 
 def test_what_is_missing_is_not_run_and_the_remedy_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(checks.NEEDS, "faults", (("no-such-program",), "sudo make one"))
-    result = checks.run("faults", 60, tmp_path, tmp_path, (), False)
+    result = checks.run("faults", 60, tmp_path, (), False)
     assert (result.state, result.note) == ("not run", "there is no no-such-program")
     assert checks.summarize([result], strict=False) == 0
     assert checks.summarize([result], strict=True) == 1
@@ -100,30 +105,18 @@ def test_the_last_line_has_the_totals(
     code: int,
     strict_code: int,
 ) -> None:
-    results = [checks.Result("unit", 1.0, passed, failed, skipped), checks.Result("lint", 1.0, 1)]
+    failures = ["a.crc: 3 is not 4"] * failed
+    results = [
+        checks.Result("unit", 1.0, passed, failed, skipped, failures),
+        checks.Result("lint", 1.0, 1),
+    ]
     assert checks.summarize(results, strict=False) == code
     *lines, last = capsys.readouterr().out.splitlines()
+    assert lines.count("failed: a.crc: 3 is not 4") == failed
     assert sum(line.startswith("skipped: ") for line in lines) == len({why for _, why in skipped})
     assert last == f"{passed + 1} passed, {failed} failed, {len(skipped)} skipped"
     assert re.fullmatch(r"\d+ passed, \d+ failed, \d+ skipped", last), "what CI reads"
     assert checks.summarize(results, strict=True) == strict_code
-
-
-def test_what_failed_is_named_with_its_message_before_the_totals(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    report = tmp_path / "report.xml"
-    report.write_text(
-        '<testsuites><testsuite><testcase classname="faults.UML" name="CAN: down">'
-        '<failure message="recovered only after 7.00 s">trace</failure></testcase>'
-        '<testcase classname="tests.a" name="good"/></testsuite></testsuites>'
-    )
-    result = checks.Result("faults")
-    checks.read_report(report, result)
-    assert checks.summarize([result], strict=False) == 1
-    *_, failed, totals = capsys.readouterr().out.splitlines()
-    assert failed == "failed: faults.UML.CAN: down: recovered only after 7.00 s"
-    assert totals == "1 passed, 1 failed, 0 skipped"
 
 
 def test_every_step_is_in_one_tier_and_a_test_of_each_marker_is_run_somewhere() -> None:

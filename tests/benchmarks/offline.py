@@ -1,4 +1,4 @@
-"""Conversion of captures and of UART bytes to candump logs and tables, by the core in C and by the one in Python.
+"""Conversion of captures and of UART bytes to candump logs and tables.
 
 The bytes are a simulated flight of four minutes, over and over.
 
@@ -9,13 +9,12 @@ import argparse
 import json
 import os
 import random
-import re
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from programs import FIVE, median
 from registry import Context, Figure, benchmark, judged
@@ -40,57 +39,33 @@ def flight(context: Context) -> bytes:
     return file.read_bytes()
 
 
-def recording(context: Context, megabytes: int) -> Path:
-    """A file of about that size."""
-    file = context.folder / f"bytes-{megabytes}.bin"
-    if not file.exists():
-        once = flight(context)
-        file.write_bytes(once * (megabytes * _MB // len(once) + 1))
-    return file
-
-
 # --- one run
 
 
-@dataclass
-class Run:
-    """One conversion. ``told``: in words, how much was written."""
+class Run(NamedTuple):
+    """One conversion: CPU time without the start of the program, and in words how much was written."""
 
     cpu_s: float
-    wall_s: float
-    peak_mb: float
-    told: str
+    written: str
 
     @property
-    def count(self) -> int:
+    def rows_per_s(self) -> float:
         """Rows or frames."""
-        return int(self.told.split()[0])
+        return int(self.written.split()[0]) / self.cpu_s
 
 
-def converted(context: Context, form: str) -> Path:
-    return context.folder / f"converted{'.log' if form == 'candump' else f'.{form}'}"
-
-
-def convert(
-    context: Context, form: str, source: Path, *options: object, python: bool = False
-) -> Run:
-    """One conversion in a process of its own, into ``converted``. ``python``: without the core in C."""
-    command = [sys.executable, __file__, form, source, converted(context, form), *options]
+def convert(context: Context, form: str, source: Path, *options: object) -> Run:
+    """One conversion in a process of its own."""
+    target = context.folder / f"converted{'.log' if form == 'candump' else f'.{form}'}"
+    command = [sys.executable, __file__, form, source, target, *options]
     # what is compiled at the first run is there from then on
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    environment["KONTRONIK_PURE"] = "1" if python else "0"
     done = subprocess.run(
         list(map(str, command)), capture_output=True, text=True, timeout=3600, env=environment
     )
     if done.returncode:
         raise RuntimeError(f"{form}: {(done.stderr.strip().splitlines() or ['no word'])[-1]}")
-    return Run(**json.loads(done.stdout))
-
-
-def best(context: Context, form: str, source: Path, *options: object) -> Run:
-    """The quickest of the rounds."""
-    runs = [convert(context, form, source, *options) for _ in range(context.rounds)]
-    return min(runs, key=lambda run: run.cpu_s)
+    return Run(*json.loads(done.stdout))
 
 
 def convert_here(arguments: list[str]) -> Run:
@@ -118,12 +93,10 @@ def convert_here(arguments: list[str]) -> Run:
             names = LiveData._fields if args.live else ()
             choice = Choice.of(recording.fields, names)
             convert_all = partial(to_table, form=args.form, choice=choice)
-        cpu, wall = time.process_time(), time.perf_counter()
+        begun = time.process_time()
         with Output(Path(args.target), args.form) as out:
-            told = convert_all(recording, out, lambda position: None)
-        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-    peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    return Run(cpu, wall, int(peak[1]) / 1024 if peak else 0.0, f"{told}")
+            written = convert_all(recording, out, lambda position: None)
+        return Run(time.process_time() - begun, str(written))
 
 
 # --- benchmarks
@@ -160,53 +133,43 @@ def capture(context: Context, seconds: int, noise: bool = False) -> Path:
     return file
 
 
-@benchmark(
-    "offline-capture", "an hour's capture of one ESC; with noise; by the core in C and by Python"
-)
+@benchmark("offline-capture", "an hour's capture of one ESC, and the same with noise")
 def captures(context: Context) -> list[Figure]:
-    """Seconds of CPU without the start of the program. Python is given a tenth of it."""
+    """Seconds of CPU without the start of the program."""
     figures, seconds = [], 60 if context.quick else 3600
     clean, noisy = capture(context, seconds), capture(context, seconds, noise=True)
-    short, hours = capture(context, seconds // 10), 3600 / seconds
-    forms = (
-        ("candump", (), ""),
-        ("parquet", ("--live",), ">= 400000"),
-        ("parquet", (), ">= 120000"),
-    )
-    for form, options, least in forms:
+    for name, form, options, least in (
+        ("candump", "candump", (), ""),
+        ("parquet, 16 values", "parquet", ("--live",), ">= 400000"),
+        ("parquet, all values", "parquet", (), ">= 120000"),
+    ):
         rounds = [
-            [convert(context, form, each, *options) for each in (clean, noisy)]
-            + [convert(context, form, short, *options, python=True)]
+            (convert(context, form, clean, *options), convert(context, form, noisy, *options))
             for _ in range(context.rounds)
         ]
-        name = f"{form}{', 16 values' if options else ', all values' if least else ''}"
-        spent = median([first.cpu_s for first, _, _ in rounds]) * hours
-        figures.append(judged(f"{name}, an hour", spent, "s", "<= 2", rounds[0][0].told))
-        noise = median([noisy.cpu_s / first.cpu_s for first, noisy, _ in rounds])
+        spent = median([one.cpu_s for one, _ in rounds]) * 3600 / seconds
+        figures.append(judged(f"{name}, an hour", spent, "s", "<= 2", rounds[0][0].written))
+        noise = median([noisy.cpu_s / one.cpu_s for one, noisy in rounds])
         figures.append(judged(f"{name}, with noise / without", noise, "x", "<= 1.5"))
-        gain = median([10 * python.cpu_s / first.cpu_s for first, _, python in rounds])
-        figures.append(Figure(f"{name}, Python / C", gain, "x"))
-        if least:
-            rows = median([first.count / first.cpu_s for first, _, _ in rounds])
-            figures.append(judged(f"{name}, rows", rows, "rows/s", least))
+        rows = median([one.rows_per_s for one, _ in rounds])
+        figures.append(judged(f"{name}, rows", rows, "rows/s", least))
     return figures
 
 
 @benchmark("offline-bytes", "UART bytes at full speed: MB a CPU second")
 def plain_bytes(context: Context) -> list[Figure]:
-    """Of the deframer alone, and of conversions without the start of the program."""
-    source, figures = recording(context, 1 if context.quick else 20), []
+    """Of the deframer alone, and of conversions without the start of the program; the quickest of the rounds."""
+    source, once = context.folder / "bytes.bin", flight(context)
+    source.write_bytes(once * ((1 if context.quick else 20) * _MB // len(once) + 1))
     size = source.stat().st_size / _MB
-    aims = {
-        "candump": (("--dbc", FIVE), ">= 80"),
-        "parquet": (("--live",), ">= 70"),
-        "csv": (("--live",), ">= 30"),
-    }
-    figures.append(judged("scan", size / min(scan(source) for _ in range(7)), "MB/s", ">= 900"))
-    for form, (options, aim) in aims.items():
-        run = best(context, form, source, *options)
-        figures.append(judged(f"{form}, bytes", size / run.cpu_s, "MB/s", aim, run.told))
-        figures.append(judged(f"{form}, peak memory", run.peak_mb, "MB", "<= 250"))
+    figures = [judged("scan", size / min(scan(source) for _ in range(7)), "MB/s", ">= 900")]
+    for form, options, aim in (
+        ("candump", ("--dbc", FIVE), ">= 80"),
+        ("parquet", ("--live",), ">= 70"),
+        ("csv", ("--live",), ">= 30"),
+    ):
+        run = min(convert(context, form, source, *options) for _ in range(context.rounds))
+        figures.append(judged(f"{form}, bytes", size / run.cpu_s, "MB/s", aim, run.written))
     return figures
 
 
@@ -228,4 +191,4 @@ def scan(source: Path) -> float:
 
 
 if __name__ == "__main__":
-    print(json.dumps(vars(convert_here(sys.argv[1:]))))
+    print(json.dumps(convert_here(sys.argv[1:])))

@@ -91,9 +91,7 @@ class Feeder:
     def __init__(
         self, context: Context, escs: int, *options: str, seconds: float | None = None
     ) -> None:
-        self.bus = (
-            f"can:{context.vcan}" if context.vcan else f"unix:kontronik-{uuid.uuid4().hex[:12]}"
-        )
+        self.bus = f"kontronik-{uuid.uuid4().hex[:12]}"
         program = context.compiled("feeder.c", "-pthread")
         length = context.seconds if seconds is None else seconds
         warmup = 0.5 if context.quick else 2.0
@@ -101,27 +99,20 @@ class Feeder:
         words = f"--bus {self.bus} --escs {escs} --seconds {length} --warmup {warmup}"
         command = [str(program), *words.split(), "--priority", str(_PRIORITY), *options]
         self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        self._heard = ""
         self.ports: list[str] = self._line()["ports"]
 
-    def _hear(self, gateway: "Gateway | None" = None) -> bool:
-        """Take in what the feeder says next; whether it goes on."""
+    def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
+        """What the feeder says next."""
         assert self.process.stdout is not None
-        fd, deadline = self.process.stdout.fileno(), time.monotonic() + self._limit_s
-        while not select.select([fd], [], [], 0.2)[0]:
+        deadline = time.monotonic() + self._limit_s
+        while not select.select([self.process.stdout], [], [], 0.2)[0]:
             if gateway is not None:
                 gateway.check()
             if time.monotonic() > deadline:
                 raise RuntimeError("the feeder says nothing more")
-        data = os.read(fd, 1 << 16)
-        self._heard += data.decode()
-        return data != b""
-
-    def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
-        while "\n" not in self._heard:
-            if not self._hear(gateway):
-                raise RuntimeError(f"the feeder ended: exit code {self.process.wait()}")
-        line, _, self._heard = self._heard.partition("\n")
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"the feeder ended: exit code {self.process.wait()}")
         return cast(dict[str, Any], json.loads(line))
 
     def measure(self, gateway: "Gateway") -> Measured:
@@ -134,12 +125,6 @@ class Feeder:
         result = self._line()
         frames = max(1, ended - begun)
         return Measured(used / 1000 / frames, used / took, result["sent"], result["lost"], result)
-
-    def rest(self, gateway: "Gateway") -> list[str]:
-        """All lines until the feeder ends."""
-        while self._hear(gateway):
-            pass
-        return self._heard.splitlines()
 
     def close(self) -> None:
         end(self.process, 0.5)
@@ -154,24 +139,24 @@ class Gateway:
         program: str,
         feeder: Feeder,
         config: str = "",
-        dbc: Path | None = FIVE,
+        dbc: Path = FIVE,
         wrap: Callable[[list[str]], list[str]] = list,
     ) -> None:
         """``config``: further lines of our configuration, tables at their end. ``wrap`` makes another command of the command."""
         self._folder = tempfile.TemporaryDirectory(prefix="kontronik-bench-")
         self.folder = folder = Path(self._folder.name)
-        channel = context.vcan or "lo"
         if program == "c":
             command = [str(context.compiled("gateway.c")), feeder.bus, *feeder.ports]
         else:
             command = [sys.executable, str(STANDIN), feeder.bus, program]
             if program == "obvious":
-                command += [str(FIVE), channel, *feeder.ports]
+                command += [str(FIVE), "lo", *feeder.ports]
             else:
-                text = config_text(feeder.ports, channel, dbc, folder, config)
+                text = config_text(feeder.ports, dbc, folder, config)
                 (folder / "gateway.toml").write_text(text)
                 command += ["run", "-c", str(folder / "gateway.toml")]
         self._errors = (folder / "errors").open("w+")
+        # what is compiled at the first run is there from then on
         same = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""}
         nothing = subprocess.DEVNULL
         self.process = start(
@@ -196,14 +181,10 @@ class Gateway:
         self._folder.cleanup()
 
 
-def config_text(
-    ports: Sequence[str], channel: str, dbc: Path | None, folder: Path, further: str = ""
-) -> str:
-    """Our configuration. ``dbc`` None: the shipped one. ``further`` may begin with lines of [dbc]."""
-    lines = ["[can]", 'interface = "socketcan"', f'channel = "{channel}"', "[dbc]"]
-    if dbc is not None:
-        lines += [f'file = "{dbc}"']
-    lines += [further, ""]
+def config_text(ports: Sequence[str], dbc: Path, folder: Path, further: str = "") -> str:
+    """Our configuration; the 1 Mbit/s are what its bus load is compared with."""
+    lines = ["[can]", 'interface = "socketcan"', 'channel = "lo"', "bitrate = 1000000"]
+    lines += ["[dbc]", f'file = "{dbc}"', further]
     if "[statistics]" not in further:
         lines += ["[statistics]", f'file = "{folder / "status.json"}"']
     for index, port in enumerate(ports):
@@ -241,7 +222,7 @@ def once(context: Context, program: str, escs: int, *options: str, **further: An
     delay = measured.delay
     context.say(
         f"{program} {escs:3} ESC: {measured.cpu_us:7.1f} us/frame, {measured.cpu_share:5.1%} of a core, lost {measured.lost} of "
-        f"{5 * measured.sent}, delay {delay['p50']} / {delay['p99']} / {delay['max']:.0f} us {' '.join(options)}"
+        f"{5 * measured.sent}, delay {delay['p50']} / {delay['p99']} / {delay['max']:.0f} us"
     )
     return measured
 

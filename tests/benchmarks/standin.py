@@ -1,8 +1,7 @@
 """Starts a gateway on a bus that is no CAN interface, for kernels without one: each CAN socket is a local one that leads to the feeder.
 
-    python standin.py unix:NAME ours run -c FILE      the real gateway's own command line
-    python standin.py unix:NAME obvious DBC lo PORT...
-    python standin.py can:vcan0 ours run -c FILE      on a real interface nothing is replaced
+    python standin.py NAME ours run -c FILE      the real gateway's own command line
+    python standin.py NAME obvious DBC lo PORT...
 
 Only how the socket is made, and its options, are replaced: ``send`` and ``recv`` are the C methods. Frames have the bytes of a raw CAN
 socket, and the local socket keeps them apart.
@@ -21,17 +20,12 @@ class BusSocket(socket.socket):
 
     name = ""
 
-    def __init__(
-        self,
-        family: int = -1,
-        type: int = -1,  # noqa: A002
-        proto: int = -1,
-        fileno: int | None = None,
-    ) -> None:
+    def __init__(self, family: int = -1, kind: int = -1, *further: Any) -> None:
         self.is_bus = family == socket.AF_CAN
         if self.is_bus:
-            family, type, proto = socket.AF_UNIX, socket.SOCK_SEQPACKET, 0  # noqa: A001
-        super().__init__(family, type, proto, fileno)
+            super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        else:
+            super().__init__(family, kind, *further)
 
     def bind(self, address: Any, /) -> None:
         if self.is_bus:
@@ -47,10 +41,8 @@ class BusSocket(socket.socket):
 
 def use(bus: str) -> None:
     """From now on CAN sockets of this process lead to ``bus``."""
-    kind, _, name = bus.partition(":")
-    if kind == "unix":
-        BusSocket.name = name
-        socket.socket = BusSocket  # type: ignore[misc]
+    BusSocket.name = bus
+    socket.socket = BusSocket  # type: ignore[assignment, misc]
 
 
 def main(arguments: list[str]) -> int:

@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self
 
-from encoding import info_values, live_values
 from feeder import CURRENT, SPEED, FedEsc
 from raw_bus import EXTENDED, FRAME, SO_RCVBUFFORCE
 from signals import Message, Table
@@ -36,16 +35,13 @@ class Wrong(NamedTuple):
     """A value that should not have been on the bus."""
 
     at_ns: int
-    message: str
-    data: str
-    why: str
+    what: str
     since_ns: int | None = None
     """Where it is right but old: when it was sent."""
     excess_ns: int = 0
     """And by how much it is too old."""
-    esc: int = 0
-    n: int = -1
-    follows: int = 0
+    shown: tuple[int, int, int] | None = None
+    """And the ESC, the number of its live frame and which message it is."""
 
 
 class Fresh(NamedTuple):
@@ -59,7 +55,6 @@ class Emergency(NamedTuple):
     at_ns: int
     node: int
     code: int
-    data: bytes
 
 
 class Said(NamedTuple):
@@ -68,22 +63,14 @@ class Said(NamedTuple):
     at_ns: int
     message: Message
     esc: int
-    data: bytes
     present: list[tuple[str, float, float]]
     """Name, value and half a step."""
     flags: int | None
     """The error bits, where the message has any and they hold."""
 
-    @property
-    def name(self) -> str:
-        return f"Esc{self.esc + 1}{self.message.stem}"
-
-    @property
-    def text(self) -> str:
-        return ", ".join(f"{name} {value:g}" for name, value, _ in self.present)
-
-    def wrong(self, why: str) -> Wrong:
-        return Wrong(self.at_ns, self.name, self.data.hex(), why)
+    def wrong(self, why: str, *further: Any) -> Wrong:
+        values = ", ".join(f"{name} {value:g}" for name, value, _ in self.present)
+        return Wrong(self.at_ns, f"{self.message.name}: {values}: {why}", *further)
 
     def is_of(self, values: dict[str, float]) -> bool:
         same = all(abs(values[name] - value) <= half for name, value, half in self.present)
@@ -97,6 +84,10 @@ class Judge:
         self.table = table
         self.escs = escs
         self.slack_ns = slack_ns
+        self.more_ns = 0
+        """Slack besides, for a while: what a bus or an adapter holds nobody can take back."""
+        self.by_more = 0
+        """Values that were right only because of it."""
         self.wrong: list[Wrong] = []
         """The newest ones, settled."""
         self.wrong_count = 0
@@ -114,61 +105,29 @@ class Judge:
         self.emergencies: list[Emergency] = []
         self.fresh: list[deque[Fresh]] = [deque(maxlen=5_000) for _ in escs]
         """The EscSpeed frames that were right."""
-        self._silences: list[list[tuple[int, int]]] = [[] for _ in escs]
         self.last_ns = 0
-        self._silent_since_ns = 0
-        self._shown = [-1 for _ in escs]
         self._suspects: list[Wrong] = []
         # CAN id -> number of the newest live frame that it has carried
         self._newest: dict[int, int] = {}
         self._bits: dict[str, tuple[Message, int]] = {}  # message name -> message, content
         self._nodes = set(range(1, len(escs) + 1))
-        self._live: list[dict[int, dict[str, float]]] = [{} for _ in escs]
-        self._info: list[dict[int, dict[str, float]]] = [{} for _ in escs]
         self._devices: list[int | None] = [None for _ in escs]
 
     def take(self, can_id: int, data: bytes, at_ns: int) -> None:
         """A classic frame with an 11-bit identifier that the gateway has sent."""
         self.last_ns = at_ns
-        if can_id > 0x700 and can_id - 0x700 in self._nodes and len(data) == 1:
-            if data[0] == 0:
-                self.boot_ups.append((at_ns, can_id - 0x700))
-            return
-        if 0x80 < can_id <= 0xFF and can_id - 0x80 in self._nodes and len(data) == 8:
-            self.emergencies.append(
-                Emergency(at_ns, can_id - 0x80, int.from_bytes(data[:2], "little"), data)
-            )
-            return
-        message = self.table.get(can_id)
-        if message is None:
-            return
         bits = int.from_bytes(data, "little")
-        if message.kind == "other":
-            name = message.stem if message.esc is None else f"Esc{message.esc + 1}{message.stem}"
-            self._bits[name] = (message, bits)
+        if can_id - 0x700 in self._nodes and data == b"\0":
+            self.boot_ups.append((at_ns, can_id - 0x700))
+        elif can_id - 0x80 in self._nodes and len(data) == 8:
+            self.emergencies.append(Emergency(at_ns, can_id - 0x80, bits & 0xFFFF))
+        elif message := self.table.get(can_id):
+            if message.kind != "other":
+                self._judge_values(message, bits, at_ns)
+                return
+            self._bits[message.name] = message, bits
             if message.stem == "Link":
-                self._judge_age(message, bits, at_ns)
-            return
-        present = []
-        for place in message.places:
-            raw = place.raw(bits)
-            if raw != place.not_available:
-                present.append((place.name, raw * place.scale, place.scale / 2 + 1e-9))
-        if not present:
-            self.marked += 1
-            return
-        start, mask = message.flags
-        has_state = mask and any(name in ("operating_state", "device") for name, _, _ in present)
-        assert message.esc is not None
-        said = Said(
-            at_ns,
-            message,
-            message.esc,
-            data,
-            present,
-            (bits >> start & mask) if has_state else None,
-        )
-        (self._judge_info if message.kind == "info" else self._judge_live)(said)
+                self._judge_age(message, at_ns)
 
     def value(self, message: str, signal: str) -> int | None:
         """The newest raw value of a signal of the gateway's own messages or of ``EscNLink``; None before the first."""
@@ -183,15 +142,25 @@ class Judge:
 
     def first_fresh(self, esc: int, after_ns: int, sent_after_ns: int = 0) -> Fresh | None:
         """The first right value frame of an ESC after a time, of a live frame that was sent after another."""
-        found, back = None, 1
-        frames, sent = self.fresh[esc], self.escs[esc].sent
-        while back <= len(frames):  # not by iterating: the judge goes on meanwhile
-            fresh = frames[-back]
+        found = None
+        for fresh in reversed(tuple(self.fresh[esc])):  # a copy: the judge goes on meanwhile
             if fresh.at_ns <= after_ns:
                 break
-            if sent[fresh.n] >= sent_after_ns:
+            if self.escs[esc].sent[fresh.n] >= sent_after_ns:
                 found = fresh
-            back += 1
+        return found
+
+    def silences(self, esc: int, begin_ns: int, end_ns: int) -> list[tuple[int, int]]:
+        """Begin and end of each time in which an ESC had sent something newer than what was on the bus.
+
+        (While it sends nothing, because it is off or its feeder is held up, the gateway cannot be silent.)
+        """
+        fed, shown, found = self.escs[esc], -1, []
+        for fresh in (*tuple(self.fresh[esc]), Fresh(end_ns, len(self.escs[esc].sent) - 1)):
+            since_ns = max(fed.left(shown + 1), begin_ns) if fresh.n > shown else fresh.at_ns
+            if fresh.at_ns > since_ns:
+                found.append((since_ns, fresh.at_ns))
+            shown = fresh.n
         return found
 
     def settle(self, stood_still: Callable[[int, int], int]) -> None:
@@ -202,147 +171,95 @@ class Judge:
             # short standstills between the long ones are not noted: four fifths have to be
             if each.since_ns is not None and 5 * stood >= 4 * each.excess_ns:
                 self.late_count += 1
-                if each.follows:
-                    self.escs[each.esc].seen[each.n] |= each.follows
+                if each.shown:
+                    esc, n, follows = each.shown
+                    self.escs[esc].seen[n] |= follows
             else:
                 self.wrong_count += 1
                 self.old_count += each.since_ns is not None
-                if stood:
-                    each = each._replace(
-                        why=f"{each.why}; the machine stood still for {stood // MS} ms of it"
-                    )
-                self.wrong.append(each)
+                still = f"; the machine stood still for {stood // MS} ms of it" if stood else ""
+                self.wrong.append(each._replace(what=each.what + still))
                 del self.wrong[:-KEPT]
-
-    def forgive(self, most: int, begin_ns: int, end_ns: int) -> int:
-        """Take back so many settled values of that time at most that were right but old; how many it were."""
-        old = [
-            each
-            for each in self.wrong
-            if each.since_ns is not None and begin_ns <= each.at_ns <= end_ns
-        ][:most]
-        for each in old:
-            self.wrong.remove(each)
-            self.wrong_count -= 1
-            self.old_count -= 1
-            if each.follows:
-                self.escs[each.esc].seen[each.n] |= each.follows
-        return len(old)
-
-    def reset_silence(self) -> None:
-        """Note silences anew."""
-        self._silent_since_ns = time.monotonic_ns()
-        self._silences = [[] for _ in self.escs]
-
-    def silences(self, esc: int, now_ns: int) -> list[tuple[int, int]]:
-        """Begin and end of each time since ``reset_silence`` in which an ESC had sent something newer than what was on the bus.
-
-        (While it sends nothing, because it is off or its feeder is held up, the gateway cannot be silent.)
-        """
-        return [*self._silences[esc], *self._silence(esc, len(self.escs[esc].sent) - 1, now_ns)]
-
-    def _silence(self, esc: int, n: int, at_ns: int) -> list[tuple[int, int]]:
-        first = self._shown[esc] + 1
-        if first > n:
-            return []
-        begin_ns = max(self.escs[esc].left(first), self._silent_since_ns)
-        return [(begin_ns, at_ns)] if at_ns > begin_ns else []
 
     # --- judging
 
+    def _judge_values(self, message: Message, bits: int, at_ns: int) -> None:
+        present = []
+        for place in message.places:
+            raw = place.raw(bits)
+            if raw != place.not_available:
+                present.append((place.name, raw * place.scale, place.scale / 2 + 1e-9))
+        if not present:
+            self.marked += 1
+            return
+        start, mask = message.flags
+        holds = mask and any(name in ("operating_state", "device") for name, _, _ in present)
+        assert message.esc is not None
+        said = Said(at_ns, message, message.esc, present, (bits >> start & mask) if holds else None)
+        (self._judge_info if message.kind == "info" else self._judge_live)(said)
+
     def _judge_live(self, said: Said) -> None:
-        esc, at_ns = self.escs[said.esc], said.at_ns
-        n = newest = esc.newest(at_ns + MS)
-        while n >= 0 and at_ns - esc.left(n) <= TIMEOUT_NS + self.slack_ns:
-            if self._is_live(said, said.esc, n):
+        fed, at_ns, can_id = self.escs[said.esc], said.at_ns, said.message.can_id
+        limit_ns = TIMEOUT_NS + self.slack_ns
+        n = newest = fed.newest(at_ns + MS)
+        while n >= 0 and at_ns - fed.left(n) <= limit_ns + self.more_ns:
+            if said.is_of(fed.values(n)):
                 break
             n -= 1
         else:
             self._suspects.append(self._origin(said, n, newest))
             return
-        newer = self._newest.get(said.message.can_id, -1)
+        newer = self._newest.get(can_id, -1)
         if n < newer:
             self._suspects.append(said.wrong(f"values of frame {n} after those of frame {newer}"))
             return
-        self._newest[said.message.can_id] = n
+        self._newest[can_id] = n
         self.values += 1
-        if follows := _FOLLOWS.get(said.message.stem):
-            esc.seen[n] |= follows
-            if follows == SPEED:
-                self.fresh[said.esc].append(Fresh(at_ns, n))
-                self._silences[said.esc] += self._silence(said.esc, n, at_ns)
-                self._shown[said.esc] = n
+        self.by_more += at_ns - fed.left(n) > limit_ns
+        follows = _FOLLOWS.get(said.message.stem, 0)
+        fed.seen[n] |= follows
+        if follows == SPEED:
+            self.fresh[said.esc].append(Fresh(at_ns, n))
 
     def _origin(self, said: Said, older: int, newest: int) -> Wrong:
         """Where values come from that none of the newest frames had."""
         fed = self.escs[said.esc]
-        for n in range(older, max(0, newest - LOOKED_BACK) - 1, -1):
-            if self._is_live(said, said.esc, n, keep=False):
+        for n in range(older, max(-1, newest - LOOKED_BACK), -1):
+            if said.is_of(fed.values(n)):
                 age = said.at_ns - fed.left(n)
-                return said.wrong(f"old: frame {n}, sent {age / SECOND:.3f} s before")._replace(
-                    since_ns=fed.sent[n],
-                    excess_ns=age - TIMEOUT_NS - self.slack_ns,
-                    esc=said.esc,
-                    n=n,
-                    follows=_FOLLOWS.get(said.message.stem, 0),
-                )
-        for other, another in enumerate(self.escs):
-            last = another.newest(said.at_ns) if other != said.esc else -1
-            for n in range(last, max(-1, last - 20), -1):
-                if self._is_live(said, other, n, keep=False):
-                    return said.wrong(f"of another ESC: frame {n} of esc{other + 1}")
-        return said.wrong(f"never sent: {said.text}; newest frame {newest}")
+                shown = said.esc, n, _FOLLOWS.get(said.message.stem, 0)
+                excess = age - TIMEOUT_NS - self.slack_ns
+                why = f"old: frame {n}, sent {age / SECOND:.3f} s before"
+                return said.wrong(why, fed.sent[n], excess, shown)
+        return said.wrong(f"never sent; newest frame {newest}")
 
     def _judge_info(self, said: Said) -> None:
-        esc = self.escs[said.esc]
-        m = newest = esc.newest_info(said.at_ns + MS)
-        while m >= 0 and said.at_ns - esc.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
-            values = self._info[said.esc].get(m)
-            if values is None:
-                values = info_values(esc.info(m)) | {"flags": 0}
-                self._keep(self._info[said.esc], m, values)
+        fed = self.escs[said.esc]
+        m = newest = fed.newest_info(said.at_ns + MS)
+        while m >= 0 and said.at_ns - fed.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
+            values = fed.values_of_info(m)
             if said.is_of(values):
                 self.values += 1
                 if said.message.stem == "Info":
                     self._devices[said.esc] = int(values["device"])
                 return
             m -= 1
-        self._suspects.append(said.wrong(f"no info of the last 10 s: {said.text}; newest {newest}"))
+        self._suspects.append(said.wrong(f"no info of the last 10 s; newest {newest}"))
 
-    def _judge_age(self, message: Message, bits: int, at_ns: int) -> None:
+    def _judge_age(self, message: Message, at_ns: int) -> None:
         """The age of the data must not be told younger than what was sent last."""
-        assert message.esc is not None
-        place = next(place for place in message.places if place.name == "data_age")
-        age = place.raw(bits)
-        if age == place.not_available or age >= 65_000:
+        age = self.value(message.name, "data_age")
+        assert message.esc is not None and age is not None
+        if age >= 65_000:
             return
         fed = self.escs[message.esc]
         newest = fed.newest(at_ns + MS)
         true_age = (at_ns - fed.left(newest)) / MS if newest >= 0 else 1e9
         if age < true_age - self.slack_ns / MS - 5:
             sent = fed.sent[newest] if newest >= 0 else None
-            why = f"an age of {age} ms; the newest is {true_age:.0f} ms old"
+            what = f"{message.name}: an age of {age} ms; the newest is {true_age:.0f} ms old"
             excess = int((true_age - age) * MS) - self.slack_ns
-            name = f"Esc{message.esc + 1}{message.stem}"
-            self._suspects.append(Wrong(at_ns, name, f"{bits:016x}", why, sent, excess))
-
-    def _is_live(self, said: Said, esc: int, n: int, keep: bool = True) -> bool:
-        """Whether an ESC's live frame has these values."""
-        values = self._live[esc].get(n)
-        if values is None:
-            fed = self.escs[esc]
-            data = fed.live(n)
-            values = live_values(data, fed.identity_of_live(n).cells)
-            values["flags"] = data.operating_errors & 0xFFFFFF
-            if keep:
-                self._keep(self._live[esc], n, values)
-        return said.is_of(values)
-
-    @staticmethod
-    def _keep(cache: dict[int, dict[str, float]], n: int, values: dict[str, float]) -> None:
-        cache[n] = values
-        if len(cache) > 80:
-            del cache[next(iter(cache))]
+            self._suspects.append(Wrong(at_ns, what, sent, excess))
 
 
 def _both_clocks() -> tuple[int, int]:
@@ -372,7 +289,6 @@ class BusWatch(Judge):
     ) -> None:
         super().__init__(table, escs, slack_ns)
         self.interface = interface
-        self.foreign = 0
         self.failure: BaseException | None = None
         self._ignore_local = ignore_local
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
@@ -397,13 +313,10 @@ class BusWatch(Judge):
     def _run(self) -> None:
         try:
             while not self._closed:
-                try:
-                    data, ancillary, flags, address = self._socket.recvmsg(16, 64)
-                except TimeoutError:
-                    continue
-                except OSError:  # an interface went down or away; the socket is still good
-                    continue
-                self._received(data, ancillary, flags, address)
+                # an OSError: time out, or an interface went down or away; the socket is still good
+                with contextlib.suppress(OSError):
+                    received = self._socket.recvmsg(16, 64)
+                    self._received(*received)
         except BaseException as error:
             self.failure = error
             raise
@@ -411,18 +324,15 @@ class BusWatch(Judge):
     def _received(self, data: bytes, ancillary: list[Any], flags: int, address: Any) -> None:
         if address[0] != self.interface or len(data) != FRAME.size:
             return
-        now, wall = _both_clocks()
-        self._note_offset(wall - now)
-        at_ns = now
+        at_ns = now = self.note_clocks()
         for _, kind, content in ancillary:
             if kind == _SO_TIMESTAMPNS and len(content) >= _STAMP.size:
                 seconds, rest = _STAMP.unpack(content[: _STAMP.size])
                 at_ns = self._monotonic(seconds * SECOND + rest, now)
         self._latest_ns = at_ns
         can_id, size, content = FRAME.unpack(data)
-        if self._ignore_local and flags & socket.MSG_DONTROUTE:
-            self.foreign += 1
-        elif not can_id & EXTENDED:
+        local = self._ignore_local and flags & socket.MSG_DONTROUTE
+        if not local and not can_id & EXTENDED:
             self.take(can_id & 0x7FF, content[:size], at_ns)
 
     def catch_up(self, seconds: float = 90) -> None:
@@ -436,16 +346,14 @@ class BusWatch(Judge):
             time.sleep(0.005)
         time.sleep(0.02)
 
-    def note_clocks(self) -> None:
-        """To be called before and after the wall clock is set."""
+    def note_clocks(self) -> int:
+        """To be called before and after the wall clock is set; returns the monotonic time."""
         now, wall = _both_clocks()
-        self._note_offset(wall - now)
-
-    def _note_offset(self, offset: int) -> None:
-        if abs(offset - self._offsets[-1]) > 50 * MS:
-            self._offsets.append(offset)
+        if abs(wall - now - self._offsets[-1]) > 50 * MS:
+            self._offsets.append(wall - now)
         else:
-            self._offsets[-1] = offset  # as it drifts
+            self._offsets[-1] = wall - now  # as it drifts
+        return now
 
     def _monotonic(self, stamp: int, now: int) -> int:
         """A kernel's time stamp on the monotonic clock, whatever the wall clock was set to when it was made."""

@@ -1,17 +1,18 @@
 """Faults of the CAN interface and of the bus behind it. Each disturbs all ESCs; the serial side must go on."""
 
+import contextlib
 import subprocess
 import time
+from collections.abc import Iterator
 from functools import partial
 
-import benches
+from beds import ADAPTER_RATE, BUS, adapters, fault, make_pair, run
 from bus_watch import SECOND
-from harness import Bench, Injection, half, injected
+from harness import Bench, Injection
 from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter
 from traffic_faults import still_answers
 
-LIMIT_S = 1.0
 ACTIVE, PASSIVE = 1, 3
 BUS_OFF_LEFT = 0x8140
 MAX_IN_CONTROLLER = 6
@@ -19,58 +20,48 @@ MAX_IN_CONTROLLER = 6
 SLOW_BITS_PER_S = 24_000
 HELD_NS = MAX_IN_CONTROLLER * 16 * 8 * SECOND // SLOW_BITS_PER_S
 """How long a bus that slow takes for them, 16 bytes each: 32 ms."""
-ip = partial(benches.run, "ip")
-on_cable = partial(injected, "CAN", limit_s=LIMIT_S)
-on_adapter = partial(injected, "CAN", bench="adapters", settle_s=1)
-
-
-def wait_can_state(bench: Bench, state: int) -> None:
-    """Wait until GatewayStatus says so."""
-    bench.wait_until(
-        lambda: bench.watch.value("GatewayStatus", "can_state") == state, 3, f"CanState {state}"
-    )
+FREE = "1gbit"
+on_cable = partial(fault, "CAN", limit_s=1.0)
+on_adapter = partial(fault, "CAN", bed=adapters, settle_s=1)
 
 
 def back_up(injection: Injection) -> None:
     """The interface is up again, each node says that it has started anew, and hears."""
     injection.cleared()
-    ip("link", "set", injection.bench.interface, "up")
+    run(f"ip link set {injection.bench.interface} up")
     injection.wait_recovery()
     boot_ups(injection)
-    still_answers(injection)
+    still_answers(injection.bench)
 
 
 def boot_ups(injection: Injection) -> None:
-    for node in range(1, len(injection.bench.ports) + 1):
+    for node in range(1, len(injection.bench.escs) + 1):
         injection.wait_boot_up(node)
 
 
-@on_cable(
-    "interface down and up",
-    rounds=lambda times: [0.05, 0.5, 1.2] * max(1, times // 2) + [24 if times > 10 else 4],
-)
+@on_cable("interface down and up", rounds=(0.05, 0.5, 1.2, 4))
 def down(bench: Bench, injection: Injection, pause: float) -> None:
-    ip("link", "set", bench.interface, "down")
+    run(f"ip link set {bench.interface} down")
     time.sleep(pause)
     back_up(injection)
 
 
-@on_cable("interface deleted and made again")
-def deleted(bench: Bench, injection: Injection, n: int) -> None:
-    ip("link", "del", bench.interface)
-    time.sleep((0.1, 0.6, 2)[n % 3])
-    benches.make_pair(bench.interface, bench.watched, up=False)
+@on_cable("interface deleted and made again", rounds=(0.1, 0.6))
+def deleted(bench: Bench, injection: Injection, pause: float) -> None:
+    run(f"ip link del {bench.interface}")
+    time.sleep(pause)
+    make_pair(bench.interface, bench.watched)
     back_up(injection)
 
 
-@on_cable("interface missing at start", rounds=half)
+@on_cable("interface missing at start", rounds=[0])
 def missing(bench: Bench, injection: Injection, _n: int) -> None:
-    injection.expect(bench.stop() == 0, "the gateway did not end well")
-    ip("link", "del", bench.interface)
+    bench.expect(bench.stop() == 0, "the gateway did not end well")
+    run(f"ip link del {bench.interface}")
     bench.start(wait=False)
     bench.wait_log("Trying again", seconds=20)
     time.sleep(0.7)
-    benches.make_pair(bench.interface, bench.watched, up=False)
+    make_pair(bench.interface, bench.watched)
     back_up(injection)
 
 
@@ -86,132 +77,120 @@ def bus_off(bench: Bench, injection: Injection, _n: int) -> None:
     injection.wait_emergency(1, BUS_OFF_LEFT)
 
 
-def limit(interface: str, rate: str) -> None:
-    """The bus takes no more than that; the kernel's queue is full soon, and then it says ENOBUFS. A new limit keeps what waits."""
-    words = f"dev {interface} root tbf rate {rate} burst 160 limit 160".split()
-    for verb in ("change", "add"):
-        command = ["tc", "qdisc", verb, *words]
-        if subprocess.run(command, capture_output=True, check=False).returncode == 0:
-            return
-    raise AssertionError("no limit could be set")
+@contextlib.contextmanager
+def slow_bus(injection: Injection, rate: str, held_ns: int) -> Iterator[None]:
+    """The bus takes no more than that; the kernel's queue is full soon, and then it says ENOBUFS. Free again, it keeps what waits.
 
-
-FREE = "1gbit"
-
-
-def unlimit(interface: str) -> None:
-    """To be called when nothing waits: what waits is thrown away."""
-    benches.run("tc", "qdisc", "del", "dev", interface, "root")
-
-
-@on_cable(
-    "ENOBUFS: a bus that takes less than there is to send",
-    settle_s=1,
-    rounds=lambda times: [60 if times > 10 else 6] * max(1, times // 3),
-)
-def no_buffers(bench: Bench, injection: Injection, seconds: float) -> None:
-    """The values that come are as fresh as ever, but for what the kernel holds of such a bus."""
-    bench.watch.slack_ns += HELD_NS
-    limit(bench.interface, f"{SLOW_BITS_PER_S}bit")
-    time.sleep(seconds)
-    limit(bench.interface, FREE)
-    injection.cleared()
-    injection.wait_recovery()
-    unlimit(bench.interface)
-    bench.watch.slack_ns -= HELD_NS
-
-
-@on_cable("a bus 100 % loaded by others", settle_s=1, rounds=half)
-def loaded(bench: Bench, injection: Injection, _n: int) -> None:
-    """No frame of ours gets through; the others' come in as fast as the machine makes them. What the controller holds then is late."""
-    limit(bench.interface, "8bit")
-    words = f"cangen {bench.watched} -g 1 -I 010 -L 8 -D i".split()
-    others = subprocess.Popen(words, stderr=subprocess.DEVNULL)
-    time.sleep(4)
-    others.terminate()
-    others.wait()
-    limit(bench.interface, FREE)
-    with RawBus(bench.interface) as near:
+    Values may be late by ``held_ns`` until then: the kernel had them, and nobody can take them back from it.
+    """
+    interface, watch = injection.bench.interface, injection.bench.watch
+    watch.more_ns = held_ns
+    run(f"tc qdisc add dev {interface} root tbf rate {rate} burst 160 limit 160")
+    yield
+    run(f"tc qdisc change dev {interface} root tbf rate {FREE} burst 160 limit 160")
+    with RawBus(interface) as near:
         # the limiter only looks at its queue when something comes
         near.send(0x7F0, wait=False)
     injection.cleared()
-    injection.in_the_controller = MAX_IN_CONTROLLER, time.monotonic_ns() + SECOND
     injection.wait_recovery()
-    unlimit(bench.interface)
+    watch.catch_up()
+    watch.more_ns = 0
+    run(f"tc qdisc del dev {interface} root")  # what waits is thrown away: nothing does
+
+
+@on_cable("ENOBUFS: a bus that takes less than there is to send", settle_s=1, rounds=[6])
+def no_buffers(bench: Bench, injection: Injection, seconds: float) -> None:
+    """The values that come are as fresh as ever, but for what the kernel holds of such a bus."""
+    with slow_bus(injection, f"{SLOW_BITS_PER_S}bit", HELD_NS):
+        time.sleep(seconds)
+
+
+@on_cable("a bus 100 % loaded by others", settle_s=1, rounds=[4])
+def loaded(bench: Bench, injection: Injection, seconds: float) -> None:
+    """No frame of ours gets through; the others' come in as fast as the machine makes them. What the controller holds then is late."""
+    before = bench.watch.by_more
+    with slow_bus(injection, "8bit", 3600 * SECOND):
+        words = f"cangen {bench.watched} -g 1 -I 010 -L 8 -D i".split()
+        others = subprocess.Popen(words, stderr=subprocess.DEVNULL)
+        time.sleep(seconds)
+        others.terminate()
+        others.wait()
+    late = bench.watch.by_more - before
+    bench.expect(late <= MAX_IN_CONTROLLER, f"{late} values were late")
 
 
 # --- adapters with controllers
 
 
-def adapters_of(bench: Bench) -> list[Adapter]:
-    """The gateway's and the judge's."""
-    return benches.BUSES[bench.interface].adapters
+def near() -> Adapter:
+    """The gateway's."""
+    return BUS[0].adapters[0]
 
 
-@on_adapter("controller bus-off without restart-ms, down and up", LIMIT_S)
+@on_adapter("controller bus-off without restart-ms, down and up", 1.0)
 def controller_bus_off(bench: Bench, injection: Injection, _n: int) -> None:
-    near, _ = adapters_of(bench)
-    near.silent = True
-    near.tell_state("b", 0, 255)
+    near().silent = True
+    near().tell_state("b", 0, 255)
     time.sleep(0.7)
-    near.down()
+    near().down()
     back_up(injection)
     injection.wait_emergency(1, BUS_OFF_LEFT)
 
 
-@on_adapter("controller error passive", None, escs=[], settle_s=0.5)
+@on_adapter("controller error passive", None, escs=[])
 def passive(bench: Bench, injection: Injection, _n: int) -> None:
-    near, _ = adapters_of(bench)
-    near.tell_errors("f")
-    near.tell_state("p", 10, 130)
-    wait_can_state(bench, PASSIVE)
-    near.tell_state("a", 0, 0)
-    wait_can_state(bench, ACTIVE)
+    def wait_can_state(state: int) -> None:
+        """Wait until GatewayStatus says so."""
+        bench.wait_until(
+            lambda: bench.watch.value("GatewayStatus", "can_state") == state, 3, f"CanState {state}"
+        )
+
+    near().tell_errors("f")
+    near().tell_state("p", 10, 130)
+    wait_can_state(PASSIVE)
+    near().tell_state("a", 0, 0)
+    wait_can_state(ACTIVE)
 
 
-@on_adapter("no other node acknowledges", LIMIT_S)
+@on_adapter("no other node acknowledges", 1.0)
 def no_acknowledge(bench: Bench, injection: Injection, _n: int) -> None:
-    near, far = adapters_of(bench)
+    far = BUS[0].adapters[1]
     far.down()
     time.sleep(1.5)
     injection.cleared()
-    ip("link", "set", far.name, "up")
-    near.tell_state("a", 0, 0)
+    run(f"ip link set {far.name} up")
+    near().tell_state("a", 0, 0)
 
 
-@on_adapter("wrong bit rate", LIMIT_S)
+@on_adapter("wrong bit rate", 1.0)
 def wrong_rate(bench: Bench, injection: Injection, _n: int) -> None:
-    near, _ = adapters_of(bench)
-    near.down()
-    near.up(250_000)
+    near().down()
+    near().up(250_000)
     time.sleep(1.2)
-    near.down()
+    near().down()
     injection.cleared()
-    near.up(benches.ADAPTER_RATE)
+    near().up(ADAPTER_RATE)
 
 
-@on_adapter("an adapter that hangs", LIMIT_S)
+@on_adapter("an adapter that hangs", 1.0)
 def hanging(bench: Bench, injection: Injection, _n: int) -> None:
     """What it had taken before it hung goes out late, as old as it is: that is inside the adapter. What the gateway sends is fresh."""
-    near, _ = adapters_of(bench)
-    before = bench.watch.slack_ns
-    bench.watch.slack_ns = 3 * SECOND
-    near.stalled = True
+    bench.watch.more_ns = 3 * SECOND
+    near().stalled = True
     time.sleep(1.5)
-    near.stalled = False
+    near().stalled = False
     injection.cleared()
     injection.wait_recovery()
     time.sleep(0.2)
-    bench.watch.slack_ns = before
+    bench.watch.more_ns = 0
 
 
-@on_adapter("adapter unplugged and plugged in again", LIMIT_S)
+@on_adapter("adapter unplugged and plugged in again", 1.0)
 def unplugged(bench: Bench, injection: Injection, _n: int) -> None:
-    bus = benches.BUSES[bench.interface]
-    bus.adapters[0].close()
+    near().close()
     time.sleep(0.6)
-    near = bus.adapters[0] = Adapter(bus, bench.interface)
+    BUS[0].adapters[0] = Adapter(BUS[0], bench.interface)
     injection.cleared()
-    near.up(benches.ADAPTER_RATE)
+    near().up(ADAPTER_RATE)
     injection.wait_recovery()
     boot_ups(injection)

@@ -9,9 +9,8 @@ from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 
-import benches
-from fault_report import Report
-from harness import Bench, Injection, injected
+from beds import bench_of, fault, run
+from harness import Bench, Injection
 from process_faults import RESTART_LIMIT_S, TIMEOUT_OBJECT, start_and_wait
 from raw_bus import RawBus
 
@@ -30,30 +29,29 @@ for name in ("write", "fsync", "replace", "rename"):
 write to the disk at all, which the watch on its system calls would show as silence.)"""
 
 
-on_disk = partial(injected, "Disk", bench="disk")
-
-
 @contextlib.contextmanager
-def disk_bench(report: Report) -> Iterator[Bench]:
+def disk(_: Path) -> Iterator[Bench]:
     """Two ESCs; the parameters on a small file system of their own; a slow one at will."""
     folder = Path(tempfile.mkdtemp(prefix="disk."))
     store, site = folder / "store", folder / "site"
     store.mkdir()
-    benches.run("mount", "-t", "tmpfs", "-o", "size=64k,mode=0700", "tmpfs", str(store))
+    run(f"mount -t tmpfs -o size=64k,mode=0700 tmpfs {store}")
     site.mkdir()
     (site / "sitecustomize.py").write_text(SLOW_DISK)
     path = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
     environment = {"PYTHONPATH": path, "KCG_SLOW": str(folder / "slow")}
-    with benches.bench_of(report, store=store, environment=environment) as bench:
+    with bench_of(store=store, environment=environment) as bench:
         yield bench
+
+
+on_disk = partial(fault, "Disk", bed=disk)
 
 
 def stores_again(bench: Bench) -> None:
     with RawBus(bench.watched) as master:
-        assert master.write(1, *TIMEOUT_OBJECT, 250, 2) == 0
+        bench.expect(master.write(1, *TIMEOUT_OBJECT, 250, 2) == 0, "a write is refused")
         code = master.store(1)
-    if code != 0:
-        raise AssertionError(f"parameters cannot be stored though the disk is good again: {code}")
+        bench.expect(code == 0, f"the disk is good again, but storing is answered with {code}")
 
 
 @contextlib.contextmanager
@@ -70,10 +68,10 @@ def full(folder: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def read_only(folder: Path) -> Iterator[None]:
     """On top of the one that the gateway has its lock open on, which would be busy."""
-    benches.run("mount", "--bind", str(folder), str(folder))
-    benches.run("mount", "-o", "remount,bind,ro", str(folder))
+    run(f"mount --bind {folder} {folder}")
+    run(f"mount -o remount,bind,ro {folder}")
     yield
-    benches.run("umount", str(folder))
+    run(f"umount {folder}")
 
 
 def refused(
@@ -86,7 +84,7 @@ def refused(
     with RawBus(bench.watched) as master, bad(bench.store):
         master.write(1, *TIMEOUT_OBJECT, 251, 2)
         code = master.store(1)
-        injection.expect(code not in (0, None), f"saving was answered with {code}")
+        bench.expect(code not in (0, None), f"saving was answered with {code}")
     stores_again(bench)
 
 
@@ -94,13 +92,11 @@ on_disk("full", None, escs=[])(partial(refused, bad=full))
 on_disk("read-only", None, escs=[])(partial(refused, bad=read_only))
 
 
-@on_disk("a write that takes 5 s", None, escs=[], rounds=lambda times: range(max(1, times // 3)))
+@on_disk("a write that takes 5 s", None, escs=[], rounds=[0])
 def slow(bench: Bench, injection: Injection, _n: int) -> None:
     """No frame is delayed by it; the "save" is confirmed when it is on the disk."""
     switch = Path(bench.environment["KCG_SLOW"])
-    assert bench.gateway is not None
     said = len(bench.gateway.lines)
-    bench.watch.reset_silence()
     switch.touch()
     with RawBus(bench.watched) as master:
         master.write(1, *TIMEOUT_OBJECT, 253, 2)
@@ -108,31 +104,20 @@ def slow(bench: Bench, injection: Injection, _n: int) -> None:
         master.store(1, 1)
     bench.wait_log("parameters stored", said, 40)
     took = time.monotonic() - begin
-    silence = bench.longest_silence_s(range(len(bench.fed)))
-    injection.row.peak("s to save", round(took, 1))
-    injection.row.peak("longest silence in s", round(silence, 3))
     switch.unlink()
-    injection.expect(took > SLOW_S, f"the disk was not slow: {took:.1f} s")
+    bench.expect(took > SLOW_S, f"the disk was not slow: {took:.1f} s")
     stores_again(bench)
 
 
-@on_disk(
-    "parameter file damaged or empty",
-    RESTART_LIMIT_S,
-    settle_s=1,
-    rounds=lambda times: range(max(3, times // 2)),
-)
+@on_disk("parameter file damaged or empty", RESTART_LIMIT_S, settle_s=1, rounds=range(3))
 def damaged(bench: Bench, injection: Injection, n: int) -> None:
     """It starts with its defaults, says so by a line and EMCY 6300h, and stores again."""
     stores_again(bench)
     bench.stop()
     (file,) = bench.store.glob("esc1*.params")
     content = file.read_bytes()
-    file.write_bytes((b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))[n % 3])
+    file.write_bytes((b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))[n])
     start_and_wait(injection)
     bench.wait_log("Running on defaults")
     injection.wait_emergency(1, 0x6300)
     stores_again(bench)
-
-
-benches.BENCHES["disk"] = disk_bench

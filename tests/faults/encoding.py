@@ -6,6 +6,7 @@ recognised. All values are inside the sheet's ranges and differ from the DBC's c
 
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,8 +34,6 @@ class Identity(NamedTuple):
     cells: int = 6
     alarms: bool = False
     """Let alarm bits come and go, a change each 128 frames."""
-    errors: int = PROGRAMMING_ALLOWED
-    """Error bits that are set besides."""
 
 
 def mix(n: int, salt: int) -> int:
@@ -48,7 +47,7 @@ def mix(n: int, salt: int) -> int:
 def live(identity: Identity, n: int) -> LiveData:
     """The live frame number n of an ESC."""
     a, b, c, d = (mix(n, identity.salt * 8 + i) for i in range(4))
-    errors = identity.errors
+    errors = PROGRAMMING_ALLOWED
     if identity.alarms and n >> 7 & 1:
         errors |= 1 << (n >> 8) % 12
     return LiveData(
@@ -100,30 +99,30 @@ def physical(data: Any, fields: Sequence[sheet.Field]) -> dict[str, float]:
     return {field.name: getattr(data, field.name) / field.steps for field in fields}
 
 
-def bits(word: int, count: int) -> dict[str, float]:
-    return {f"bit{n}": word >> n & 1 for n in range(count)}
-
-
-def live_values(data: LiveData, cells: int) -> dict[str, float]:
-    """Physical values by the names that the DBC's signals have in snake case; derived ones computed anew here."""
+@lru_cache(1024)
+def live_values(identity: Identity, n: int) -> dict[str, float]:
+    """Physical values of a live frame by the names that the DBC's signals have in snake case, and its error bits as "flags"."""
+    data = live(identity, n)
     values = physical(data, sheet.LIVE_FIELDS)
     speed, voltage = values["electrical_speed"], values["battery_voltage"]
     return {
         **values,
-        **bits(data.operating_errors, 24),
+        "flags": data.operating_errors & 0xFFFFFF,
         "operating_state_raw": data.operating_state,
         "motor_speed": speed / POLE_PAIRS,
         "output_speed": speed / POLE_PAIRS / GEAR,
-        "mean_cell_voltage": voltage / cells,
+        "mean_cell_voltage": voltage / identity.cells,
         "battery_power": voltage * values["battery_current"],
     }
 
 
-def info_values(data: InfoData) -> dict[str, float]:
+@lru_cache(1024)
+def info_values(identity: Identity, m: int) -> dict[str, float]:
     """The same of an info frame."""
+    data = info(identity, m)
     return {
         **physical(data, sheet.INFO_FIELDS),
-        **bits(data.selftest_errors, 19),
+        "flags": data.selftest_errors,
         "variant": data.device_and_variant & 1023,
         "firmware_main": data.firmware_word >> 8,
         "firmware_sub": data.firmware_word & 255,

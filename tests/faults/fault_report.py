@@ -1,4 +1,4 @@
-"""The faults there are, and what came of injecting them: a row for each, kept as JSON; docs/fault-programme.md shows them."""
+"""The faults there are, and what came of injecting them: a row for each, as docs/fault-programme.md shows them."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -16,12 +16,17 @@ class Fault:
     area: str
     name: str
     limit_s: float | None
-    run: Callable[..., None]
-    bench: str
-    """Which bench it needs; those that need the same one share it."""
+    inject: Callable[[Any, Any, Any], None]
+    """One injection on a bench; the last argument is one of ``rounds``."""
+    bed: Callable[[Path], Any]
+    """Makes the bench that it needs; those with the same one share it."""
+    escs: Sequence[int] | None = None
+    """Those that it disturbs, None: all of the bench."""
+    settle_s: float = 0.5
+    rounds: Sequence[Any] = range(2)
 
     def __str__(self) -> str:
-        return f"{self.area}: {self.name}"
+        return f"{self.machine} {self.area}: {self.name}"
 
 
 FAULTS: list[Fault] = []
@@ -29,41 +34,25 @@ FAULTS: list[Fault] = []
 AREAS = ("Start", "Serial", "CAN", "Time", "Process", "Disk", "Traffic", "Many")
 WITH_PYTHON = "s with the start of Python"
 """The figure of a fault that ends the process: what its users wait for here."""
-MACHINES = ("UML", "QEMU")
 MAX_TAKEN = 0.1
 """Of the processor time that the virtual machine would have had. Where more was taken, what came late or not at all shows nothing."""
 GOOD, FAILED, NOT_JUDGED = "good", "failed", "not judged"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
+BEGIN, END = "<!-- faults begin -->\n", "<!-- faults end -->\n"
+COLUMNS = "machine, fault|injected|recovered|worst recovery|wrong values|values lost|state"
+HEAD = f"| {COLUMNS.replace('|', ' | ')} |\n{'|---' * 7}|\n"
 
 
-def in_order(machine: str | None = None) -> list[Fault]:
-    """The faults of a machine, or all, in the order of the table."""
-    chosen = [fault for fault in FAULTS if machine in (None, fault.machine)]
-    areas = [*AREAS, *(fault.area for fault in FAULTS)]
-    return sorted(
-        chosen, key=lambda fault: (MACHINES.index(fault.machine), areas.index(fault.area))
-    )
-
-
-def fault(
-    area: str, name: str, limit_s: float | None, *, machine: str = "UML", bench: str = "two"
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a function as a fault of the programme."""
-
-    def register(function: Callable[..., None]) -> Callable[..., None]:
-        assert all((known.machine, known.name) != (machine, name) for known in FAULTS), name
-        FAULTS.append(Fault(machine, area, name, limit_s, function, bench))
-        return function
-
-    return register
+def in_order() -> list[Fault]:
+    """The faults in the order of the table."""
+    return sorted(FAULTS, key=lambda fault: (fault.machine != "UML", AREAS.index(fault.area)))
 
 
 @dataclass
 class Row:
     """What came of one fault."""
 
-    machine: str
-    area: str
-    name: str
+    fault: str
     limit_s: float | None
     injected: int = 0
     recovered: int = 0
@@ -82,96 +71,81 @@ class Row:
     """What went wrong, for people."""
     figures: dict[str, float] = field(default_factory=dict)
 
-    def __str__(self) -> str:
-        return f"{self.area}: {self.name}"
-
-    def peak(self, name: str, value: float) -> None:
-        """The largest of a figure."""
-        self.figures[name] = max(value, self.figures.get(name, 0))
-
-    def count(self, name: str, value: float) -> None:
-        """The sum of a figure."""
-        self.figures[name] = value + self.figures.get(name, 0)
-
-    @property
-    def good(self) -> bool:
-        healed = self.injected > 0 and self.recovered == self.injected
-        return healed and not self.wrong and not self.lost and not self.transmitted
-
     @property
     def state(self) -> str:
         """Lateness and loss are not judged on a machine that could not run; a wrong value or a byte to an ESC fails anywhere."""
-        if self.good:
+        healed = self.injected > 0 and self.recovered == self.injected
+        if healed and not (self.wrong or self.lost or self.transmitted):
             return GOOD
         only_late = self.wrong == self.old and not self.transmitted
         return NOT_JUDGED if self.taken > MAX_TAKEN and only_late else FAILED
 
+    @property
+    def recovery(self) -> str:
+        limit = self.limit_s
+        return "undisturbed" if limit is None else f"{self.worst_s:.2f} s (limit {limit:g} s)"
 
-class Report:
-    """All rows of a run."""
+    @property
+    def cells(self) -> list[str]:
+        """What the page shows, the fault first."""
+        recovery = self.recovery
+        if WITH_PYTHON in self.figures:
+            recovery += f", {self.figures[WITH_PYTHON]:.2f} {WITH_PYTHON}"
+        counts = (self.injected, self.recovered, recovery, self.wrong, self.lost, self.state)
+        return [self.fault, *map(str, counts)]
 
-    def __init__(self, **about: Any) -> None:
-        self.about: dict[str, Any] = dict(about)
-        self.rows: list[Row] = []
+    @property
+    def line(self) -> str:
+        """For the terminal."""
+        text = f"{self.state:10} {self.fault}: {self.recovered} of {self.injected}, {self.recovery}"
+        text += f", wrong {self.wrong}, lost {self.lost}"
+        if self.excused:
+            text += f", {self.excused} not sent while the machine stood still"
+        if self.transmitted:
+            text += f", {self.transmitted} bytes sent to an ESC"
+        if self.taken > MAX_TAKEN:
+            text += f", {self.taken:.0%} of the processor time was taken"
+        text += "".join(f"; {name} {value:g}" for name, value in self.figures.items())
+        return text + "".join(f"\n       {note}" for note in self.notes[:8])
 
-    def row(self, fault: Fault) -> Row:
+
+class Report(dict[str, Row]):
+    """The rows of a run by the names of the faults."""
+
+    def of(self, fault: Fault) -> Row:
         """The row of a fault, made when it is first asked for."""
-        for row in self.rows:
-            if (row.machine, row.name) == (fault.machine, fault.name):
-                return row
-        self.rows.append(Row(fault.machine, fault.area, fault.name, fault.limit_s))
-        return self.rows[-1]
+        return self.setdefault(str(fault), Row(str(fault), fault.limit_s))
 
     def write(self, path: Path) -> None:
-        rows = [{**asdict(row), "state": row.state} for row in self.rows]
-        path.write_text(json.dumps({**self.about, "rows": rows}, indent=1) + "\n")
+        path.write_text(json.dumps([asdict(row) for row in self.values()], indent=1) + "\n")
+
+    def read(self, path: Path) -> None:
+        """Take in what another run has written."""
+        self.update((found["fault"], Row(**found)) for found in json.loads(path.read_text()))
 
     def write_junit(self, path: Path) -> None:
         """Each row as a test; one that was not judged as skipped."""
         suite = ET.Element("testsuite")
-        for row in self.rows:
-            case = ET.SubElement(
-                suite, "testcase", classname=f"faults.{row.machine}", name=str(row)
-            )
+        for row in self.values():
+            case = ET.SubElement(suite, "testcase", classname="faults", name=row.fault)
             if row.state == FAILED:
-                ET.SubElement(case, "failure", message=line(row))
+                ET.SubElement(case, "failure", message=row.line)
             elif row.state == NOT_JUDGED:
-                ET.SubElement(
-                    case,
-                    "skipped",
-                    message=f"{NOT_JUDGED}: {row.taken:.0%} of the processor time was taken",
-                )
+                why = f"{NOT_JUDGED}: {row.taken:.0%} of the processor time was taken"
+                ET.SubElement(case, "skipped", message=why)
         ET.ElementTree(suite).write(path)
 
-    @staticmethod
-    def read(paths: Sequence[Path]) -> "Report":
-        """Several runs' rows as one report."""
-        merged = Report()
-        for path in paths:
-            found = json.loads(path.read_text())
-            merged.rows += [
-                Row(**{key: row[key] for key in row if key != "state"}) for row in found.pop("rows")
-            ]
-            merged.about |= found
-        return merged
+
+def shown(text: str) -> dict[str, list[str]]:
+    """The rows of a page by their fault."""
+    lines = text.partition(BEGIN)[2].partition(END)[0].splitlines()[2:]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {row[0]: row for row in rows}
 
 
-def line(row: Row) -> str:
-    """One row for the terminal."""
-    recovery = (
-        "undisturbed" if row.limit_s is None else f"worst {row.worst_s:.2f} s of {row.limit_s:g} s"
-    )
-    text = f"{row.state:10} {row.machine} {row}: {row.recovered} of {row.injected}, "
-    text += f"{recovery}, wrong {row.wrong}, lost {row.lost}"
-    if row.excused:
-        text += f", {row.excused} not sent while the machine stood still"
-    if row.transmitted:
-        text += f", {row.transmitted} bytes sent to an ESC"
-    if row.taken > MAX_TAKEN:
-        text += f", {row.taken:.0%} of the processor time was taken"
-    figures = ", ".join(f"{name} {value:g}" for name, value in row.figures.items())
-    return (
-        text
-        + (f"; {figures}" if figures else "")
-        + "".join(f"\n       {note}" for note in row.notes[:8])
-    )
+def put(text: str, report: Report) -> str:
+    """A page with the rows of a report in the place of older ones, in the order of the programme."""
+    rows = shown(text) | {row.fault: row.cells for row in report.values()}
+    listed = [f"| {' | '.join(rows[str(each)])} |\n" for each in in_order() if str(each) in rows]
+    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    return "".join((before, BEGIN, HEAD, *listed, END, after))

@@ -11,10 +11,10 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from typing import Self
 
-from encoding import Identity, info, live
+from encoding import Identity, info, info_values, live, live_values
 
 from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 
 SECOND = 1_000_000_000
 SLOW_WRITE_NS = 5_000_000
@@ -23,20 +23,16 @@ SPEED, CURRENT = 1, 2
 
 
 class FedEsc:
-    """One ESC: who it is, where its bytes go, what it has sent.
+    """One ESC: who it is, what it has sent; where its bytes go is the matter of those that are made of it.
 
-    ``write`` returns False where not all bytes were taken. ``mangle`` gets the bytes of a frame and returns what goes on the
-    line and whether the frame is still whole in it. ``rate_hz`` frames a second, every ``info_every``-th of them an info frame.
+    ``mangle`` gets the bytes of a frame and returns what goes on the line and whether the frame is still whole in it. ``rate_hz``
+    frames a second, every ``info_every``-th of them an info frame.
     """
 
-    def __init__(
-        self,
-        write: Callable[[bytes], bool],
-        identity: Identity,
-        rate_hz: float = 50,
-        info_every: int = 100,
-    ) -> None:
-        self.write = write
+    path: str
+    """What the gateway opens."""
+
+    def __init__(self, identity: Identity, rate_hz: float = 50, info_every: int = 100) -> None:
         self.rate_hz = rate_hz
         self.info_every = info_every
         self.on = True
@@ -49,33 +45,34 @@ class FedEsc:
         self.seen = bytearray()
         """Which messages with live frame n came to the bus; written by the bus watch."""
         self.info_sent = array("q")
-        self._identities = [(0, 0, identity)]
+        self.identity = identity
+        """Who is on the line; another one from the next frame on where it is set."""
+        self._was: list[Identity] = []
+        """Who sent live frame n."""
+        self._was_of_info: list[Identity] = []
         self._ticks = 0
         self.due_ns = 0
 
-    @property
-    def identity(self) -> Identity:
-        return self._identities[-1][2]
+    def write(self, data: bytes) -> bool:
+        """Bytes to the line; False where not all were taken."""
+        raise NotImplementedError
 
-    def become(self, identity: Identity) -> None:
-        """From the next frame on another ESC is on the line."""
-        self._identities.append((len(self.sent), len(self.info_sent), identity))
+    def received(self) -> int:
+        """Bytes that came to the ESC so far but for the kernel's echo between a plug-in and the gateway's setting of the port."""
+        raise NotImplementedError
 
-    def identity_of_live(self, n: int) -> Identity:
-        return self._identities[bisect_right(self._identities, n, key=lambda entry: entry[0]) - 1][
-            2
-        ]
-
-    def identity_of_info(self, m: int) -> Identity:
-        return self._identities[bisect_right(self._identities, m, key=lambda entry: entry[1]) - 1][
-            2
-        ]
+    def close(self) -> None:
+        raise NotImplementedError
 
     def live(self, n: int) -> LiveData:
-        return live(self.identity_of_live(n), n)
+        return live(self._was[n], n)
 
-    def info(self, m: int) -> InfoData:
-        return info(self.identity_of_info(m), m)
+    def values(self, n: int) -> dict[str, float]:
+        """What live frame n means."""
+        return live_values(self._was[n], n)
+
+    def values_of_info(self, m: int) -> dict[str, float]:
+        return info_values(self._was_of_info[m], m)
 
     def left(self, n: int) -> int:
         """When live frame n had left at the latest: the feeder may have been held up between its look at the clock and the write."""
@@ -93,25 +90,28 @@ class FedEsc:
         self._ticks += 1
         is_info = self._ticks % self.info_every == 3  # the first one soon
         identity = self.identity
-        if is_info:
-            wire = encode(info(identity, len(self.info_sent)), identity.layout)
-        else:
-            wire = encode(live(identity, len(self.sent)), identity.layout)
-        whole = True
+        data = info(identity, len(self.info_sent)) if is_info else live(identity, len(self.sent))
+        wire, whole = encode(data, identity.layout), True
         if self.mangle is not None:
             wire, whole = self.mangle(wire)
         now = time.monotonic_ns()
-        if is_info:
-            self.info_sent.append(now)
-        else:
-            self.seen.append(0)
-            self.whole.append(0)
-            self.sent.append(now)
+        self.note(now, is_info)
         taken = self.write(wire)
         if not is_info:
             self.whole[-1] = taken and whole
             if (left := time.monotonic_ns()) - now > SLOW_WRITE_NS:
                 self._left[len(self.sent) - 1] = left
+
+    def note(self, at_ns: int, is_info: bool = False) -> None:
+        """A frame is sent at that time; ``sent`` last, for whoever finds a frame there looks at the rest."""
+        if is_info:
+            self._was_of_info.append(self.identity)
+            self.info_sent.append(at_ns)
+        else:
+            self._was.append(self.identity)
+            self.seen.append(0)
+            self.whole.append(0)
+            self.sent.append(at_ns)
 
 
 class Feeder:

@@ -1,28 +1,27 @@
 """The bench of the fault programme: fed ESCs, a gateway process, a judge of the bus, and the account of each injected fault.
 
-    @injected("Serial", "port gone and back", 2.0, escs=[0])    # who is disturbed by it; []: nobody may be; all unless given
-    def gone(bench, injection, n):                              # the n-th of as many as a run asks for
+    @fault("Serial", "port gone and back", 2.0, escs=[0])    # who is disturbed by it; []: nobody may be; all unless given
+    def gone(bench, injection, pause):                       # one of the fault's rounds
         ...the fault is on...
-        injection.cleared()                                     # its cause is gone: until the first right value sent since then
+        injection.cleared()                                  # its cause is gone: until the first right value sent since then
 
 Then the bus is watched a while longer, then wrong and lost values are put down to the fault. Times are
 monotonic nanoseconds, of frames the kernel's.
 """
 
-import contextlib
 import os
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Protocol, Self
+from typing import IO, Any, Self
 
-from bus_watch import MS, SECOND, BusWatch, Fresh
+from bus_watch import MS, SECOND, BusWatch
 from encoding import GEAR, POLE_PAIRS, Identity
-from fault_report import Fault, Report, Row, fault
+from fault_report import Fault, Row
 from feeder import CURRENT, SPEED, FedEsc, Feeder
 from signals import Table
 
@@ -30,7 +29,6 @@ from kontronik_can_gw.desk.pty import PtyEsc
 
 IN_FLIGHT_NS = 60 * MS
 """A frame that was handed over so shortly before a fault may be its victim."""
-SETTLE_S = 0.5
 STANDSTILL_NS = 8 * MS
 AHEAD = ("chrt", "-f", "10")
 """The gateway goes before the bench's own processes, with which it shares a processor here."""
@@ -122,52 +120,25 @@ class Gateway(LoggedProcess):
         }
 
 
-def growth(row: Row, before: dict[str, int], after: dict[str, int], rss_kib: int) -> list[str]:
-    """Note in a row what a gateway has more of than before, memory above so much; the names of what has grown."""
-    row.figures |= {f"{name} before": before[name] for name in before}
-    row.figures |= {f"{name} after": after[name] for name in after}
-    grown = [
-        name for name in before if after[name] > before[name] + (rss_kib if name == "rss" else 0)
+def growth(before: dict[str, int], after: dict[str, int], rss_kib: int) -> list[str]:
+    """What a gateway has more of than before, memory above so much."""
+    limits = before | {"rss": before["rss"] + rss_kib}
+    return [
+        f"{name} {before[name]} -> {after[name]}" for name in before if after[name] > limits[name]
     ]
-    row.notes += [f"the gateway has more {name} than before" for name in grown]
-    return grown
 
 
-class Port(Protocol):
-    """An ESC and the line to the gateway."""
-
-    fed: FedEsc
-
-    @property
-    def path(self) -> str:
-        """What the gateway opens."""
-
-    def received(self) -> int:
-        """Bytes that the gateway has sent to the ESC so far."""
-
-    @property
-    def echoed(self) -> int:
-        """Bytes that the kernel has echoed to the ESC so far, between the plug-in and the gateway's setting of the port."""
-
-    def close(self) -> None: ...
-
-
-class PtyPort:
-    """A fed ESC on a pseudo terminal behind a symbolic link; it may be unplugged and plugged in again."""
-
-    echoed = 0  # a pseudo terminal is made without echo
+class PtyPort(FedEsc):
+    """A fed ESC on a pseudo terminal, which is made without echo, behind a symbolic link; it may be unplugged and plugged in again."""
 
     def __init__(self, link: Path, identity: Identity, rate_hz: float = 50) -> None:
+        super().__init__(identity, rate_hz)
         self.link = link
-        self.fed = FedEsc(self.write, identity, rate_hz)
+        self.path = str(link)
         self._lock = threading.Lock()
         self._received = 0
         self._pty: PtyEsc | None = None
         self.plug()
-
-    @property
-    def path(self) -> str:
-        return str(self.link)
 
     @property
     def device(self) -> str:
@@ -246,8 +217,8 @@ class Metronome:
 class Bench:
     """Everything that runs around one gateway.
 
-    ``interface`` is the gateway's, ``watched`` where the judge listens: the far end of it, where there is one. ``options``
-    is further text of the configuration's tables.
+    ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen`` None: no nodes.
+    ``dbc``: another layout than the shipped one.
     """
 
     metronome_step_s = 0.004
@@ -256,13 +227,12 @@ class Bench:
         self,
         interface: str,
         watched: str,
-        ports: Sequence[Port],
-        report: Report,
-        *,
+        escs: Sequence[FedEsc],
         table: Table,
+        *,
         slack_ns: int = 60 * MS,
         canopen: str | None = "self_start = true",
-        options: str = "",
+        dbc: Path | None = None,
         store: Path | None = None,
         prefix: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
@@ -270,66 +240,64 @@ class Bench:
     ) -> None:
         self.interface = interface
         self.watched = watched
-        self.ports = list(ports)
-        self.fed = [port.fed for port in ports]
-        self.report = report
+        self.escs = list(escs)
         self.folder = Path(tempfile.mkdtemp(prefix="faults."))
         self.store = store or self.folder / "store"
         self.config = self.folder / "gateway.toml"
         self.prefix = tuple(prefix)
         self.environment = dict(environment or {})
         self.start_limit_s = start_limit_s
-        self._canopen = canopen
-        self.config.write_text(self.configuration(options))
-        self.watch = BusWatch(
-            watched, table, self.fed, slack_ns=slack_ns, ignore_local=watched != interface
-        ).start()
+        self.config.write_text(self._configuration(canopen, dbc))
+        self.watch = BusWatch(watched, table, self.escs, slack_ns=slack_ns).start()
         self.metronome = Metronome(self.metronome_step_s)
-        self.feeder = Feeder(self.fed).start()
-        self.gateway: Gateway | None = None
-        self.losses: list[tuple[int, str]] = []
-        """When each value was sent that was lost, and which it was."""
-        self._accounted = [0 for _ in ports]
-        self._received = self._echoed = 0
-        self._excluded: list[list[tuple[int, int]]] = [[] for _ in ports]
+        self.feeder = Feeder(self.escs).start()
+        self._gateway: Gateway | None = None
+        self._accounted = [0 for _ in escs]
+        self._received = 0
+        self._excluded: list[list[tuple[int, int]]] = [[] for _ in escs]
 
-    def configuration(self, options: str = "") -> str:
+    def _configuration(self, canopen: str | None, dbc: Path | None) -> str:
         text = f'[can]\ninterface = "socketcan"\nchannel = "{self.interface}"\nbitrate = 1000000\n'
-        if self._canopen is not None:
-            text += f'[canopen]\nenabled = true\nnode_id = 1\nserial = 1050112\nstore = "{self.store}"\n{self._canopen}\n'
-        text += f"{options}\n"
-        for i, port in enumerate(self.ports):
-            text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{port.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
+        if canopen is not None:
+            text += f'[canopen]\nenabled = true\nnode_id = 1\nserial = 1050112\nstore = "{self.store}"\n{canopen}\n'
+        if dbc is not None:
+            text += f'[dbc]\nfile = "{dbc}"\n'
+        for i, esc in enumerate(self.escs):
+            text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{esc.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
         return text
 
     # --- the gateway
 
-    def start(self, *, wait: bool = True) -> Gateway:
+    @property
+    def gateway(self) -> Gateway:
+        """The one that runs."""
+        assert self._gateway is not None
+        return self._gateway
+
+    def start(self, *, wait: bool = True) -> None:
         """Start the gateway; ``wait``: until every ESC that is on has its values on the bus. NotRecovered if they do not come."""
-        assert self.gateway is None
+        assert self._gateway is None
         begin = time.monotonic_ns()
-        self.gateway = Gateway(self.config, self.prefix, self.environment)
+        self._gateway = Gateway(self.config, self.prefix, self.environment)
         if wait:
-            on = [i for i, fed in enumerate(self.fed) if fed.on]
+            on = [i for i, esc in enumerate(self.escs) if esc.on]
             self.wait_fresh(on, begin, self.start_limit_s)
-            self.leave_out(range(len(self.ports)), begin - IN_FLIGHT_NS, time.monotonic_ns())
-        return self.gateway
+            self.leave_out(range(len(self.escs)), begin - IN_FLIGHT_NS, time.monotonic_ns())
 
     def stop(self) -> int:
         """End the gateway by SIGTERM; its exit code."""
-        assert self.gateway is not None
-        gateway, self.gateway = self.gateway, None
+        process = self.gateway.process
         try:
-            gateway.process.terminate()
-            return gateway.process.wait(10)
+            process.terminate()
+            return process.wait(10)
         except subprocess.TimeoutExpired:
             raise NotRecovered("it did not end within 10 s of SIGTERM") from None
         finally:
-            gateway.kill()
+            self.kill()
 
     def kill(self) -> None:
         """End the gateway, however it fares."""
-        gateway, self.gateway = self.gateway, None
+        gateway, self._gateway = self._gateway, None
         if gateway is not None:
             gateway.kill()
 
@@ -337,15 +305,18 @@ class Bench:
         self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0
     ) -> int:
         """Wait until each of these ESCs has had a right value on the bus after a time; when the last of them came first."""
+        came = [after_ns]
 
-        def found() -> list[Fresh | None]:
-            return [self.watch.first_fresh(esc, after_ns, sent_after_ns) for esc in escs]
+        def all_came() -> bool:
+            found = [self.watch.first_fresh(esc, after_ns, sent_after_ns) for esc in escs]
+            came[1:] = [fresh.at_ns for fresh in found if fresh]
+            return all(found)
 
         names = ", ".join(f"esc{esc + 1}" for esc in escs)
-        self.wait_until(lambda: all(found()), seconds, f"right values of {names}")
-        return max([fresh.at_ns for fresh in found() if fresh], default=time.monotonic_ns())
+        self.wait_until(all_came, seconds, f"right values of {names}")
+        return max(came)
 
-    def wait_until(self, condition: Callable[[], bool], seconds: float, what: str) -> None:
+    def wait_until(self, condition: Callable[[], object], seconds: float, what: str) -> None:
         """Wait until something holds. NotRecovered when it does not come."""
         begin, last = time.monotonic(), False
         while not condition():
@@ -360,43 +331,44 @@ class Bench:
 
     def wait_log(self, text: str, since: int = 0, seconds: float = 10) -> None:
         """Wait for a line with this text in the gateway's log, from that line on."""
-        assert self.gateway is not None
         lines = self.gateway.lines
         self.wait_until(
             lambda: any(text in line for line in lines[since:]), seconds, f"the log says {text!r}"
         )
 
+    def expect(self, holds: object, what: str) -> None:
+        """NotRecovered unless something holds."""
+        if not holds:
+            raise NotRecovered(f"{what}; {self.last_words()}")
+
     def check_alive(self) -> None:
-        if self.gateway is not None and not self.gateway.alive:
-            raise NotRecovered(
-                f"the gateway ended with {self.gateway.process.returncode}; {self.last_words()}"
-            )
+        code = self._gateway and self._gateway.process.poll()
+        self.expect(code is None, f"the gateway ended with {code}")
         for failure in (self.feeder.error, self.watch.failure):
             if failure is not None:
                 raise failure
 
     def last_words(self) -> str:
-        lines = self.gateway.lines[-6:] if self.gateway is not None else []
-        return (
-            "the gateway's last lines: " + " | ".join(lines)
-            if lines
-            else "the gateway said nothing"
-        )
+        lines = self._gateway.lines[-6:] if self._gateway is not None else []
+        return f"the gateway's last lines: {' | '.join(lines) or 'none'}"
 
     def running_s(self, begin_ns: int, end_ns: int) -> float:
         """Seconds of that time in which the machine did not stand still."""
         time.sleep(0.02)
         return (end_ns - begin_ns - self.metronome.stood_still(begin_ns, end_ns)) / SECOND
 
-    def longest_silence_s(self, escs: Iterable[int]) -> float:
-        """How long at most the gateway was silent of one of these ESCs since ``watch.reset_silence`` though the machine ran."""
-        self.watch.catch_up()
-        time.sleep(0.05)  # until the metronome has told of the last standstill
+    def longest_silence_s(self, escs: Sequence[int] | range, begin_ns: int) -> float:
+        """How long at most the gateway was silent of one of these ESCs since then though the machine ran."""
+        self._catch_up()
         now = time.monotonic_ns()
-        silences = [each for esc in escs for each in self.watch.silences(esc, now)]
+        silences = [each for esc in escs for each in self.watch.silences(esc, begin_ns, now)]
         stood_still = self.metronome.stood_still
         longest = [end - begin - stood_still(begin, end) for begin, end in silences]
         return max(longest, default=0) / SECOND
+
+    def _catch_up(self) -> None:
+        self.watch.catch_up()
+        time.sleep(0.05)  # until the metronome has told of the last standstill
 
     # --- accounts
 
@@ -405,15 +377,14 @@ class Bench:
         for esc in escs:
             self._excluded[esc].append((begin_ns, end_ns))
 
-    def account(self, row: Row, until_ns: int | None = None) -> int:
-        """Note in a row how many values that were sent since the last account, outside of all faults, never came; how many they are."""
+    def account(self, row: Row, until_ns: int | None = None) -> list[tuple[int, str]]:
+        """Note in a row how many values that were sent since the last account, outside of all faults, never came; when and which."""
         if until_ns is None:
             until_ns = time.monotonic_ns() - 150 * MS
-        self.watch.catch_up()
-        time.sleep(0.05)  # until the metronome has told of the last standstill
+        self._catch_up()
         self.watch.settle(self.metronome.stood_still)
-        lost_before = row.lost
-        for index, fed in enumerate(self.fed):
+        losses = []
+        for index, fed in enumerate(self.escs):
             last = fed.newest(until_ns)
             for n in range(self._accounted[index], last + 1):
                 at = fed.sent[n]
@@ -425,29 +396,26 @@ class Bench:
                 if self.metronome.stood_still(at - 5 * MS, following + 5 * MS) >= STANDSTILL_NS:
                     row.excused += 1
                     continue
-                row.lost += 1
                 seen = {0: "nothing", SPEED: "only EscSpeed"}.get(fed.seen[n], "only EscCurrent")
-                what = f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came"
-                self.losses.append((at, what))
+                losses.append((at, f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came"))
             self._accounted[index] = max(self._accounted[index], last + 1)
             self._excluded[index] = [x for x in self._excluded[index] if x[1] > until_ns]
-        return row.lost - lost_before
+        row.lost += len(losses)
+        return losses
 
-    @contextlib.contextmanager
-    def injection(
-        self, fault: Fault, escs: Sequence[int] | None = None, settle_s: float = SETTLE_S
-    ) -> Iterator["Injection"]:
-        """One injection of a fault; ``escs``: those that it disturbs, all unless given. A failed one is noted and raised again."""
-        row = self.report.row(fault)
+    def inject(self, fault: Fault, row: Row, given: Any) -> None:
+        """One injection of a fault, noted in the row. NotRecovered, and what else it raises, is noted too and raised again."""
         self.check_alive()
         self.account(row)  # of before; nobody's fault is the programme's too
-        injection = Injection(self, fault, range(len(self.ports)) if escs is None else escs)
+        injection = Injection(self, fault, row)
         row.injected += 1
         failed = True
         try:
-            yield injection
+            fault.inject(self, injection, given)
+            if injection.cleared_ns is not None and injection.recovered_ns is None:
+                injection.wait_recovery()
             injection.leave_out_until(injection.recovered_ns or time.monotonic_ns())
-            time.sleep(settle_s)
+            time.sleep(fault.settle_s)
             self.check_alive()
             failed = False
         except NotRecovered as error:
@@ -456,15 +424,10 @@ class Bench:
         finally:
             if failed:
                 injection.leave_out_until(time.monotonic_ns())
-            injection.note_lost(self.account(row))
-            injection.note_wrong()
-            received, self._received = self._received, sum(port.received() for port in self.ports)
+            injection.note_values(self.account(row))
+            received, self._received = self._received, sum(esc.received() for esc in self.escs)
             row.transmitted += max(0, self._received - received)
-            echoed, self._echoed = self._echoed, sum(port.echoed for port in self.ports)
-            if self._echoed > echoed:
-                what = "bytes echoed by the kernel before the port was set"
-                row.count(what, self._echoed - echoed)
-            if not injection.in_time:
+            if fault.limit_s is not None and injection.recovery_s > fault.limit_s:
                 row.notes.append(f"recovered only after {injection.recovery_s:.2f} s")
             elif not failed:
                 row.recovered += 1
@@ -476,8 +439,8 @@ class Bench:
         self.kill()
         self.watch.close()
         self.metronome.close()
-        for port in self.ports:
-            port.close()
+        for esc in self.escs:
+            esc.close()
 
     def __enter__(self) -> Self:
         return self
@@ -489,18 +452,17 @@ class Bench:
 class Injection:
     """One fault while it is on and until it is healed."""
 
-    def __init__(self, bench: Bench, fault: Fault, escs: Sequence[int] | range) -> None:
+    def __init__(self, bench: Bench, fault: Fault, row: Row) -> None:
         self.bench = bench
         self.fault = fault
-        self.escs = list(escs)
+        self.row = row
+        self.escs = range(len(bench.escs)) if fault.escs is None else fault.escs
         self.begin_ns = time.monotonic_ns()
         self.cleared_ns: int | None = None
         self.recovered_ns: int | None = None
         self.recovery_s = 0.0
-        self.in_the_controller: tuple[int, int] | None = None
-        """So many values may come late until then: the controller had them, and nobody can take them back from it."""
-        self.boot_ups = len(bench.watch.boot_ups)
-        self.emergencies = len(bench.watch.emergencies)
+        self._boot_ups = len(bench.watch.boot_ups)
+        self._emergencies = len(bench.watch.emergencies)
         self._wrong, self._old = bench.watch.wrong_count, bench.watch.old_count
 
     def cleared(self) -> None:
@@ -510,9 +472,9 @@ class Injection:
     def wait_recovery(self) -> None:
         """Wait for the first right value of each disturbed ESC that was sent since ``cleared``."""
         assert self.cleared_ns is not None
-        limit = self.fault.limit_s or 1.0
+        limit_s = (self.fault.limit_s or 1.0) * 3 + 2
         self.recovered_ns = self.bench.wait_fresh(
-            self.escs, self.cleared_ns, limit * 3 + 2, self.cleared_ns
+            self.escs, self.cleared_ns, limit_s, self.cleared_ns
         )
         self.healed_at(self.recovered_ns)
 
@@ -523,103 +485,44 @@ class Injection:
 
     def wait_boot_up(self, node: int) -> None:
         """Wait for a boot-up message of a node since the injection."""
+        times: list[int] = []
 
-        def seen() -> list[int]:
-            return [
-                at_ns
-                for at_ns, found in self.bench.watch.boot_ups[self.boot_ups :]
-                if found == node
-            ]
+        def seen() -> bool:
+            found = self.bench.watch.boot_ups[self._boot_ups :]
+            times.extend(at_ns for at_ns, booted in found if booted == node)
+            return times != []
 
-        self.bench.wait_until(lambda: bool(seen()), 3, f"boot-up of node {node}")
-        self.healed_at(seen()[0])
-
-    def emergency_codes(self, node: int) -> list[int]:
-        """Codes of the EMCYs of a node since the injection."""
-        return [
-            each.code
-            for each in self.bench.watch.emergencies[self.emergencies :]
-            if each.node == node
-        ]
+        self.bench.wait_until(seen, 3, f"boot-up of node {node}")
+        self.healed_at(times[0])
 
     def wait_emergency(self, node: int, code: int) -> None:
         """Wait for an EMCY of a node since the injection."""
-        self.bench.wait_until(lambda: code in self.emergency_codes(node), 3, f"EMCY {code:X}h")
 
-    def expect(self, holds: bool, what: str) -> None:
-        """NotRecovered unless something holds."""
-        if not holds:
-            raise NotRecovered(f"{what}; {self.bench.last_words()}")
+        def seen() -> bool:
+            found = self.bench.watch.emergencies[self._emergencies :]
+            return any((each.node, each.code) == (node, code) for each in found)
 
-    @property
-    def row(self) -> Row:
-        return self.bench.report.row(self.fault)
-
-    def after(self, at_ns: int | None) -> str:
-        """A time since the injection in words."""
-        return "no time" if at_ns is None else f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
-
-    @property
-    def in_time(self) -> bool:
-        return self.fault.limit_s is None or self.recovery_s <= self.fault.limit_s
+        self.bench.wait_until(seen, 3, f"EMCY {code:X}h")
 
     def leave_out_until(self, end_ns: int) -> None:
         """What was sent until then may be lost."""
         self.bench.leave_out(self.escs, self.begin_ns - IN_FLIGHT_NS, end_ns)
 
-    def note_wrong(self) -> None:
-        """Put the wrong values since the injection down to it."""
+    def note_values(self, losses: Sequence[tuple[int, str]]) -> None:
+        """Put the wrong values since the injection, and these lost ones, down to it."""
+
+        def after(at_ns: int | None) -> str:
+            return "no time" if at_ns is None else f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
+
         watch, row = self.bench.watch, self.row
-        if self.in_the_controller:
-            most, end_ns = self.in_the_controller
-            forgiven = watch.forgive(most, self.begin_ns, end_ns)
-            row.peak("values in the controller already", forgiven)
         wrong = watch.wrong_count - self._wrong
         row.wrong += wrong
         row.old += watch.old_count - self._old
         for each in watch.wrong[-min(wrong, 3) :] if wrong else ():
-            what = f"{each.message} {each.data}: {each.why}"
-            row.notes.append(f"wrong value {self.after(each.at_ns)} after the injection: {what}")
-
-    def note_lost(self, lost: int) -> None:
-        if lost:
-            when = [f"{self.after(at)} {what}" for at, what in self.bench.losses[-lost:]]
-            self.row.notes.append(
-                f"{lost} values lost, cleared at {self.after(self.cleared_ns)}, recovered at "
-                f"{self.after(self.recovered_ns)}: {'; '.join(when[:4])}"
+            row.notes.append(f"wrong value {after(each.at_ns)} after the injection: {each.what}")
+        if losses:
+            when = "; ".join(f"{after(at)} {what}" for at, what in losses[:4])
+            row.notes.append(
+                f"{len(losses)} values lost, cleared at {after(self.cleared_ns)}, "
+                f"recovered at {after(self.recovered_ns)}: {when}"
             )
-
-
-Injects = Callable[[Any, Injection, Any], None]
-"""One injection on a bench; the last argument is what ``rounds`` gave for it."""
-
-
-def half(times: int) -> range:
-    return range(max(1, times // 2))
-
-
-def injected(
-    area: str,
-    name: str,
-    limit_s: float | None,
-    *,
-    escs: Sequence[int] | None = None,
-    settle_s: float = SETTLE_S,
-    rounds: Callable[[int], Iterable[Any]] = range,
-    machine: str = "UML",
-    bench: str = "two",
-) -> Callable[[Injects], Injects]:
-    """Register a function as a fault: called once for each round, and its recovery is waited for when its cause is ``cleared``."""
-
-    def register(inject: Injects) -> Injects:
-        def run(bench: Bench, fault: Fault, times: int) -> None:
-            for each in rounds(times):
-                with bench.injection(fault, escs, settle_s) as injection:
-                    inject(bench, injection, each)
-                    if injection.cleared_ns is not None and injection.recovered_ns is None:
-                        injection.wait_recovery()
-
-        fault(area, name, limit_s, machine=machine, bench=bench)(run)
-        return inject
-
-    return register

@@ -1,68 +1,146 @@
-"""The faults that need no more than a kernel with vxcan, slcan and vcan, in User Mode Linux.
+"""The fault programme: injects every fault into a running gateway in a virtual machine, and judges what came of it.
 
-    python tests/faults/programme.py [--out FILE] [--long] [--only TEXT]... [--list]
+    python tests/faults/programme.py [uml|qemu|soak] [--only TEXT]... [--minutes N] [--seed N] [--junit FILE] [--page]
+
+uml     the faults that need no more than a kernel with vxcan, slcan and vcan, in User Mode Linux
+qemu    those of real drivers, on emulated hardware (tests/vm/setup.sh qemu)
+soak    random ones of uml, one after the other, for minutes or hours: the same ones in the same order for the same seed
 
 They set the clock, mount and make interfaces: never on the machine itself. Exits with 1 if one was not healed in time, or a value on
-the bus was wrong, or one was lost that need not have been, or a byte was sent to an ESC.
+the bus was wrong, or one was lost that need not have been, or a byte was sent to an ESC. What was late or lost while much processor
+time was taken from the virtual machine is not judged (see taken.py). Nothing is run twice.
 """
 
+import argparse
 import contextlib
-import os
+import random
+import subprocess
 import sys
+import tempfile
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 
-import benches
+import beds
 import can_faults  # noqa: F401  registers its faults, as the others do
 import disk_faults  # noqa: F401
-import outside
 import process_faults  # noqa: F401
+import qemu_bed
+import qemu_faults  # noqa: F401
 import serial_faults  # noqa: F401
-import time_faults  # noqa: F401
 import traffic_faults  # noqa: F401
-from fault_report import Fault, Report, in_order, line
-from harness import Bench
+from bus_watch import SECOND
+from fault_report import FAILED, NOT_JUDGED, PAGE, Fault, Report, in_order, put
+from harness import Bench, growth
+from taken import Load, worst_share
 
-QUICK_TIMES, LONG_TIMES = 2, 20
-TIMEOUT_S = {False: 1500, True: 4 * 3600}
+PROJECT = Path(__file__).resolve().parents[2]
+BEGIN, END = ">>>", "<<<"
+"""What is printed inside, followed by the name, around each fault."""
+TIMEOUT_S = {"uml": 1500, "qemu": 600}
+NEW_PROCESS = ("missing at start", "kill -9", "SIGTERM", "frozen")
+"""Faults that end the gateway: its memory could not be followed over them."""
+MAX_GROWTH_KIB = 2048
+SOAK = Fault(
+    "UML", "Process", "memory, descriptors and threads after it all", None, print, beds.two
+)
 
 
-def run(
-    faults: list[Fault],
-    report: Report,
-    times: int,
-    out: Path,
-    made: Mapping[str, benches.MakesBench] = benches.BENCHES,
-) -> None:
-    """All faults, those with the same bench on one bench; a bench that a fault has broken is made anew."""
-    for kind in dict.fromkeys(fault.bench for fault in faults):
-        waiting = [fault for fault in faults if fault.bench == kind]
+# --- outside of the virtual machine
+
+
+def run_inside(load: Load, args: argparse.Namespace) -> Report:
+    """Run this script in a virtual machine; its rows, with what was taken from it meanwhile."""
+    begun: dict[str, float] = {}
+    shares: dict[str, float] = {}
+
+    def ended(name: str) -> None:
+        load.take()
+        share = worst_share(load.samples, begun.pop(name), time.monotonic())
+        shares[name] = max(shares.get(name, 0.0), share)
+
+    with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
+        if args.part == "qemu":
+            qemu_bed.prepare(Path(folder))
+        timeout_s = TIMEOUT_S.get(args.part, 60 * args.minutes + 300)
+        words = [
+            *(sys.executable, PROJECT / "tests/vm/vm_run.py", f"--timeout={timeout_s:g}"),
+            *(f"--backend={'qemu' if args.part == 'qemu' else 'uml'}", f"--rw={folder}", "--"),
+            *(sys.executable, "-B", __file__, args.part, f"--inside={folder}"),
+            *(f"--seed={args.seed}", f"--minutes={args.minutes:g}"),
+            *(f"--only={text}" for text in args.only),
+        ]
+        command = list(map(str, words))
+        nothing, pipe = subprocess.DEVNULL, subprocess.PIPE
+        with subprocess.Popen(command, stdin=nothing, stdout=pipe, text=True) as process:
+            assert process.stdout
+            load.machine = process.pid
+            for text in process.stdout:
+                mark, _, name = text.rstrip().partition(" ")
+                if mark == BEGIN:
+                    begun[name] = time.monotonic()
+                elif mark == END:
+                    ended(name)
+                else:
+                    print(text, end="", flush=True)
+        for name in list(begun):
+            ended(name)
+        report, file = Report(), Path(folder, "report.json")
+        if file.exists():
+            report.read(file)
+    for row in report.values():
+        row.taken = shares.get(row.fault, 0.0)
+    return report
+
+
+def conclude(report: Report) -> int:
+    """Say in the end what failed and what was not judged."""
+    rows = sorted(report.values(), key=lambda row: row.state, reverse=True)
+    for row in rows:
+        if row.state in (NOT_JUDGED, FAILED):
+            print(row.line)
+    states = [row.state for row in rows]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in sorted(set(states)))
+    print(f"{len(states)} faults: {counts}", flush=True)
+    return int(FAILED in states or not states)
+
+
+# --- inside
+
+
+def run(faults: Sequence[Fault], report: Report, folder: Path) -> None:
+    """All faults, those with the same bed on one bench; a bench that a fault has broken is made anew."""
+    for bed in dict.fromkeys(fault.bed for fault in faults):
+        waiting = [fault for fault in faults if fault.bed is bed]
         while waiting:
             with contextlib.ExitStack() as stack:
                 try:
-                    bench = stack.enter_context(made[kind](report))
+                    bench = stack.enter_context(bed(folder))
                 except Exception as error:
                     traceback.print_exc()
-                    row = report.row(waiting.pop(0))
+                    row = report.of(waiting.pop(0))
                     row.injected += 1
                     row.notes.append(f"no bench: {error!r}")
-                    print(line(row), flush=True)
+                    print(row.line, flush=True)
                     continue
-                while waiting and run_one(bench, waiting.pop(0), report, times):
-                    report.write(out)
-        report.write(out)
+                good = True
+                while waiting and good:
+                    fault = waiting.pop(0)
+                    good = run_one(bench, fault, fault.rounds, report)
+                    report.write(folder / "report.json")
+        report.write(folder / "report.json")
 
 
-def run_one(bench: Bench, fault: Fault, report: Report, times: int) -> bool:
+def run_one(bench: Bench, fault: Fault, rounds: Sequence[object], report: Report) -> bool:
     """True if the bench is still good."""
     begin = time.monotonic()
-    row = report.row(fault)
-    print(outside.BEGIN, fault, flush=True)
+    row = report.of(fault)
+    print(BEGIN, fault, flush=True)
     good = False
     try:
-        fault.run(bench, fault, times)
+        for each in rounds:
+            bench.inject(fault, row, each)
         good = True
     except AssertionError as error:
         if not row.notes:
@@ -72,23 +150,81 @@ def run_one(bench: Bench, fault: Fault, report: Report, times: int) -> bool:
         row.notes.append(repr(error))
     if not good and row.recovered >= row.injected:
         row.injected = row.recovered + 1
-    print(outside.END, fault, flush=True)
-    print(f"{time.monotonic() - begin:6.1f} s  {line(row)}", flush=True)
+    print(END, fault, flush=True)
+    print(f"{time.monotonic() - begin:6.1f} s  {row.line}", flush=True)
     return good
 
 
+def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> None:
+    """Faults until then, of those that the same gateway process lives through; then memory, descriptors, threads, silences."""
+    faults = [
+        fault
+        for fault in in_order()
+        if fault.bed is beds.two and not any(text in fault.name for text in NEW_PROCESS)
+    ]
+    escs, row = range(len(bench.escs)), report.of(SOAK)
+    before = bench.gateway.figures()
+
+    def longest_silence(name: str, begin_ns: int) -> None:
+        found = round(bench.longest_silence_s(escs, begin_ns), 3)
+        row.figures[name] = max(found, row.figures.get(name, 0))
+
+    while time.monotonic() < end:
+        fault, begin_ns = generator.choice(faults), time.monotonic_ns()
+        time.sleep(generator.uniform(0.5, 3))
+        longest_silence("longest silence of an ESC between faults in s", begin_ns)
+        if row.injected == 5:
+            before = bench.gateway.figures()
+        row.injected += 1
+        begin_ns = time.monotonic_ns()
+        run_one(bench, fault, [generator.choice(fault.rounds)], report)
+        longest_silence("longest silence of an ESC in s", begin_ns)
+    row.notes += growth(before, bench.gateway.figures(), MAX_GROWTH_KIB)
+    row.recovered = 0 if row.notes else row.injected
+    row.figures |= {
+        "right values": bench.watch.values,
+        "values late because the machine stood still": bench.watch.late_count,
+        "s that the machine stood still": sum(e - b for b, e in bench.metronome.stalls) / SECOND,
+        **bench.gateway.figures(),
+    }
+    print(row.line)
+
+
 def main() -> int:
-    parser = outside.parser(__doc__)
-    parser.add_argument("--list", action="store_true", help="name the faults and end")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("part", nargs="?", choices=("uml", "qemu", "soak"), default="uml")
+    parser.add_argument("--junit", type=Path, help="write what came of it as a JUnit report")
+    parser.add_argument("--page", action="store_true", help="write it to docs/fault-programme.md")
+    parser.add_argument("--only", action="append", default=[], help="faults with this text")
+    parser.add_argument("--minutes", type=float, default=10)
+    parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(1 << 32))
+    parser.add_argument("--inside", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    mine = outside.chosen(in_order("UML"), args.only)
-    if args.list:
-        print(*mine, sep="\n")
-        return 0
+    if args.part == "soak":
+        faults = [SOAK]
+    else:
+        mine = [fault for fault in in_order() if fault.machine.lower() == args.part]
+        faults = [f for f in mine if not args.only or any(text in str(f) for text in args.only)]
     if args.inside is None:
-        return outside.main(args, "programme.py", mine, timeout_s=TIMEOUT_S[args.long])
-    report = Report(kernel_uml=os.uname().release, long=args.long)
-    run(mine, report, LONG_TIMES if args.long else QUICK_TIMES, args.inside / "report.json")
+        with Load() as load:
+            report = run_inside(load, args)
+        for fault in faults:
+            report.of(fault)  # one that was not reached has failed
+        if args.junit:
+            report.write_junit(args.junit)
+        if args.page:
+            PAGE.write_text(put(PAGE.read_text(), report))
+        return conclude(report)
+    report = Report()
+    if args.part == "soak":
+        print(f"seed {args.seed}", flush=True)
+        with beds.two(args.inside) as bench:
+            soak(bench, report, random.Random(args.seed), time.monotonic() + 60 * args.minutes)
+        report.write(args.inside / "report.json")
+    else:
+        run(faults, report, args.inside)
     return 0
 
 

@@ -1,14 +1,32 @@
-"""A serial adapter on a played USB whose wire has real bits: an FT232BM (driver ftdi_sio).
+"""A serial adapter on a played USB whose wire has real bits: the kernel's vhci_hcd (USB/IP) plugs it in, the driver ftdi_sio serves it.
 
 What is put on its wire is a sequence of levels, made with the sender's baud rate and parity; it is sampled with the rate and parity
-that the driver has set, so wrong parity, framing errors and breaks come out as they do on hardware.
+that the driver has set, so wrong parity, framing errors and breaks come out as they do on hardware. Only root may plug, and only
+on a kernel with vhci_hcd: the machine of tests/vm.
 """
 
+import contextlib
+import socket
+import struct
+import threading
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
-from qemu_usb import UsbDevice, descriptors
+from qemu_machine import wait_until
+
+VHCI = Path("/sys/devices/platform/vhci_hcd.0")
+FULL_SPEED = 2
+_HEADER = struct.Struct(">5I28s")
+_SUBMIT = struct.Struct(">4xi12x8s")
+_SETUP = struct.Struct("<BBHHH")
+_CMD_UNLINK, _RET_SUBMIT, _RET_UNLINK = 2, 3, 4
+_STALL, _UNLINKED = -32, -104
+_DEVICE_TO_HOST, _VENDOR_OR_CLASS = 0x80, 0x60
+_GET_STATUS, _GET_DESCRIPTOR, _GET_CONFIGURATION = 0, 6, 8
+_DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
 
 # --- the wire of a UART
 
@@ -79,29 +97,81 @@ def sampled(wire: list[int], sent_at: int, line: Line) -> Iterator[tuple[int, in
             position = skip(0)
 
 
-class SerialAdapter(UsbDevice):
-    """An FT232BM. ``received`` counts the bytes and breaks that would have gone out to the ESC, ``echoed`` the bytes of before the
-    host had set the line as an ESC's: the kernel's echo on a fresh port."""
+# --- the adapter
 
-    def __init__(self, port: int, serial_number: str) -> None:
-        strings = ("FTDI", "FT232BM with a wire", serial_number)
-        super().__init__(port, descriptors((0x0403, 0x6001, 0x0400), strings, (0x81, 0x02)))
+
+def descriptors(strings: Sequence[str]) -> dict[int, bytes]:
+    """By wValue: an FT232BM with one interface and the bulk endpoints 81h and 02h."""
+    found = {
+        _DEVICE << 8: bytes.fromhex("12 01 0002 00 00 00 08 0304 0160 0004 01 02 03 01"),
+        _CONFIGURATION << 8: bytes.fromhex(
+            "09 02 2000 01 01 00 80 32"  # 32 bytes in all, one interface, bus-powered, 100 mA
+            "09 04 00 00 02 FF FF FF 00"  # vendor's class
+            "07 05 81 02 4000 00 07 05 02 02 4000 00"  # bulk, packets of 64
+        ),
+        _STRING << 8: bytes.fromhex("04 03 0904"),  # English
+    }
+    for number, string in enumerate(strings, 1):
+        text = string.encode("utf-16-le")
+        found[_STRING << 8 | number] = bytes((2 + len(text), _STRING)) + text
+    return found
+
+
+class SerialAdapter:
+    """An FT232BM; a thread speaks USB/IP on a socket pair. ``plug`` and ``unplug`` are what a hand does.
+
+    ``received`` counts the bytes and breaks that would have gone out to the ESC once the host had set the line as an ESC's:
+    before that the kernel echoes on a fresh port.
+    """
+
+    def __init__(self, serial_number: str) -> None:
         self.line = FRESH_LINE
         self.latency_ms = 16
         self.received = 0
-        self.echoed = 0
+        self._descriptors = descriptors(("FTDI", "FT232BM with a wire", serial_number))
         self._is_set = False
         self._just_reset = False
         self._overrun = 0
+        self._lock = threading.RLock()
+        self._ours: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self._asked: deque[int] = deque()  # requests that wait for data
+        self._ready: deque[bytes] = deque()  # packets that wait to be asked for
+
+    @property
+    def plugged(self) -> bool:
+        return self._ours is not None
 
     def plug(self) -> None:
-        self.line, self._is_set = FRESH_LINE, False
-        super().plug()
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+
+        def attached() -> bool:
+            with contextlib.suppress(OSError):  # right after an unplug the port is not free yet
+                (VHCI / "attach").write_text(f"0 {theirs.fileno()} {0x10001} {FULL_SPEED}")
+                return True
+            return False
+
+        wait_until(attached, 5, "the USB port is free")
+        theirs.close()  # the kernel holds it
+        with self._lock:
+            self.line, self._is_set = FRESH_LINE, False
+            self._asked.clear()
+            self._ready.clear()
+            self._ours = ours
+        self._thread = threading.Thread(target=self._serve, args=(ours,), daemon=True)
+        self._thread.start()
+
+    def unplug(self) -> None:
+        with contextlib.suppress(OSError):  # it may have lost the device by itself
+            (VHCI / "detach").write_text("0")
+        if self._thread is not None:
+            self._thread.join(5)
+            self._thread = None
+
+    # --- the wire
 
     def put(self, data: bytes, line: Line = ESC_LINE) -> None:
         """Bytes from an ESC whose UART is set to ``line``."""
-        if not self.plugged:
-            return
         if line == self.line:
             # the usual case, and slow to work out: what comes out is what went in
             self._pass_on(data, 0)
@@ -119,6 +189,11 @@ class SerialAdapter(UsbDevice):
         wire[bit] ^= 1
         self._sample(wire, ESC_LINE.baud)
 
+    def waiting(self) -> int:
+        """Bytes that wait until the host asks for them."""
+        with self._lock:
+            return sum(len(packet) for packet in self._ready)
+
     def _sample(self, wire: list[int], sent_at: int) -> None:
         run = bytearray()
         for byte, error in sampled(wire, sent_at, self.line):
@@ -131,38 +206,97 @@ class SerialAdapter(UsbDevice):
         self._pass_on(bytes(run), 0)
 
     def _pass_on(self, data: bytes, error: int) -> None:
-        for at in range(0, len(data), 62):
-            packet = data[at : at + 62]
-            if self.waiting(1) + len(packet) > FIFO_SIZE:
-                self._overrun = STATUS_OVERRUN
-                return
-            self.give(1, bytes((MODEM_STATUS, LINE_STATUS | error | self._overrun)) + packet)
-            self._overrun = 0
+        """Packets to the host, as soon as it asks; nothing happens while unplugged."""
+        with self._lock:
+            for at in range(0, len(data) if self.plugged else 0, 62):
+                packet = data[at : at + 62]
+                if self.waiting() + len(packet) > FIFO_SIZE:
+                    self._overrun = STATUS_OVERRUN
+                    return
+                packet = bytes((MODEM_STATUS, LINE_STATUS | error | self._overrun)) + packet
+                self._overrun = 0
+                if self._asked:
+                    self._answer(self._asked.popleft(), packet)
+                else:
+                    self._ready.append(packet)
 
-    def before_answer(self) -> None:
+    # --- USB/IP
+
+    def _serve(self, ours: socket.socket) -> None:
+        stream = ours.makefile("rb")
+        try:
+            while len(head := stream.read(_HEADER.size)) == _HEADER.size:
+                command, number, _, to_host, endpoint, rest = _HEADER.unpack(head)
+                if command == _CMD_UNLINK:
+                    self._unlink(number, int.from_bytes(rest[:4], "big"))
+                    continue
+                length, setup = _SUBMIT.unpack(rest)
+                data = b"" if to_host else stream.read(length)
+                if endpoint == 0:
+                    self._control(number, setup, len(data))
+                elif to_host:
+                    self._give(number)
+                else:
+                    self._answer(number, taken=len(data))
+                    self.take(data)
+        except OSError:
+            pass
+        finally:
+            with self._lock:
+                self._ours = None
+            stream.close()
+            ours.close()
+
+    def _give(self, number: int) -> None:
+        """The host asks for data."""
         if self._just_reset:
             # by the port's opening: what does not fill a packet waits for the latency timer
             self._just_reset = False
             time.sleep(self.latency_ms / 1000)
+        with self._lock:
+            if self._ready:
+                self._answer(number, self._ready.popleft())
+            else:
+                self._asked.append(number)
 
-    def taken(self, endpoint: int, data: bytes) -> None:
+    def take(self, data: bytes) -> None:
+        """Bytes to the ESC."""
         if self._is_set:
             self.received += len(data)
-        else:
-            self.echoed += len(data)
 
-    def control(self, kind: int, request: int, value: int, index: int, length: int) -> bytes | None:
+    def _control(self, number: int, setup: bytes, taken: int) -> None:
+        kind, request, value, index, length = _SETUP.unpack(setup)
+        answer: bytes | None = b""
+        if kind & _VENDOR_OR_CLASS:
+            answer = self.vendor(request, value, index, length)
+        elif request == _GET_DESCRIPTOR:
+            answer = self._descriptors.get(value)
+        elif request == _GET_STATUS:
+            answer = bytes(2)
+        elif request == _GET_CONFIGURATION:
+            answer = b"\1"
+        elif kind & _DEVICE_TO_HOST:
+            answer = None
+        if answer is None:
+            self._answer(number, status=_STALL)
+        else:
+            self._answer(number, answer[:length] if kind & _DEVICE_TO_HOST else b"", taken)
+
+    def vendor(self, request: int, value: int, index: int, length: int) -> bytes:
+        """The answer to a request of the driver ftdi_sio."""
+        line = self.line
         if request == 0:  # reset, or clear a buffer: 1 the one of what was received
             if value in (0, 1):
-                self.forget(1)
+                with self._lock:
+                    self._ready.clear()
             self._just_reset = value == 0
         elif request == 3:  # baud rate: 3 MHz over a divisor with eighths
             eighths = (0, 4, 2, 1, 3, 5, 6, 7)[value >> 14 | (index & 1) << 2]
             rate = int(3_000_000 / ((value & 0x3FFF) + eighths / 8 or 1))
             exact = ESC_LINE.baud if abs(rate - ESC_LINE.baud) < 0.03 * ESC_LINE.baud else rate
-            self._set(Line(exact, self.line.parity))
+            line = line._replace(baud=exact)
         elif request == 4:  # data bits, parity, stop bits, break
-            self._set(Line(self.line.baud, "NOEMS"[value >> 8 & 7]))
+            line = line._replace(parity="NOEMS"[value >> 8 & 7])
             self.received += value >> 14 & 1
         elif request == 5:
             return bytes((MODEM_STATUS, LINE_STATUS))
@@ -170,8 +304,26 @@ class SerialAdapter(UsbDevice):
             self.latency_ms = value & 0xFF
         elif request == 10:
             return bytes((self.latency_ms,))
-        return bytes(length)
-
-    def _set(self, line: Line) -> None:
         self.line = line
         self._is_set = self._is_set or line == ESC_LINE
+        return bytes(length)
+
+    def _answer(self, number: int, data: bytes = b"", taken: int = 0, status: int = 0) -> None:
+        """Complete a request: with data to the host, or with so many bytes taken from it."""
+        size = len(data) or taken
+        head = struct.pack(">5I5i8x", _RET_SUBMIT, number, 0, 0, 0, status, size, 0, 0, 0)
+        self._send(head + data)
+
+    def _unlink(self, number: int, victim: int) -> None:
+        """The host takes a request back."""
+        with self._lock:
+            status = 0
+            if victim in self._asked:
+                self._asked.remove(victim)
+                status = _UNLINKED
+            self._send(struct.pack(">5Ii24x", _RET_UNLINK, number, 0, 0, 0, status))
+
+    def _send(self, packet: bytes) -> None:
+        with self._lock, contextlib.suppress(OSError):
+            if self._ours is not None:
+                self._ours.sendall(packet)

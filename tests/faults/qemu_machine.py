@@ -1,23 +1,16 @@
-"""What the emulated machine of tests/vm offers besides a kernel: the far end of its serial port, its CAN controllers.
+"""What the emulated machine of tests/vm has besides a kernel, by /sys, ioctl and ``ip``: tests/vm/vm_run.py says what is plugged in."""
 
-All of it is reached from inside the machine, by a virtio port, /sys and ``ip``. See tests/vm/vm_run.py for what is plugged in.
-"""
-
-import contextlib
 import fcntl
 import json
 import os
-import select
 import struct
 import subprocess
 import termios
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-VIRTIO_PORTS = Path("/dev/virtio-ports")
 KVASER = Path("/sys/bus/pci/drivers/kvaser_pci")
 BITRATE = 1_000_000
 _TIOCGICOUNT = 0x545D
@@ -32,41 +25,6 @@ def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
         time.sleep(0.01)
 
 
-class FarEnd:
-    """The far end of an emulated serial port: what is written comes out of the port, what the port sends is counted."""
-
-    def __init__(self, name: str) -> None:
-        self._fd = os.open(VIRTIO_PORTS / name, os.O_RDWR | os.O_NONBLOCK)
-        self.received = 0
-        """Bytes that the machine has transmitted."""
-        self._stop = False
-        self._thread = threading.Thread(target=self._listen, daemon=True)
-        self._thread.start()
-
-    def put(self, data: bytes, seconds: float = 1.0) -> int:
-        """Bytes to the port, as many as it takes within the time."""
-        done, deadline = 0, time.monotonic() + seconds
-        while done < len(data):
-            try:
-                done += os.write(self._fd, data[done:])
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    break
-                time.sleep(0.002)
-        return done
-
-    def _listen(self) -> None:
-        while not self._stop:
-            if select.select([self._fd], [], [], 0.2)[0]:
-                with contextlib.suppress(BlockingIOError):
-                    self.received += len(os.read(self._fd, 4096))
-
-    def close(self) -> None:
-        self._stop = True
-        self._thread.join(2)
-        os.close(self._fd)
-
-
 # --- serial ports
 
 
@@ -77,14 +35,6 @@ class LineCounts(NamedTuple):
     overrun: int
     parity: int
     breaks: int
-
-
-class LineSetting(NamedTuple):
-    baud: int
-    bits: int
-    parity: str
-    stop_bits: int
-    echo: bool
 
 
 def _beside(device: str) -> int:
@@ -100,19 +50,19 @@ def line_counts(device: str) -> LineCounts:
         os.close(fd)
 
 
-def line_setting(device: str) -> LineSetting:
-    """How a port is set, read from the kernel."""
+AS_SET = termios.B115200, termios.CS8 | termios.PARENB, 0
+"""How the gateway sets a port: 8E1, without echo. Until then the kernel echoes on a new one, as a USB port is at each plug-in."""
+
+
+def line_setting(device: str) -> tuple[int, int, int]:
+    """How a port is set, read from the kernel: speed, what stands for 8E1, echo."""
     fd = _beside(device)
     try:
         _, _, control, local, _, speed, _ = termios.tcgetattr(fd)
     finally:
         os.close(fd)
-    baud = {termios.B9600: 9600, termios.B115200: 115200}.get(speed, 0)
-    bits = {termios.CS5: 5, termios.CS6: 6, termios.CS7: 7, termios.CS8: 8}[control & termios.CSIZE]
-    parity = "N" if not control & termios.PARENB else "O" if control & termios.PARODD else "E"
-    return LineSetting(
-        baud, bits, parity, 2 if control & termios.CSTOPB else 1, bool(local & termios.ECHO)
-    )
+    frame = termios.CSIZE | termios.PARENB | termios.PARODD | termios.CSTOPB
+    return speed, control & frame, local & termios.ECHO
 
 
 def hold(device: str) -> int:

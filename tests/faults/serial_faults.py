@@ -9,21 +9,20 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 
+from beds import fault
 from encoding import Identity
-from fault_report import Fault, fault
-from harness import Bench, Injection, PtyPort, growth, half, injected
+from harness import Bench, Injection, PtyPort, growth
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.states import Device
 
-LIMIT_S = 2.0
 LOST, PORT_ERROR = 4, 5
-on_first = partial(injected, "Serial", escs=[0])
+on_first = partial(fault, "Serial", limit_s=2.0, escs=[0])
 """A fault of the first ESC."""
 
 
-def port_of(bench: Bench) -> PtyPort:
-    port = bench.ports[0]
+def port_of(bench: Bench, esc: int = 0) -> PtyPort:
+    port = bench.escs[esc]
     assert isinstance(port, PtyPort)
     return port
 
@@ -49,7 +48,7 @@ def replugged(port: PtyPort) -> Iterator[None]:
     port.link = link
 
 
-@on_first("port busy at its return", LIMIT_S)
+@on_first("port busy at its return")
 def busy(bench: Bench, injection: Injection, _n: int) -> None:
     port = port_of(bench)
     with replugged(port):
@@ -61,7 +60,7 @@ def busy(bench: Bench, injection: Injection, _n: int) -> None:
     bench.wait_log("in use")
 
 
-@on_first("permission missing at its return", LIMIT_S)
+@on_first("permission missing at its return")
 def permission(bench: Bench, injection: Injection, _n: int) -> None:
     port = port_of(bench)
     with replugged(port):
@@ -72,11 +71,7 @@ def permission(bench: Bench, injection: Injection, _n: int) -> None:
     os.chmod(port.device, 0o620)
 
 
-@on_first(
-    "port gone and back",
-    LIMIT_S,
-    rounds=lambda times: [0.05, 0.3, 0.7] * max(1, times // 2) + [24 if times > 10 else 4],
-)
+@on_first("port gone and back", rounds=(0.05, 0.3, 0.7, 4))
 def gone(bench: Bench, injection: Injection, pause: float) -> None:
     port = port_of(bench)
     port.unplug()
@@ -87,7 +82,7 @@ def gone(bench: Bench, injection: Injection, pause: float) -> None:
     port.plug()
 
 
-@on_first("port back under another name", LIMIT_S)
+@on_first("port back under another name")
 def other_name(bench: Bench, injection: Injection, _n: int) -> None:
     port = port_of(bench)
     before = port.device
@@ -98,7 +93,7 @@ def other_name(bench: Bench, injection: Injection, _n: int) -> None:
         time.sleep(0.3)
         injection.cleared()
         port.plug(other=True)
-        injection.expect(port.device != before, "the bench gave the port its old name again")
+        bench.expect(port.device != before, "the bench gave the port its old name again")
         injection.wait_recovery()
     finally:
         os.close(held)
@@ -111,14 +106,14 @@ Mangle = Callable[[bytes], tuple[bytes, bool]]
 
 def garbage(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
     """Whatever comes between whole frames, bits of frames included, no frame is lost."""
-    kind = generator.randrange(5)
-    if kind == 0:
-        return generator.randbytes(generator.randrange(1, 400)) + wire, True
-    if kind == 1:
-        return b"KODL" + generator.randbytes(generator.randrange(20)) + wire, True
-    if kind == 2:
-        return wire[: generator.randrange(1, len(wire))] + wire, True
-    return wire, True
+    between = (
+        generator.randbytes(generator.randrange(1, 400)),
+        b"KODL" + generator.randbytes(generator.randrange(20)),
+        wire[: generator.randrange(1, len(wire))],
+        b"",
+        b"",
+    )
+    return generator.choice(between) + wire, True
 
 
 def bit_errors(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
@@ -126,12 +121,13 @@ def bit_errors(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
     if generator.random() > 0.3:
         return wire, True
     at = generator.randrange(len(wire))
-    kind = generator.randrange(3)
-    if kind == 0:
-        return wire[:at] + wire[at + 1 :], False
-    if kind == 1:
-        return wire[:at] + bytes([wire[at] ^ 1 << generator.randrange(8)]) + wire[at + 1 :], False
-    return wire[:at] + bytes([generator.randrange(256)]) + wire[at:], False
+    rest = wire[at + 1 :]
+    hit = (
+        rest,
+        bytes([wire[at] ^ 1 << generator.randrange(8)]) + rest,
+        bytes([generator.randrange(256)]) + wire[at:],
+    )
+    return wire[:at] + generator.choice(hit), False
 
 
 def line_break(_generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
@@ -152,7 +148,7 @@ def slow_stream(generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
 
 def mangled(bench: Bench, injection: Injection, n: int, how: Mangle, readable: bool) -> None:
     """Nothing may be disturbed, or nothing is right any more: that a wrong setting is likely is said after a while."""
-    bench.fed[0].mangle = how
+    bench.escs[0].mangle = how
     try:
         time.sleep(1.5 if readable else 0.8)
         if readable:
@@ -161,7 +157,7 @@ def mangled(bench: Bench, injection: Injection, n: int, how: Mangle, readable: b
         if n == 0 and "parity" in injection.fault.name:
             bench.wait_log("parity")
     finally:
-        bench.fed[0].mangle = None
+        bench.escs[0].mangle = None
     injection.cleared()
 
 
@@ -172,39 +168,33 @@ for name, how, readable in (
     ("every byte hit, as by a wrong parity", parity, False),
     ("a 9600 baud stream", slow_stream, False),
 ):
-    escs, limit_s = ([], None) if readable else ([0], LIMIT_S)
+    escs, limit_s = ([], None) if readable else ([0], 2.0)
     line = partial(how, random.Random(name))
-    injected("Serial", name, limit_s, escs=escs)(partial(mangled, how=line, readable=readable))
+    fault("Serial", name, limit_s, escs=escs)(partial(mangled, how=line, readable=readable))
 
 
-@on_first("ESC off and on", LIMIT_S)
-def off(bench: Bench, injection: Injection, n: int) -> None:
-    bench.fed[0].on = False
-    time.sleep((0.5, 1.5, 3)[n % 3])
+@on_first("ESC off and on", rounds=(0.5, 1.5))
+def off(bench: Bench, injection: Injection, seconds: float) -> None:
+    bench.escs[0].on = False
+    time.sleep(seconds)
     lost(bench)
     injection.cleared()
-    bench.fed[0].on = True
+    bench.escs[0].on = True
 
 
-MODELS = [
+MODELS = (
     Identity(11, Layout.LEGACY, Device.JIVEPRO, 12),
     Identity(12, Layout.V4, Device.KOLIBRI, 3),
-    Identity(13, Layout.V4, Device.KOSMIK, 14),
     Identity(1),
-]
-
-
-@on_first(
-    "ESC swapped for another model and layout",
-    LIMIT_S,
-    settle_s=1,
-    rounds=lambda times: [*(MODELS * times)[:times], Identity(1)],
 )
+
+
+@on_first("ESC swapped for another model and layout", settle_s=1, rounds=MODELS)
 def swapped(bench: Bench, injection: Injection, model: Identity) -> None:
-    fed = bench.fed[0]
+    fed = bench.escs[0]
     fed.on = False
     time.sleep(0.6)
-    fed.become(model)
+    fed.identity = model
     injection.cleared()
     fed.on = True
     injection.wait_recovery()
@@ -215,10 +205,10 @@ def swapped(bench: Bench, injection: Injection, model: Identity) -> None:
     )
 
 
-@on_first("a stream that stutters, bytes seconds apart", LIMIT_S, rounds=half)
+@on_first("a stream that stutters, bytes seconds apart", rounds=[0])
 def stutter(bench: Bench, injection: Injection, _n: int) -> None:
     """A frame of which the end comes seconds after its beginning is old."""
-    fed = bench.fed[0]
+    fed = bench.escs[0]
     fed.on = False
     time.sleep(0.05)
     wire = encode(fed.live(len(fed.sent) - 1), fed.identity.layout)
@@ -230,26 +220,25 @@ def stutter(bench: Bench, injection: Injection, _n: int) -> None:
     fed.on = True
 
 
-@on_first("a line that is never silent", LIMIT_S, settle_s=1)
+@on_first("a line that is never silent", settle_s=1)
 def never_silent(bench: Bench, injection: Injection, _n: int) -> None:
     """Frame behind frame, as many as 115200 baud carry: of one ESC newer values take the place of older ones, of the other none is lost."""
-    fed = bench.fed[0]
+    fed = bench.escs[0]
     before, fed.rate_hz = fed.rate_hz, 260
     time.sleep(1.5)
     fed.rate_hz = before
     injection.cleared()
 
 
-@injected("Serial", "a port that floods", LIMIT_S, settle_s=1)
+@fault("Serial", "a port that floods", 2.0, settle_s=1)
 def flood(bench: Bench, injection: Injection, _n: int) -> None:
     """Rubbish and frames as fast as a pseudo terminal takes them, many times a UART's pace: the other ESC goes on, perhaps thinned out."""
     rubbish = random.Random(5).randbytes(4096).replace(b"K", b"k")
-    bench.watch.reset_silence()
     stop = threading.Event()
 
     def pour() -> None:
         while not stop.is_set():
-            if not bench.fed[0].write(rubbish):
+            if not bench.escs[0].write(rubbish):
                 time.sleep(0.001)
 
     thread = threading.Thread(target=pour, daemon=True)
@@ -257,34 +246,28 @@ def flood(bench: Bench, injection: Injection, _n: int) -> None:
     time.sleep(1.5)
     stop.set()
     thread.join()
-    silence = bench.longest_silence_s([1])
-    injection.row.peak("ms the other ESC was silent", int(1000 * silence))
-    injection.expect(silence < 0.25, f"the other ESC was silent for {silence:.2f} s")
+    silence = bench.longest_silence_s([1], injection.begin_ns)
+    bench.expect(silence < 0.25, f"the other ESC was silent for {silence:.2f} s")
     injection.cleared()
 
 
-@fault("Serial", "ports gone and back again and again", LIMIT_S, bench="cycles")
-def cycles(bench: Bench, fault: Fault, times: int) -> None:
+def cycles(bench: Bench, injection: Injection, times: int) -> None:
     """Nothing grows: memory, descriptors and threads after the cycles are what they were after the first few."""
-    rounds = 500 if times > 10 else 25
-    ports = [port for port in bench.ports if isinstance(port, PtyPort)]
-    row = bench.report.row(fault)
-    assert bench.gateway is not None
+    ports = [port_of(bench, esc) for esc in range(len(bench.escs))]
     before = bench.gateway.figures()
-    for i in range(rounds):
-        with bench.injection(fault, settle_s=0) as injection:
-            for port in ports:
-                port.unplug()
-            time.sleep(0.15)
-            injection.cleared()
-            for port in ports:
-                port.plug()
-            injection.wait_recovery()
-            if i == rounds // 5:
-                before = bench.gateway.figures()
+    for i in range(times):
+        for port in ports:
+            port.unplug()
+        time.sleep(0.15)
+        injection.cleared()
+        for port in ports:
+            port.plug()
+        injection.wait_recovery()
+        if i == times // 5:
+            before = bench.gateway.figures()
     time.sleep(0.5)
-    if growth(row, before, bench.gateway.figures(), 1024 + rounds):
-        row.recovered -= 1
-    row.injected *= len(ports)
-    row.recovered *= len(ports)
-    bench.watch.reset_silence()
+    grown = growth(before, bench.gateway.figures(), 1024)
+    bench.expect(not grown, f"the gateway has more than before: {grown}")
+
+
+fault("Serial", "ports gone and back 25 times", 2.0, rounds=[25])(cycles)

@@ -6,10 +6,10 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from encoding import Identity, info, info_values, live, live_values
+from encoding import Identity, info_values, live_values
 
-LIVE_NAMES = frozenset(live_values(live(Identity(), 0), 1))
-INFO_NAMES = frozenset(info_values(info(Identity(), 0)))
+LIVE_NAMES = frozenset(live_values(Identity(), 0))
+INFO_NAMES = frozenset(info_values(Identity(), 0))
 NOT_FOLLOWED = frozenset({"losses", "layout", "energy_used"})
 """Amid an ESC's values: what is the gateway's own."""
 STATE_STEMS = frozenset({"Link", "Heartbeat", "Emergency"})
@@ -42,6 +42,10 @@ class Message(NamedTuple):
     """All signals; of a live or info message only those that are an ESC's values."""
     flags: tuple[int, int]
     """Start and mask of the error bits; a mask of 0: none."""
+
+    @property
+    def name(self) -> str:
+        return self.stem if self.esc is None else f"Esc{self.esc + 1}{self.stem}"
 
 
 Table = dict[int, Message]
@@ -95,26 +99,22 @@ def _message(message: Any, count: int) -> Message:
     )
 
 
-def table_of(texts: Sequence[str], escs: int) -> Table:
-    """The table of all messages of these DBC texts."""
+def table_of(text: str, escs: int) -> Table:
+    """The table of all messages of a DBC's text."""
     import cantools.database
 
-    found: Table = {}
-    for text in texts:
-        database: Any = cantools.database.load_string(text, "dbc", strict=True)
-        for message in database.messages:
-            found[message.frame_id] = _message(message, escs)
-    return found
+    database: Any = cantools.database.load_string(text, "dbc", strict=True)
+    return {message.frame_id: _message(message, escs) for message in database.messages}
 
 
 def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:
     """Of what ``kontronik-can-gw dbc`` prints, of the nodes too if there are any; in this process, as a start takes long in a VM."""
     from kontronik_can_gw.cli import main
 
-    texts = []
+    found: Table = {}
     for options in ([], ["--canopen"]) if canopen else ([],):
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             assert main(["dbc", *words, *options]) == 0
-        texts.append(printed.getvalue())
-    return table_of(texts, escs)
+        found |= table_of(printed.getvalue(), escs)
+    return found

@@ -42,16 +42,16 @@ def test_each_error_is_told_by_the_levels() -> None:
 def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gateways_from_then_on() -> (
     None
 ):
-    adapter = SerialAdapter(0, "x")
+    adapter = SerialAdapter("x")
 
     def set_line(divisor: int, parity_and_bits: int) -> None:
-        adapter.control(0x40, 3, divisor, 0, 0)
-        adapter.control(0x40, 4, parity_and_bits, 0, 0)
+        adapter.vendor(3, divisor, 0, 0)
+        adapter.vendor(4, parity_and_bits, 0, 0)
 
     set_line(312, 0x0008)  # 9600 8N1, at the opening
-    adapter.taken(2, b"echo")
+    adapter.take(b"echo")
     set_line(26, 0x0208)  # 115200 8E1
-    adapter.taken(2, b"A")
+    adapter.take(b"A")
     set_line(312, 0x0008)  # by another program
-    adapter.taken(2, b"B")
-    assert (adapter.echoed, adapter.received) == (4, 2)
+    adapter.take(b"B")
+    assert adapter.received == 2

@@ -105,9 +105,9 @@ def test_a_users_dbc_is_followed(
         gateway.wait_for_line("esc1: /")
         for n in range(30):
             held_up = gateway.log.count("suspended")  # then it may throw frames away
-            while len(port.fed.sent) == n:
-                port.fed.send_one()
-            data = port.fed.live(n)
+            while len(port.sent) == n:
+                port.send_one()
+            data = port.live(n)
             wanted = {
                 "ElectricalSpeed": data.electrical_speed,
                 "BatteryVoltage": data.battery_voltage / 100,

@@ -202,14 +202,13 @@ class Chain:
         esc: str = NEVER_STALE,
     ) -> None:
         self.interface = interface
-        self.ports = [
+        self.escs = [
             PtyPort(folder / f"port{i + 1}", identity) for i, identity in enumerate(identities)
         ]
-        self.escs = [port.fed for port in self.ports]
         for fed in self.escs:
             fed.info_every = 10
         self.config = folder / "gateway.toml"
-        ports = [port.path for port in self.ports]
+        ports = [esc.path for esc in self.escs]
         self.config.write_text(configuration(interface, ports, toml, esc))
         table = table_sent(["-c", str(self.config)], "[canopen]" in toml, len(identities))
         self.watch = Witness(interface, table, self.escs, slack_ns=NO_LIMIT_NS, ignore_local=False)
@@ -222,7 +221,7 @@ class Chain:
         """A gateway that has opened everything, killed at the end if it still runs."""
         self.gateway = GatewayProcess(self.config, *options)
         try:
-            self.gateway.wait_for_line(f"esc{len(self.ports)}: /")
+            self.gateway.wait_for_line(f"esc{len(self.escs)}: /")
             self.gateway.wait_for_line("CAN socketcan")
             yield self.gateway
         finally:
@@ -267,12 +266,12 @@ class Chain:
         self.catch_up()
         self.watch.settle(lambda _begin, _end: 0)
         assert not self.watch.wrong, self.watch.wrong
-        assert not any(port.received() for port in self.ports), "something was sent to an ESC"
+        assert not any(esc.received() for esc in self.escs), "something was sent to an ESC"
 
     def close(self) -> None:
         self.watch.close()
-        for port in self.ports:
-            port.close()
+        for esc in self.escs:
+            esc.close()
 
 
 @contextmanager

@@ -1,13 +1,10 @@
-/* The bus: a real CAN interface, "can:vcan0", or a local socket that keeps frames apart and stands for it, "unix:NAME". */
+/* The bus: a local socket that keeps frames apart stands for a CAN interface; NAME in the abstract space leaves no file behind. */
 #include <errno.h>
 #include <linux/can.h>
-#include <linux/can/raw.h>
-#include <net/if.h>
 #include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <sys/un.h>
 #include <unistd.h>
@@ -18,23 +15,6 @@ static void die(const char *what)
     exit(1);
 }
 
-static int can_socket(const char *name)
-{
-    int fd = socket(AF_CAN, SOCK_RAW, CAN_RAW);
-    struct ifreq request = {0};
-    struct sockaddr_can address = {.can_family = AF_CAN};
-    if (fd < 0)
-        die("CAN socket");
-    strncpy(request.ifr_name, name, IFNAMSIZ - 1);
-    if (ioctl(fd, SIOCGIFINDEX, &request) < 0)
-        die(name);
-    address.can_ifindex = request.ifr_ifindex;
-    if (bind(fd, (struct sockaddr *)&address, sizeof address) < 0)
-        die(name);
-    return fd;
-}
-
-/* A name in the abstract space: no file is left behind. */
 static socklen_t local_address(struct sockaddr_un *address, const char *name)
 {
     memset(address, 0, sizeof *address);

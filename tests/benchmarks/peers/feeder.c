@@ -1,13 +1,12 @@
 /* The ESCs and the bus's other end: writes telemetry to pseudo terminals, receives and checks the CAN frames, measures the delay.
 
-       feeder [--escs N] [--seconds S] [--warmup S] [--period US] [--seed N] [--priority P] [--sdo] [--file F] --bus BUS
+       feeder [--escs N] [--seconds S] [--warmup S] [--period US] [--priority P] [--sdo] --bus BUS
 
    BUS as in bus.h. Prints lines of JSON: {"ports": [...]}; once the gateway has sent a frame and the warm-up is over
    {"begin": live frames so far}; at the end {"end": ...}; then the results. Every CAN frame with an id of
    five.dbc is compared with what the frames written say it must hold, in their order. The delay is from the write of a frame's last byte
    to the receipt of the fifth CAN frame that belongs to it.
-   --file: write these pieces (feed_file) to the one ESC in place of live frames; the received frames go to standard output as lines
-   "ID DATA" in hex. --sdo: be a CANopen master that asks nodes 1..N in turn, 200 times a second in all, for 20 objects. */
+   --sdo: be a CANopen master that asks nodes 1..N in turn, 200 times a second in all, for 20 objects. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <poll.h>
@@ -49,18 +48,17 @@ struct esc {
 };
 
 static struct esc *escs;
-static int count = 1, bus, on_can, sdo, priority;
+static int count = 1, bus, sdo, priority;
 static const char *bus_name = "";
-static int64_t period = 10000000, strange, others, write_failures;
+static int64_t period = 10000000, others;
 static _Atomic int stopping;
 static _Atomic int64_t received;
 static _Atomic int measuring;
 static uint32_t histogram[BUCKETS + 1]; /* microseconds */
-static int64_t delays, delay_sum, delay_max;
+static int64_t delay_max;
 static uint32_t sdo_histogram[BUCKETS + 1];
-static int64_t sdo_sent, sdo_answers, sdo_missed, sdo_max;
+static int64_t sdo_sent, sdo_answers, sdo_max;
 static _Atomic int64_t sdo_at[MOST];
-static FILE *dump;
 static uint32_t table[256];
 static uint64_t chance = 88172645463325252ULL;
 
@@ -164,7 +162,6 @@ static void write_all(struct esc *e, const uint8_t *data, int length)
             struct pollfd p = {.fd = e->fd, .events = POLLOUT};
             if (errno != EAGAIN && errno != EINTR)
                 die("write to a pseudo terminal");
-            write_failures++;
             if (stopping)
                 return;
             poll(&p, 1, 10);
@@ -195,8 +192,6 @@ static void note_delay(int64_t delay)
 {
     int64_t us = delay / 1000;
     histogram[us > BUCKETS ? BUCKETS : us]++;
-    delays++;
-    delay_sum += delay;
     if (delay > delay_max)
         delay_max = delay;
 }
@@ -205,12 +200,6 @@ static void receive(const struct can_frame *frame, int64_t now)
 {
     int id = frame->can_id, slot = (id - 272) / 128, index = (id - 272) % 128;
     received++;
-    if (dump) {
-        fprintf(dump, "%X ", id);
-        for (int i = 0; i < frame->can_dlc; i++)
-            fprintf(dump, "%02X", frame->data[i]);
-        fprintf(dump, "\n");
-    }
     if (sdo && id > 0x580 && id <= 0x580 + count) {
         int64_t at = sdo_at[id - 0x581], us = (now - at) / 1000;
         if (at) {
@@ -241,7 +230,6 @@ static void receive(const struct can_frame *frame, int64_t now)
             note_delay(now - w->at);
         return;
     }
-    strange++;
 }
 
 static void *receiver(void *nothing)
@@ -268,7 +256,6 @@ static void *master(void *nothing)
         for (int i = 0; i < count && !stopping; i++) {
             uint32_t n = asked++ / (uint32_t)count % 20; /* 2000h:1..10h, then 2020h:1..4 */
             struct can_frame frame = {.can_id = 0x601 + i, .can_dlc = 8, .data = {0x40, n < 16 ? 0 : 0x20, 0x20, n % 16 + 1}};
-            sdo_missed += sdo_at[i] != 0;
             sdo_at[i] = now_ns();
             sdo_sent++;
             if (send(bus, &frame, sizeof frame, 0) < 0)
@@ -314,7 +301,7 @@ static int new_port(char *name, int size, int *slave)
 static int accept_gateway(void)
 {
     struct sockaddr_un address;
-    socklen_t size = local_address(&address, bus_name + 5);
+    socklen_t size = local_address(&address, bus_name);
     int listener = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0);
     struct pollfd p[2] = {{.fd = listener, .events = POLLIN}, {.fd = 0, .events = POLLIN}};
     if (listener < 0 || bind(listener, (struct sockaddr *)&address, size) < 0 || listen(listener, 1) < 0)
@@ -352,7 +339,7 @@ static void be_prompt(void)
         return;
     mlockall(MCL_CURRENT | MCL_FUTURE);
     if (sched_setscheduler(0, SCHED_FIFO, &p) < 0)
-        priority = 0; /* told in the results */
+        priority = 0;
 }
 
 static int64_t all_sent(void)
@@ -392,30 +379,9 @@ static void feed(double seconds, double warmup)
     measuring = 0;
 }
 
-/* Pieces: a byte with the length, and 80h where a live frame ends with it: then go on when its five CAN frames have come. */
-static void feed_file(const char *name)
-{
-    static uint8_t data[1 << 22];
-    FILE *file = fopen(name, "rb");
-    int size, at = 0;
-    if (!file)
-        die(name);
-    size = fread(data, 1, sizeof data, file);
-    while (at < size && !stopping) {
-        int n = data[at] & 127, is_live = data[at] & 128;
-        int64_t before = received, patience = now_ns() + 1000000000;
-        write_all(&escs[0], data + at + 1, n);
-        at += 1 + n;
-        do
-            sleep_until(now_ns() + 500000);
-        while (is_live && received < before + FIVE && now_ns() < patience);
-    }
-}
-
 int main(int argc, char **argv)
 {
     double seconds = 5, warmup = 1;
-    const char *file = NULL;
     pthread_t thread, sdo_thread, watcher;
     for (int i = 1; i < argc; i++) {
         const char *name = argv[i], *value = i + 1 < argc ? argv[i + 1] : "";
@@ -425,9 +391,7 @@ int main(int argc, char **argv)
         else if (!strcmp(name, "--seconds")) seconds = atof(value);
         else if (!strcmp(name, "--warmup")) warmup = atof(value);
         else if (!strcmp(name, "--period")) period = atoll(value) * 1000;
-        else if (!strcmp(name, "--seed")) chance ^= strtoull(value, NULL, 10) * 0x9E3779B97F4A7C15ULL;
         else if (!strcmp(name, "--priority")) priority = atoi(value);
-        else if (!strcmp(name, "--file")) file = value;
         else if (!strcmp(name, "--bus")) bus_name = value;
         else { fprintf(stderr, "feeder: %s?\n", name); return 2; }
     }
@@ -444,8 +408,6 @@ int main(int argc, char **argv)
         table[i] = c;
     }
     escs = calloc(count, sizeof *escs);
-    if (file)
-        dump = stdout;
     printf("{\"ports\": [");
     for (int i = 0; i < count; i++) {
         char name[64];
@@ -456,16 +418,7 @@ int main(int argc, char **argv)
         e->current = e->motor_current = e->peak_current = 400, e->temperature = e->bec_temperature = 40;
     }
     printf("], ");
-    on_can = !strncmp(bus_name, "can:", 4);
-    if (on_can) {
-        int room = 1 << 22;
-        bus = can_socket(bus_name + 4);
-        setsockopt(bus, SOL_SOCKET, SO_RCVBUF, &room, sizeof room);
-        printf("\"bus\": \"ready\"}\n");
-        fflush(stdout);
-    } else {
-        bus = accept_gateway();
-    }
+    bus = accept_gateway();
     pthread_create(&watcher, NULL, watch_parent, NULL);
     be_prompt();
     pthread_create(&thread, NULL, receiver, NULL); /* has our priority */
@@ -474,29 +427,18 @@ int main(int argc, char **argv)
     sleep_until(now_ns() + 300000000); /* a gateway looks round once more behind its start */
     if (sdo)
         pthread_create(&sdo_thread, NULL, master, NULL);
-    if (file) {
-        feed_file(file);
-        sleep_until(now_ns() + 800000000); /* the loss of telemetry shows too */
-        fflush(stdout);
-        _exit(0);
-    }
     feed(seconds, warmup);
     sleep_until(now_ns() + 200000000);
     stopping = 1;
-    int64_t lost = 0, sent = all_sent(), matched = 0;
+    int64_t lost = 0;
     for (int i = 0; i < count; i++)
-        for (int k = 0; k < FIVE; k++) {
+        for (int k = 0; k < FIVE; k++)
             lost += escs[i].sent - escs[i].matched[k];
-            matched += escs[i].matched[k];
-        }
-    printf("{\"sent\": %lld, \"can_frames\": %lld, \"lost\": %lld, \"strange\": %lld, \"others\": %lld, \"full\": %lld, \"priority\": %d, ",
-           (long long)sent, (long long)matched, (long long)lost, (long long)strange, (long long)others, (long long)write_failures,
-           priority);
+    printf("{\"sent\": %lld, \"lost\": %lld, \"others\": %lld, ", (long long)all_sent(), (long long)lost, (long long)others);
     percentiles("delay_us", histogram, delay_max);
-    printf(", \"delay_mean_us\": %.2f, ", delays ? delay_sum / 1000.0 / delays : 0);
+    printf(", ");
     percentiles("sdo_us", sdo_histogram, sdo_max);
-    printf(", \"sdo_sent\": %lld, \"sdo_answers\": %lld, \"sdo_missed\": %lld}\n", (long long)sdo_sent, (long long)sdo_answers,
-           (long long)sdo_missed);
+    printf(", \"sdo_sent\": %lld, \"sdo_answers\": %lld}\n", (long long)sdo_sent, (long long)sdo_answers);
     fflush(stdout);
     _exit(0);
 }

@@ -1,6 +1,6 @@
 /* The floor: what a gateway costs in plain C. One epoll loop over serial ports, five CAN frames for each live frame (five.dbc).
 
-       gateway BUS PORT...        BUS: unix:NAME or can:vcan0
+       gateway BUS PORT...        BUS: see bus.h
 
    The same rules as ours where they show on the bus: all four frame forms, the CRC over the largest multiple of four bytes, the shorter
    form first, a search byte by byte behind what is no frame; Error codes for what does not fit; NotAvailable at the start, 250 ms behind
@@ -242,15 +242,11 @@ int main(int argc, char **argv)
         if (epoll_ctl(ep, EPOLL_CTL_ADD, escs[i].fd, &event) < 0)
             die("epoll");
     }
-    if (!strncmp(argv[1], "can:", 4)) {
-        bus = can_socket(argv[1] + 4);
-    } else {
-        struct sockaddr_un address;
-        socklen_t size = local_address(&address, argv[1] + 5);
-        bus = socket(AF_UNIX, SOCK_SEQPACKET, 0);
-        if (bus < 0 || connect(bus, (struct sockaddr *)&address, size) < 0)
-            die("bus");
-    }
+    struct sockaddr_un address;
+    socklen_t size = local_address(&address, argv[1]);
+    bus = socket(AF_UNIX, SOCK_SEQPACKET, 0);
+    if (bus < 0 || connect(bus, (struct sockaddr *)&address, size) < 0)
+        die("bus");
     for (int i = 0; i < count; i++)
         not_available(i);
     while (!stopping) {

@@ -1,4 +1,4 @@
-"""What the runner of the fault programme makes of rows that ran while processor time was taken away."""
+"""What the fault programme makes of faults that ran while processor time was taken away."""
 
 import itertools
 import os
@@ -9,13 +9,12 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from fault_report import FAILED, GOOD, NOT_JUDGED, Report, Row
-from outside import Load, Sample, conclude, worst_share
+from programme import conclude
+from taken import Load, Sample, worst_share
 
 
 def row(name: str = "x", taken: float = 0.0, **counts: Any) -> Row:
-    return Row(
-        "UML", "Serial", name, 2.0, **{"injected": 3, "recovered": 3, "taken": taken, **counts}
-    )
+    return Row(name, 2.0, **{"injected": 3, "recovered": 3, "taken": taken, **counts})
 
 
 @pytest.mark.parametrize(
@@ -45,23 +44,25 @@ def test_lateness_and_loss_are_judged_on_a_machine_that_could_run_and_wrong_valu
 def test_states_stand_in_both_reports_and_a_wrong_value_fails_anyhow(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = Report()
-    report.rows = [row("good"), row("late", 0.3, recovered=2)]
-    out, junit = tmp_path / "out.json", tmp_path / "out.xml"
-    assert conclude(report, out, junit) == 0
-    report.rows.append(row("wrong", 0.3, wrong=1))
-    assert conclude(report, out, junit) == 1
-    assert [each.state for each in Report.read([out]).rows] == [GOOD, NOT_JUDGED, FAILED]
-    cases = [[found.tag for found in case] for case in ET.parse(junit).iter("testcase")]
-    assert cases == [[], ["skipped"], ["failure"]]
+    report = Report(good=row("good"), late=row("late", 0.3, recovered=2))
+    assert conclude(report) == 0
+    report["wrong"] = row("wrong", 0.3, wrong=1)
+    assert conclude(report) == 1
     assert capsys.readouterr().out.endswith("3 faults: 1 failed, 1 good, 1 not judged\n")
-    assert conclude(Report(), None, None) == 1, "nothing was run"
+    out, again = tmp_path / "out", Report()
+    report.write(out)
+    again.read(out)
+    assert [each.state for each in again.values()] == [GOOD, NOT_JUDGED, FAILED]
+    report.write_junit(out)
+    cases = [[found.tag for found in case] for case in ET.parse(out).iter("testcase")]
+    assert cases == [[], ["skipped"], ["failure"]]
+    assert conclude(Report()) == 1, "nothing was run"
 
 
 def at(*shares: float) -> list[Sample]:
-    """Two samples a second of a machine with two processors, of which such shares were taken."""
-    stolen = itertools.accumulate([0, *(round(100 * share) for share in shares)])
-    return [Sample(n / 2, each, 100 * n) for n, each in enumerate(stolen)]
+    """Two samples a second, between which such shares were taken."""
+    taken = itertools.accumulate([0.0, *(share / 2 for share in shares)])
+    return [Sample(n / 2, each) for n, each in enumerate(taken)]
 
 
 def test_the_worst_second_counts() -> None:

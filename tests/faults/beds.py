@@ -1,0 +1,117 @@
+"""The beds that the faults of the programme share: each makes a bench with a running gateway."""
+
+import contextlib
+import functools
+import itertools
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from encoding import Identity
+from fault_report import FAULTS, Fault
+from harness import Bench, PtyPort
+from signals import table_sent
+from slcan_adapters import Bus
+
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.states import Device
+
+WITHOUT_OVERRIDE = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
+"""Root that file permissions hold for."""
+IDENTITIES = (Identity(1), Identity(2, Layout.LEGACY, Device.JIVEPRO, 12, alarms=True))
+ADAPTER_RATE = 500_000
+table = functools.cache(table_sent)
+"""Of the shipped layouts."""
+_numbers = itertools.count()
+MakesBench = Callable[[Path], contextlib.AbstractContextManager[Bench]]
+
+
+def run(command: str) -> None:
+    subprocess.run(command.split(), check=True)
+
+
+def make_pair(gateway_end: str, far_end: str) -> None:
+    """A CAN cable: what is sent at one end comes out at the other. The gateway's end is down."""
+    run(f"ip link add {gateway_end} type vxcan peer name {far_end}")
+    run(f"ip link set {far_end} up")
+
+
+@contextlib.contextmanager
+def bench_of(
+    identities: Sequence[Identity] = IDENTITIES,
+    rate_hz: float = 50,
+    names: tuple[str, str] | None = None,
+    **options: Any,
+) -> Iterator[Bench]:
+    """A running gateway with these ESCs on a CAN cable, or on interfaces that are there."""
+    number = next(_numbers)
+    near, far = names or (f"gw{number}", f"far{number}")
+    if names is None:
+        make_pair(near, far)
+        run(f"ip link set {near} up")
+    folder = Path(tempfile.mkdtemp(prefix="ports."))
+    ports = [
+        PtyPort(folder / f"esc{i + 1}", identity, rate_hz) for i, identity in enumerate(identities)
+    ]
+    known = table(("--esc", str(len(ports))), options.get("canopen", "") is not None, len(ports))
+    try:
+        with Bench(near, far, ports, known, **options) as bench:
+            bench.start()
+            yield bench
+    finally:
+        if names is None:
+            subprocess.run(["ip", "link", "del", near], check=False, capture_output=True)
+
+
+def two(_: Path) -> contextlib.AbstractContextManager[Bench]:
+    return bench_of(prefix=WITHOUT_OVERRIDE)
+
+
+def eight(_: Path) -> contextlib.AbstractContextManager[Bench]:
+    """Slow ones: feeder and judge have the processor, too."""
+    layouts = (Layout.V4, Layout.LEGACY)
+    identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
+    return bench_of(identities, rate_hz=25, canopen=None)
+
+
+BUS: list[Bus] = []
+"""That of the bed ``adapters``, while there is one."""
+
+
+@contextlib.contextmanager
+def adapters(_: Path) -> Iterator[Bench]:
+    """One ESC, a gateway on an emulated adapter, the judge on another; the adapters are slow."""
+    number = next(_numbers)
+    names = f"sl{number}", f"slfar{number}"
+    BUS[:] = [Bus(*names)]
+    try:
+        for adapter in BUS[0].adapters:
+            run(f"ip link set {adapter.name} txqueuelen 100")
+            adapter.up(ADAPTER_RATE)
+        with bench_of([Identity(1)], rate_hz=25, names=names) as bench:
+            yield bench
+    finally:
+        BUS[0].close()
+
+
+Injects = Callable[[Any, Any, Any], None]
+
+
+def fault(
+    area: str,
+    name: str,
+    limit_s: float | None,
+    *,
+    bed: MakesBench = two,
+    machine: str = "UML",
+    **further: Any,
+) -> Callable[[Injects], Injects]:
+    """Register a function as a fault; when its cause is ``cleared``, its recovery is waited for."""
+
+    def register(inject: Injects) -> Injects:
+        FAULTS.append(Fault(machine, area, name, limit_s, inject, bed, **further))
+        return inject
+
+    return register
