@@ -60,5 +60,5 @@ def gateway_with(layout: Layout, *lives: LiveData | None, info: InfoData | None 
 
 def packed(plan: MessagePlan, gateway: Gateway, alive: int = 0, page: int | None = None) -> bytes:
     """What a message holds now."""
-    bits = compile_pack(plan)(gateway.escs, gateway.status, NOW, alive, page or 0)
+    bits = compile_pack(plan)(gateway.escs, gateway.status, NOW, alive, plan.pages.index(page))
     return bits.to_bytes(plan.length, "little")
