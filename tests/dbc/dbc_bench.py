@@ -31,7 +31,7 @@ def compiled(
     """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcSettings."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
-    return prepare(database, FILE, escs, DbcSettings(**settings), fd, taken)[1]
+    return prepare(database, FILE, escs, DbcSettings(**settings), fd, taken)
 
 
 def refused(text: str, *arguments: Any, **more: Any) -> list[str]:

@@ -53,7 +53,7 @@ def built() -> None:
 
 def layout_of(signal: str, more: str = "") -> Layout:
     database = parse_database((HEAD.format(signal) + more).encode(), "t.dbc")
-    return prepare(database, "t.dbc", (EscSettings(),), DbcSettings())[1]
+    return prepare(database, "t.dbc", (EscSettings(),), DbcSettings())
 
 
 def why(**settings: object) -> str:
@@ -232,7 +232,7 @@ def test_a_signal_of_more_than_64_bits_runs_in_python(bits: int) -> None:
     signal = f'BatteryVoltage : 0|{bits}@1+ (0.01,0) [0|0] "V"'
     text = HEAD.format(signal).replace("M: 8", "M: 64")
     database = parse_database(text.encode(), "t.dbc")
-    layout = prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)[1]
+    layout = prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)
     found = Gateway([EscSettings()], layout, 0).why_python
     assert found == ("" if bits == 64 else f"M.BatteryVoltage: {bits} bits")
 

@@ -27,7 +27,7 @@ from packer_oracle import (
     read,
 )
 
-from kontronik_can_gw.dbc.prepare import compile_layout
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES
@@ -49,9 +49,7 @@ ROUNDS = 3
 def compiled(
     messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS
 ) -> dict[str, MessagePlan]:
-    layout = compile_layout(
-        database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True
-    )
+    layout = prepare(database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True)
     return {plan.name: plan for plan in layout.messages}
 
 
