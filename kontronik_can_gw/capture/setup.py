@@ -125,11 +125,12 @@ class CaptureSetup:
         )
 
     def database(self) -> tuple["Database", Layout] | None:
-        """The database that was sent by and its layout; None without DBC output. UserError if this version refuses it."""
+        """The DBC that was sent by and its layout; None without DBC output. UserError if this version refuses it."""
         if self.dbc is None:
             return None
         name, data = self.dbc
-        return prepare(parse_database(data, name), name, self.escs, self.dbc_settings, self.fd)
+        database = parse_database(data, name)
+        return database, prepare(database, name, self.escs, self.dbc_settings, self.fd)
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """The gateway in its state before the start."""

@@ -13,7 +13,7 @@ from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.parse import name_problem
-from kontronik_can_gw.dbc.expand import among_canopen, expand
+from kontronik_can_gw.dbc.expand import among_canopen, copies_of, expand
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import choose_node, load_database
 from kontronik_can_gw.dbc.settings import DbcSettings
@@ -111,11 +111,12 @@ def _database(args: argparse.Namespace) -> "Database":
         options = ("esc", "name", "base_id", "id_step", "node", "from")
         _refuse(args, options, "--config, which says all that")
         loaded = load_all(args.config)
-        database = loaded.database
-        if database is None:
+        if loaded.database is None:
             raise UserError(
                 f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. --canopen writes those of the nodes."
             )
+        settings, plain = loaded.config.dbc_settings, loaded.database
+        database = expand(plain, copies_of(plain, loaded.layout.file, loaded.escs, settings))
         version = re.sub(" ?layout [0-9A-F]{8}$", "", database.version or "")
         database.version = f"{version} layout {loaded.layout.fingerprint}".strip()
         return database
@@ -126,12 +127,13 @@ def _database(args: argparse.Namespace) -> "Database":
     for line in ignored:
         say(f"warning: {line}")
     node = choose_node(plain, args.node, str(file))
-    database, bind = expand(plain, node, escs, str(file), None, args.base_id, args.id_step)
-    if args.base_id is None and (reason := among_canopen(plain, database, node)):
+    settings = DbcSettings(node=node, base_id=args.base_id, id_step=args.id_step)
+    copies = copies_of(plain, str(file), escs, settings)
+    if args.base_id is None and (reason := among_canopen(copies, node)):
         raise UserError(f"{file}: for {len(escs)} ESCs, {reason}")
     # raises for mistakes that the gateway refuses
-    prepare(database, str(file), escs, DbcSettings(bind, node), fd_allowed=True)
-    return database
+    prepare(plain, str(file), escs, settings, fd_allowed=True)
+    return expand(plain, copies)
 
 
 def _refuse(args: argparse.Namespace, options: tuple[str, ...], beside: str) -> None:

@@ -64,6 +64,7 @@ class Loaded:
     escs: list[EscSettings]
     """The settings in effect: configuration, then parameters that a master stored."""
     database: "Database | None"
+    """The DBC as it was read."""
     layout: Layout
     canopen: "CanopenSetup | None"
     damaged: tuple[tuple[int, str], ...]
@@ -168,8 +169,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     if config.dbc.enabled:
         with collecting(problems):
             dbc = read_dbc(config.dbc_path)
-            found = parse_database(dbc, file, ignored)
-            database, layout = prepare(found, file, escs, config.dbc_settings, config.can.fd, taken)
+            database = parse_database(dbc, file, ignored)
+            layout = prepare(database, file, escs, config.dbc_settings, config.can.fd, taken)
     if problems:
         raise UserError(*problems)
     bitrate, data_bitrate = config.can.bitrate, config.can.data_bitrate

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -30,13 +31,18 @@ class Binder:
             ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
         )
 
-    def by_name(self, name: str) -> tuple[Value, int | None] | None:
-        """The source of a signal name or a bound name, and its ESC (None: no ESC named, or the gateway)."""
+    def by_name(self, name: str, esc: int | None = None) -> tuple[Value, int | None] | None:
+        """The source of a signal name or a bound name, and its ESC (None: no ESC named, or the gateway).
+
+        ``esc``: whose values a name without an ESC means.
+        """
         key = normalize(name)
-        meant: list[tuple[int | None, str]] = [(0, key)] if len(self.escs) == 1 else []
-        for prefix, esc in self._prefixes:
+        if esc is None and len(self.escs) == 1:
+            esc = 0
+        meant: list[tuple[int | None, str]] = [] if esc is None else [(esc, key)]
+        for prefix, index in self._prefixes:
             if key.startswith(prefix):
-                meant.append((esc, key.removeprefix(prefix)))
+                meant.append((index, key.removeprefix(prefix)))
         for of_esc, rest in [*meant, (None, key)]:
             known = VALUES_BY_KEY if of_esc is None else self._known[of_esc]
             value = known.get(rest) or known.get(rest.removesuffix("percent"))
@@ -44,9 +50,9 @@ class Binder:
                 return value, None if value.group is Group.GATEWAY else of_esc
         return None
 
-    def bound(self, message: str, signal: str) -> str | float | None:
-        """The entry of ``[dbc.bind]`` for a signal."""
-        key = bind_key(self.bind, message, signal)
+    def bound(self, copy: Copy, signal: str) -> str | float | None:
+        """The entry of ``[dbc.bind]`` for a signal of the file."""
+        key = next((key for key in copy.bind_keys(signal) if key in self.bind), None)
         if key is None:
             return None
         self.used.add(key)
@@ -56,7 +62,7 @@ class Binder:
         """The ESCs that a message has values of, by index; None: of one that is not named."""
         escs = set()
         for signal in message.signals:
-            bound = self.bound(message.name, signal.name)
+            bound = self.bound(Copy(message), signal.name)
             found = self.by_name(bound if isinstance(bound, str) else signal.name)
             if found and found[0].group is not Group.GATEWAY:
                 escs.add(found[1])
@@ -70,8 +76,3 @@ class Binder:
         return did_you_mean(
             key, VALUES_BY_KEY, 0.5, show=lambda near: VALUES_BY_KEY[near].name, count=3
         )
-
-
-def bind_key(bind: Mapping[str, str | float], message: str, signal: str) -> str | None:
-    """The key of a signal's entry in ``[dbc.bind]``: its name with that of its message, or alone."""
-    return next((key for key in (f"{message}.{signal}", signal) if key in bind), None)

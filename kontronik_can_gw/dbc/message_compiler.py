@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import is_e2e
 from kontronik_can_gw.dbc.raw_values import bits, raw_range
 from kontronik_can_gw.dbc.settings import Compilation
@@ -19,8 +20,9 @@ _MAX_PAGES = 1024
 """Maximum of multiplexer values in one of our messages."""
 
 
-def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
+def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
     """The plan of a message; None, with lines in the problems, where it cannot be sent."""
+    message = copy.message
     where = f"{job.file}: {message.name}"
     before = len(job.problems)
     job.problems += _frame_problems(job, message, where)
@@ -31,15 +33,15 @@ def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
     if problem := _too_many_pages(message, len(pages)):
         job.problems.append(f"{where}: {problem}")
         return None
-    signals = _signals(job, message)
+    signals = _signals(job, copy)
     job.problems += _placement_problems(message, where)
     job.problems += _page_problems(message, pages, signals, where)
-    job.problems += _crc_problems(job, message, signals, where)
+    job.problems += _crc_problems(job, copy, signals, where)
     if len(job.problems) > before:
         return None
     return MessagePlan(
-        name=message.name,
-        can_id=message.frame_id,
+        name=copy.name,
+        can_id=copy.frame_id,
         extended=message.is_extended_frame,
         fd=_is_fd(message),
         length=message.length,
@@ -50,7 +52,7 @@ def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
         escs=frozenset(s.esc for s in signals if s.esc is not None),
         paces=frozenset(s.source.pace or s.source.group for s in signals if s.source),
         pages=tuple(pages) or (None,),
-        data_id=job.settings.data_ids.get(message.name, message.frame_id & 0xFFFF),
+        data_id=job.settings.data_ids.get(copy.name, copy.frame_id & 0xFFFF),
     )
 
 
@@ -86,12 +88,12 @@ def _too_many_pages(message: "Message", count: int) -> str | None:
     return None
 
 
-def _signals(job: Compilation, message: "Message") -> list[SignalPlan]:
+def _signals(job: Compilation, copy: Copy) -> list[SignalPlan]:
     """The plans of a message's signals, those on several pages once for each."""
     plans = []
-    for signal in message.signals:
-        if signal.length <= message.length * 8:  # others are reported with their place
-            compiler = SignalCompiler(job, message, signal)
+    for signal in copy.message.signals:
+        if signal.length <= copy.message.length * 8:  # others are reported with their place
+            compiler = SignalCompiler(job, copy, signal)
             plans += [compiler.plan(page) for page in signal.multiplexer_ids or (None,)]
     return [plan for plan in plans if plan is not None]
 
@@ -141,7 +143,7 @@ def _page_problems(
 
 
 def _crc_problems(
-    job: Compilation, message: "Message", signals: Sequence[SignalPlan], where: str
+    job: Compilation, copy: Copy, signals: Sequence[SignalPlan], where: str
 ) -> Iterator[str]:
     """A checksum is sent only as AUTOSAR E2E profile 1, if it is configured or has the well-known names."""
     crcs = [signal for signal in signals if signal.role is Role.CRC]
@@ -152,14 +154,13 @@ def _crc_problems(
     if len(crcs) != 1:
         return
     (crc,) = crcs
-    bound = job.binder.bound
-    asked = message.name in job.settings.data_ids or bound(message.name, crc.name) is not None
+    own = crc.name.removeprefix(copy.prefix)
+    asked = copy.name in job.settings.data_ids or job.binder.bound(copy, own) is not None
     fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
     has_counter = len(alive) == 1 and alive[0].high >= 14
-    by_names = has_counter and is_e2e(
-        crc.name, str(bound(message.name, alive[0].name) or alive[0].name)
-    )
-    key = f"dbc.e2e_data_ids.{message.name} = 0x{message.frame_id & 0xFFFF:X}"
+    counter = alive[0].name.removeprefix(copy.prefix) if alive else ""
+    by_names = has_counter and is_e2e(own, str(job.binder.bound(copy, counter) or counter))
+    key = f"dbc.e2e_data_ids.{copy.name} = 0x{copy.frame_id & 0xFFFF:X}"
     if not asked and not (fits and by_names):
         yield (
             f"{where}.{crc.name}: the DBC does not say how this checksum is made. AUTOSAR E2E profile 1 (8 bits on a byte border, "

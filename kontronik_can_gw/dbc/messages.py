@@ -4,9 +4,8 @@ Pure: ``on_event`` and time (``advance``) mark messages as pending, ``take`` pac
 over at most once in a step: in the order of the times at which the messages became due, then of their index.
 """
 
-from collections.abc import Iterable, Sequence
-from itertools import chain
-from typing import NamedTuple
+from collections.abc import Sequence
+from operator import itemgetter
 
 from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
@@ -23,8 +22,6 @@ _EVENT_OF_PACE = {
     Group.LINK: Event.LINK,
     Group.GATEWAY: Event.NONE,
 }
-
-_CAUSES = Event.LIVE | Event.INFO | Event.LINK | Event.SECOND
 
 
 class Traits:
@@ -71,10 +68,6 @@ class _Message(Traits):
         self.pages_to_send: set[int] = set()
         self.alive = 0
         self.last: dict[int, CanFrame] = {}
-        # one that was asked for is sent, and there is nothing to note
-        self.is_stateless = self.is_free and not (
-            self.silent_able or self.on_change or self.alive_modulus
-        )
 
     def follows(self, events: int, up: bool) -> bool:
         """Whether these events of an ESC are news to it. ``up``: the ESC's live data is fresh."""
@@ -100,8 +93,7 @@ class _Message(Traits):
         if not self.pages_to_send:
             self.turn_page()
         count = len(self.plan.pages)
-        places = ((self.place + n) % count for n in range(count))
-        place = next(place for place in places if place in self.pages_to_send)
+        place = min(self.pages_to_send, key=lambda place: (place - self.place) % count)
         self.pages_to_send.remove(place)
         return place
 
@@ -112,14 +104,6 @@ def own_ids(layout: Layout) -> dict[int, Owner]:
         plan.can_id | (EXTENDED if plan.extended else 0): Owner(None, f"message {plan.name}")
         for plan in layout.messages
     }
-
-
-class _Followers(NamedTuple):
-    """The messages that follow a combination of events: those that go at once, those of the schedule, those that send all pages."""
-
-    at_once: tuple[int, ...]
-    scheduled: tuple[int, ...]
-    paged: tuple[_Message, ...]
 
 
 class Messages:
@@ -139,34 +123,17 @@ class Messages:
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
-        self._stateless = [m.frame if m.is_stateless else None for m in self._messages]
         self._of_gateway = [(i, m) for i, m in enumerate(self._messages) if m.follows_gateway]
-        self.schedule = Schedule(layout.messages, now)
-        self.pending: dict[tuple[int, ...], int] = {}
-        """Messages that ``take`` hands over, in groups that became pending together, and since when."""
-        self._why: dict[int, int] = {}
-        """Of pending messages CYCLE, it is sent in any case, REQUEST, where it is news, or both; REQUEST of those that are missing."""
-        self._followers = [
-            [
-                [self._followers_of(esc, up, events) for events in range(_CAUSES + 1)]
-                for up in (False, True)
-            ]
+        self._of_esc = [
+            [(i, m) for i, m in enumerate(self._messages) if esc in m.plan.escs]
             for esc in range(len(escs))
         ]
-        """By ESC, whether its live data is fresh, and combination of events."""
+        self.schedule = Schedule(layout.messages, now)
+        self.pending: dict[int, int] = {}
+        """Messages that ``take`` hands over, and since when."""
+        self._why: dict[int, int] = {}
+        """Of pending messages CYCLE, it is sent in any case, REQUEST, where it is news, or both."""
         self._stopping = False
-
-    def _followers_of(self, esc: int, up: bool, events: int) -> _Followers:
-        found = [
-            (i, m)
-            for i, m in enumerate(self._messages)
-            if esc in m.plan.escs and m.follows(events, up)
-        ]
-        return _Followers(
-            tuple(i for i, m in found if m.is_free),
-            tuple(i for i, m in found if not m.is_free),
-            tuple(m for _, m in found if m.is_paged and m.by_event),
-        )
 
     # --- what makes messages pending
 
@@ -174,14 +141,13 @@ class Messages:
         """Something of an ESC changed: bits of telemetry.Event."""
         state = self._escs[esc]
         up = state.live is not None
-        at_once, scheduled, paged = self._followers[esc][up][events & _CAUSES]
-        if paged and (not up or (events & Event.INFO and state.info is None)):
-            for message in paged:
-                message.add_all_pages()  # no further event brings the others
-        if at_once:
-            self.pending.setdefault(at_once, now)
-        for index in scheduled:
-            self._request(index, now)
+        # no further event brings the other pages
+        is_last = not up or (events & Event.INFO and state.info is None)
+        for index, message in self._of_esc[esc]:
+            if message.follows(events, up):
+                if is_last and message.by_event:
+                    message.add_all_pages()
+                self._request(index, now)
 
     def on_gateway_change(self, now: int, each_second: bool = False) -> None:
         """The gateway's own state changed; ``each_second``: only its counters, which is news for messages that have no cycle."""
@@ -218,34 +184,19 @@ class Messages:
             self.schedule.defer(index)
 
     def _let_go(self, index: int, since: int, why: int) -> None:
-        self.pending[(index,)] = min(since, self.pending.get((index,), since))
+        self.pending[index] = min(since, self.pending.get(index, since))
         self._why[index] = self._why.get(index, 0) | why
 
     # --- frames
 
     def take(self, now: int) -> list[CanFrame]:
         """The frames of what is pending, as they are now."""
-        if not self.pending:
-            return []
         pending, self.pending = self.pending, {}
         why, self._why = self._why, {}
-        order: Iterable[int]
-        if len(pending) == 1:
-            (order,) = pending
-        else:
-            by_time: dict[int, set[int]] = {}
-            for group, since in pending.items():
-                by_time.setdefault(since, set()).update(group)
-            order = dict.fromkeys(chain.from_iterable(sorted(by_time[t]) for t in sorted(by_time)))
-        escs, gateway, stateless = self._escs, self._gateway, self._stateless
         frames: list[CanFrame] = []
-        for index in order:
-            frame = stateless[index]
-            if frame is not None:
-                frames.append(frame(escs, gateway, now, 0, 0))
-                continue
+        for index, _ in sorted(pending.items(), key=itemgetter(1, 0)):
             message = self._messages[index]
-            if self._is_sent(message, why.get(index, REQUEST), now):
+            if self._is_sent(message, why[index], now):
                 frames.append(self._frame(index, message, now))
                 while self._stopping and message.pages_to_send:
                     frames.append(self._frame(index, message, now))
@@ -282,8 +233,7 @@ class Messages:
             message.last[place] = message.frame(self._escs, self._gateway, now, 0, place)
         if message.alive_modulus:
             message.alive = (message.alive + 1) % message.alive_modulus
-        if not message.is_free:
-            self.schedule.sent(index, now)
-            if message.pages_to_send:
-                self.schedule.wait(index, now)
+        self.schedule.sent(index, now)
+        if message.pages_to_send:
+            self.schedule.wait(index, now)
         return frame

@@ -4,7 +4,6 @@ Pure: ``may_go`` says whether a message may be sent now, ``defer`` puts it off u
 reports a sent one, and ``next_due`` is the time of the next call.
 """
 
-import heapq
 from collections.abc import Sequence
 
 from kontronik_can_gw.output import NEVER
@@ -25,17 +24,13 @@ class Schedule:
         self._cycle = [plan.cycle_ns for plan in plans]
         self._delay = [plan.delay_ns for plan in plans]
         self._last = [_LONG_AGO] * len(plans)
+        self._cycle_due = [
+            now + phase if cycle else NEVER
+            for cycle, phase in zip(self._cycle, phases(self._cycle), strict=True)
+        ]
         self._deferred_until = [NEVER] * len(plans)
         self._cycle_deferred = [False] * len(plans)
-        self._heap = [
-            (now + phase, index, False)
-            for index, phase in enumerate(phases(self._cycle))
-            if self._cycle[index]
-        ]
-        """(when, message, True for a deferred request): at the same time the cycle of a message comes first."""
-        heapq.heapify(self._heap)
-        self.next_due = self._heap[0][0] if self._heap else NEVER
-        """When ``due`` will return a message; NEVER for never."""
+        self._note_next()
 
     def may_go(self, index: int, now: int) -> bool:
         """True if the message may be sent now: its minimum distance is over."""
@@ -57,48 +52,38 @@ class Schedule:
             self._deferred_until[index] = NEVER
             self._note_next()
 
-    def _note_next(self) -> None:
-        """The first deadline that still holds; before it go those of requests that were done meanwhile."""
-        heap = self._heap
-        while heap and heap[0][2] and heap[0][0] != self._deferred_until[heap[0][1]]:
-            heapq.heappop(heap)
-        self.next_due = heap[0][0] if heap else NEVER
-
     def due(self, now: int) -> list[tuple[int, int, int]]:
         """(deadline, message, CYCLE, REQUEST or both), each message once.
 
         A late call skips missed cycles: it never returns a message twice.
         """
-        heap = self._heap
-        found: dict[int, tuple[int, int, int]] = {}
-        while heap and heap[0][0] <= now:
-            when, index, is_deferred = heap[0]
-            if is_deferred:
-                heapq.heappop(heap)
-                if when != self._deferred_until[index]:
-                    continue  # a frame has gone out since
+        found = []
+        for index, cycle in enumerate(self._cycle):
+            when, why = NEVER, 0
+            if (until := self._deferred_until[index]) <= now:
+                when, why = until, CYCLE | REQUEST if self._cycle_deferred[index] else REQUEST
                 self._deferred_until[index] = NEVER
-                first, _, why = found.get(index, (when, index, 0))
-                why |= CYCLE | REQUEST if self._cycle_deferred[index] else REQUEST
-                found[index] = (first, index, why)
                 self._cycle_deferred[index] = False
-            else:
-                cycle = self._cycle[index]
-                heapq.heapreplace(heap, (when + cycle * ((now - when) // cycle + 1), index, False))
+            if (start := self._cycle_due[index]) <= now:
+                self._cycle_due[index] += cycle * ((now - start) // cycle + 1)
                 if self.may_go(index, now):
-                    first, _, why = found.get(index, (when, index, 0))
-                    found[index] = (first, index, why | CYCLE)
+                    when, why = min(when, start), why | CYCLE
                 else:
                     self.defer(index)
                     self._cycle_deferred[index] = True
+            if why:
+                found.append((when, index, why))
         self._note_next()
-        return list(found.values())
+        return found
+
+    def _note_next(self) -> None:
+        self.next_due = min([*self._cycle_due, *self._deferred_until], default=NEVER)
+        """When ``due`` will return a message; NEVER for never."""
 
     def _defer(self, index: int, until: int) -> None:
         if self._deferred_until[index] == NEVER:
             self._deferred_until[index] = until
-            heapq.heappush(self._heap, (until, index, True))
-            self.next_due = self._heap[0][0]
+            self.next_due = min(self.next_due, until)
 
 
 def phases(cycles: Sequence[int]) -> list[int]:

@@ -54,8 +54,8 @@ class Compilation:
     send_types: set[str] = field(default_factory=set)
     while_active: list[str] = field(default_factory=list)
     """Messages whose send type means: only while a signal is active."""
-    unbound: int = 0
-    """Number of signals without a source."""
+    unbound: set[str] = field(default_factory=set)
+    """Signals without a source."""
     _tables: dict[int, ValueTable] = field(default_factory=dict)
     """By the address of what cantools read, which the database keeps."""
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc import names, raw_values
 from kontronik_can_gw.dbc.bound_value import bound_plan
+from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.raw_values import exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.settings import Compilation, UnfitSignal
@@ -15,7 +16,7 @@ from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import Role, SignalPlan
 
 if TYPE_CHECKING:
-    from cantools.database.can import Message, Signal
+    from cantools.database.can import Signal
 
 _SUSPECT = {
     None: "",
@@ -27,9 +28,9 @@ _SUSPECT = {
 class SignalCompiler:
     """Makes the plans of one signal, one for each page it is on."""
 
-    def __init__(self, job: Compilation, message: "Message", signal: "Signal") -> None:
+    def __init__(self, job: Compilation, copy: Copy, signal: "Signal") -> None:
         self.job = job
-        self.message = message
+        self.copy = copy
         self.signal = signal
         self.table = job.table(signal)
         self.start = attribute(signal, "GenSigStartValue", job.database)
@@ -47,7 +48,7 @@ class SignalCompiler:
 
     @property
     def _where(self) -> str:
-        return f"{self.job.file}: {self.message.name}.{self.signal.name}"
+        return f"{self.job.file}: {self.copy.message.name}.{self.signal.name}"
 
     def _check(self) -> None:
         """UnfitSignal for a length or a value table that cannot be sent."""
@@ -95,7 +96,7 @@ class SignalCompiler:
             low += 1
         not_available = self._not_available()
         plan = SignalPlan(
-            name=signal.name,
+            name=self.copy.prefix + signal.name,
             unit=self._unit(),
             role=Role.CONSTANT,
             length=signal.length,
@@ -145,14 +146,14 @@ class SignalCompiler:
         """The plan with what fills the signal."""
         if self.signal.is_multiplexer:
             return replace(plan, role=Role.MULTIPLEXER)
-        bound = self.job.binder.bound(self.message.name, self.signal.name)
+        bound = self.job.binder.bound(self.copy, self.signal.name)
         if isinstance(bound, (int, float)):
             constant = raw_values.constant(self.signal, bound, plan.factor, plan.offset)
             if constant is None:
                 raise UnfitSignal(f"the constant {bound} bound to it cannot be sent exactly.")
             return replace(plan, constant=constant)
         name = self.signal.name if bound is None else bound
-        if (found := self.job.binder.by_name(name)) is not None:
+        if (found := self.job.binder.by_name(name, self.copy.esc)) is not None:
             return self._bound(plan, *found)
         if (role := names.protection(name)) is not None:
             if role is Role.ALIVE and (plan.is_float or plan.low > 0 or plan.high < 2):
@@ -162,7 +163,8 @@ class SignalCompiler:
             return replace(plan, role=role)
         if bound is None and self.job.settings.unbound == "start_value":
             return replace(plan, constant=self._start_value(plan), unbound=True)
-        self.job.unbound += bound is None
+        if bound is None:
+            self.job.unbound.add(self._where)
         via = "" if bound is None else f" (bound by dbc.bind to {bound!r})"
         hints = self.job.binder.suggestions(name) + _SUSPECT[names.suspected_protection(name)]
         raise UnfitSignal(f"no such source{via}.{hints} Bind it under [dbc.bind] or rename it.")

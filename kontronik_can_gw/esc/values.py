@@ -2,7 +2,7 @@
 
 DBC signals and CANopen objects bind to these by name. A value is a whole number of steps divided by a divisor of the ESC (pole
 pairs, gear, cells), which may change at run time: physical = steps / ``per_unit`` / divisor. ``steps`` and ``physical`` read any
-of them; the packers generate the same arithmetic from the numbers of a Value.
+of them.
 """
 
 import operator

@@ -31,7 +31,7 @@ def compiled(
     """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcSettings."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
-    return prepare(database, FILE, escs, DbcSettings(**settings), fd, taken)[1]
+    return prepare(database, FILE, escs, DbcSettings(**settings), fd, taken)
 
 
 def refused(text: str, *arguments: Any, **more: Any) -> list[str]:
@@ -60,5 +60,5 @@ def gateway_with(layout: Layout, *lives: LiveData | None, info: InfoData | None 
 
 def packed(plan: MessagePlan, gateway: Gateway, alive: int = 0, page: int | None = None) -> bytes:
     """What a message holds now."""
-    bits = compile_pack(plan)(gateway.escs, gateway.status, NOW, alive, page or 0)
+    bits = compile_pack(plan)(gateway.escs, gateway.status, NOW, alive, plan.pages.index(page))
     return bits.to_bytes(plan.length, "little")

@@ -53,9 +53,7 @@ def by_unit(messages: Iterable[Message]) -> dict[str, str]:
 def prepared(database: Database, file: str, **settings: Any) -> tuple[Layout | None, list[str]]:
     """The layout of a gateway, or why it is refused: lines that name their place."""
     try:
-        return prepare(database, file, [EscSettings("esc1", 7)], DbcSettings(**settings), True)[
-            1
-        ], []
+        return prepare(database, file, [EscSettings("esc1", 7)], DbcSettings(**settings), True), []
     except UserError as error:
         for line in error.problems:
             assert line.startswith((file, "dbc.")) and "\n" not in line and len(line) < 600

@@ -14,7 +14,7 @@ from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc import expand, writer
-from kontronik_can_gw.dbc.prepare import compile_layout, prepare
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
@@ -36,8 +36,9 @@ EIGHT = escs(*(f"esc{number}" for number in range(1, 9)))
 def multiplied(
     text: str, escs: Sequence[EscSettings], node: str = "Gateway", **more: Any
 ) -> tuple[Database, str]:
-    database, _ = expand.expand(read(text), node, escs, "my.dbc", **more)
-    out = writer.dbc_text(database)
+    plain = read(text)
+    copies = expand.copies_of(plain, "my.dbc", escs, DbcSettings(node=node, **more))
+    out = writer.dbc_text(expand.expand(plain, copies))
     return read(out), out
 
 
@@ -210,7 +211,7 @@ def test_ids_that_move_among_those_of_canopen_are_named() -> None:
     nine = escs(*(f"esc{number}" for number in range(1, 10)))
 
     def layout(text: str, count: int, **more: Any) -> Layout:
-        return prepare(read(text), "test.dbc", nine[:count], DbcSettings(**more))[1]
+        return prepare(read(text), "test.dbc", nine[:count], DbcSettings(**more))
 
     assert not layout(SHIPPED, 8).warnings
     assert not layout(SHIPPED, 9, base_id=0x680).warnings
@@ -258,9 +259,7 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     after = read(writer.dbc_text(before))
     assert all_facts(after) == all_facts(before)
     bind = DbcSettings(bindings(messages))
-    old, new = (
-        compile_layout(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after)
-    )
+    old, new = (prepare(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after))
     assert plain_plans(new) == plain_plans(old)
 
 

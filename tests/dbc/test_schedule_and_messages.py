@@ -53,7 +53,7 @@ class Bench:
         )
         database = read(dbc_text([m for m, *_ in messages], more))
         escs = [EscSettings(name, timeout_ns=TIMEOUT) for name in names]
-        self.layout = prepare(database, "my.dbc", escs, DbcSettings(), fd_allowed=True)[1]
+        self.layout = prepare(database, "my.dbc", escs, DbcSettings(), fd_allowed=True)
         self.gateway = Gateway(escs, self.layout, 0, silent)
         self.now = 0
         self.sent: list[tuple[int, CanFrame]] = []
@@ -218,7 +218,7 @@ def test_a_late_call_sends_one_frame_and_the_grid_stays(late: int) -> None:
 @pytest.mark.parametrize("count", [2, 3, 8])
 def test_the_same_message_of_several_escs_never_goes_at_one_instant(count: int) -> None:
     escs = [EscSettings(f"esc{n + 1}") for n in range(count)]
-    _, layout = prepare(load_database(SHIPPED), "x", escs, DbcSettings())
+    layout = prepare(load_database(SHIPPED), "x", escs, DbcSettings())
     gateway = Gateway(escs, layout, 0)
     escs_of_one: dict[tuple[str, int], list[int]] = {}
     names = {plan.can_id: re.sub("^Esc[0-9]", "", plan.name) for plan in layout.messages}

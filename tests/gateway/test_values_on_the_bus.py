@@ -28,7 +28,7 @@ SPEED = ' SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
 def layout_of(text: str) -> Layout:
     return prepare(
         parse_database(text.encode(), "t.dbc"), "t.dbc", (ESC,), DbcSettings(), fd_allowed=True
-    )[1]
+    )
 
 
 def wire(**values: int) -> bytes:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.config.keys import MqttConfig
+from kontronik_can_gw.dbc.expand import expand
 from kontronik_can_gw.desk.mqtt.messages import (
     IDENTITY_NS,
     MIN_PAUSE_NS,
@@ -95,6 +96,7 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
 @pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
 def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str, ...]) -> None:
     bus = layout_of(names)
+    database = expand(bus.database, [*bus.copies().values()])
     frames = flight(bus, 12)
     made = publisher(*names)
     last = run(made, frames, 12)
@@ -102,7 +104,7 @@ def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str
     for index, name in enumerate(names):
         when, found = states(last, name)[-1]
         prefix = name.capitalize() if len(names) > 1 else ""
-        wanted = by_cantools(bus.database, [(t, f) for t, f in frames if t <= when], prefix)
+        wanted = by_cantools(database, [(t, f) for t, f in frames if t <= when], prefix)
         compared = found.keys() - (OWN_KEYS - {"link_state"})
         for source in compared:
             value = found[source]

@@ -77,7 +77,7 @@ def layout(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) ->
     while True:
         try:
             text, chosen = dbc(chance, escs, most)
-            return prepare(read(text), "x.dbc", escs, chosen, fd_allowed=True)[1]
+            return prepare(read(text), "x.dbc", escs, chosen, fd_allowed=True)
         except UserError:
             continue
 

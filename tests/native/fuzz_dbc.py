@@ -79,7 +79,7 @@ def one(library: Any, seed: int) -> tuple[str, int]:
     text = changed(chance, text)
     try:
         database = parse_database(text.encode("latin-1"), "x.dbc")
-        layout = prepare(database, "x.dbc", escs, chosen, fd_allowed=True)[1]
+        layout = prepare(database, "x.dbc", escs, chosen, fd_allowed=True)
         both = equality.Both(library, chance, escs, layout)
     except UserError:
         return "refused", 0

@@ -53,7 +53,7 @@ def built() -> None:
 def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
     text = HEAD.format(signal).replace("M: 8", f"M: {length}") + more
     database = parse_database(text.encode(), "t.dbc")
-    return prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)[1]
+    return prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)
 
 
 def why(layout: Layout = EMPTY, **settings: object) -> str:

@@ -70,7 +70,7 @@ def layout_of(escs: Sequence[EscSettings]) -> Layout:
         _MESSAGE.format(can_id=256 + n, number=n, esc=name) for n, name in enumerate(prefix)
     )
     text = _DBC.format(messages=messages).encode()
-    return prepare(parse_database(text, "w.dbc"), "w.dbc", escs, DbcSettings(), fd_allowed=False)[1]
+    return prepare(parse_database(text, "w.dbc"), "w.dbc", escs, DbcSettings(), fd_allowed=False)
 
 
 def live(speed: int) -> bytes:

@@ -5,6 +5,7 @@ import os
 import random
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from typing import Any
@@ -26,13 +27,13 @@ from packer_oracle import (
     read,
 )
 
-from kontronik_can_gw.dbc.prepare import compile_layout
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.signals.packer import compile_frame, compile_pack, float_bits, quotient
+from kontronik_can_gw.signals.packer import compile_frame, compile_pack, float_bits, ratio
 from kontronik_can_gw.signals.plan import MessagePlan
 
 ESCS = (
@@ -48,9 +49,7 @@ ROUNDS = 3
 def compiled(
     messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS
 ) -> dict[str, MessagePlan]:
-    layout = compile_layout(
-        database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True
-    )
+    layout = prepare(database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True)
     return {plan.name: plan for plan in layout.messages}
 
 
@@ -135,10 +134,10 @@ def same(a: Any, b: Any) -> bool:
     return bool(a == b) or (isinstance(b, float) and math.isnan(b) and math.isnan(a))
 
 
-def test_a_quotient_beyond_a_double_is_infinite() -> None:
-    assert quotient(-(10**400), 3) == float("-inf")
-    assert quotient(10**400, 3) == float("inf")
-    assert quotient(1, 4) == 0.25
+def test_a_ratio_beyond_a_double_is_infinite() -> None:
+    assert ratio(-(10**400), 3) == float("-inf")
+    assert ratio(10**400, 3) == float("inf")
+    assert ratio(1, 4) == 0.25
 
 
 @pytest.mark.parametrize("seed", range(FILES))
@@ -224,4 +223,7 @@ def test_every_source_is_right_in_every_unit(seed: int) -> None:
     [(None, 7), (-1.5, 7), (100.5, 7), (math.nan, 7), (100.0, 0x42C80000), (0.0, 0)],
 )
 def test_a_float_outside_its_limits_is_sent_as_error(value: float | None, right: int) -> None:
-    assert float_bits(value, 32, 0.0, 100.0, 7) == right
+    signal = Sig("Throttle", 0, 32, signed=True, is_float=True, maximum="100", unit="%")
+    message = Msg("EscPower", 1, 8, [signal])
+    plan = compiled([message], read(dbc_text([message])), ESCS[:1])["EscPower"].signals[0]
+    assert float_bits(value, replace(plan, error=7)) == right

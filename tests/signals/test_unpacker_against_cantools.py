@@ -11,7 +11,7 @@ from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text,
 from test_packer_against_cantools import ESCS, MESSAGES
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.prepare import compile_layout
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
@@ -49,9 +49,7 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
     database = read(dbc_text(messages))
-    layout = compile_layout(
-        database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True
-    )
+    layout = prepare(database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True)
     reader = SignalReader(layout)
     plans = {plan.name: plan for plan in layout.messages}
     compared = 0

@@ -61,17 +61,22 @@ def _keys(kind: Any) -> list[Row]:
 
 def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
     """Messages that the gateway sends, and their signals."""
-    found = {message.name: message for message in bus.database.messages}
-    plans = [(plan, found[plan.name]) for plan in bus.layout.messages]
+    copies = bus.copies()
+    plans = [(plan, copies[plan.name]) for plan in bus.layout.messages]
     comment = next((each.comment for each in bus.database.buses if each.comment), "")
     file = f"{PurePath(bus.layout.file).name}, messages of {bus.layout.node}."
     signals = [
-        {"message": plan.name, **_signal(signal, message.get_signal_by_name(signal.name), escs)}
-        for plan, message in plans
+        {"message": plan.name, **_signal(signal, of_file[signal.name], escs)}
+        for plan, copy in plans
+        for of_file in [{sent: signal for signal, sent in copy.signals()}]
         for signal in plan.signals
     ]
     return [
-        Table("Messages", [file, _line(comment)], [_message(*pair) for pair in plans]),
+        Table(
+            "Messages",
+            [file, _line(comment)],
+            [_message(plan, copy.message) for plan, copy in plans],
+        ),
         Table("Signals", [_SIGNALS], signals, by="message"),
     ]
 

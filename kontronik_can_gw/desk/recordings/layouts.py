@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import Config
+from kontronik_can_gw.dbc.copies import Copy
+from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.reader import choose_node, load_database
 from kontronik_can_gw.dbc.settings import DbcSettings
@@ -20,12 +22,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BusLayout:
-    """A DBC in use. ``config``: where it came from, None for a DBC alone."""
+    """A DBC as it was read, and its layout. ``config``: where it came from, None for a DBC alone."""
 
     database: "Database"
     layout: Layout
     escs: Sequence[EscSettings]
     config: Config | None = None
+
+    def copies(self) -> dict[str, Copy]:
+        """The file's messages by their names on the bus."""
+        layout = self.layout
+        settings = self.config.dbc_settings if self.config else DbcSettings(node=layout.node)
+        copies = copies_of(self.database, layout.file, self.escs, settings)
+        return {copy.name: copy for copy in copies}
 
 
 def layout_of_dbc(file: Path, known: Sequence[EscSettings] = ()) -> BusLayout:
@@ -61,8 +70,8 @@ def _made(database: "Database", node: str, file: str, known: Sequence[EscSetting
     escs = list(known) or [EscSettings(name) for name in names] or [EscSettings("esc1")]
     if names:
         escs = [replace(esc, name=name) for esc, name in zip(escs, names, strict=True)]
-    made, layout = prepare(database, file, escs, DbcSettings(node=node), fd_allowed=True)
-    return BusLayout(made, layout, escs)
+    layout = prepare(database, file, escs, DbcSettings(node=node), fd_allowed=True)
+    return BusLayout(database, layout, escs)
 
 
 def esc_names(database: "Database", node: str) -> list[str]:
