@@ -80,7 +80,7 @@ OPTIONS = (
     "what ESC",
     option("--esc N", "number of ESCs, 1..1000 (default 1)", type=number_from(1, 1000, "number of ESCs", kind=int), default=1),
     option("--device", "default: kosmik, in the legacy layout jivepro", choices=tuple(_DEVICES)),
-    option("--layout", "mixed: odd ESCs v4, even ones legacy (default: legacy for jivepro, else v4)", choices=("v4", "legacy", "mixed")),
+    option("--layout", "frame layout (default: legacy for jivepro, else v4)", choices=("v4", "legacy")),
     option("--idle", "the motor never runs (default: a repeating flight of 50 s)"),
     option("--seed N", "seed of all that is random (default 0)", type=int, default=0),
     "where to, and how long",
@@ -123,31 +123,23 @@ def main(args: argparse.Namespace) -> int:
         raise UserError(f"--out {args.out}: has no end. Give --seconds.")
     if args.out is not None and args.link is not None:
         raise UserError("--link: there is no pseudo terminal with --out. Give one of the two.")
-    escs = []
-    for index in range(args.esc):
-        chosen = _options(args, index + 1)
-        # spread over the period, since real ESCs are not synchronized
-        start_ns = chosen.period_ns * index // args.esc
-        escs.append(SimulatedEsc(chosen, seed=args.seed + index, start_ns=start_ns))
+    device = args.device or ("jivepro" if args.layout == "legacy" else "kosmik")
+    chosen = EscOptions(
+        device=_DEVICES[device],
+        layout=None if args.layout is None else Layout(args.layout),
+        profile=IDLE if args.idle else FLIGHT,
+        faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
+    )
+    # spread over the period, since real ESCs are not synchronized
+    starts = [chosen.period_ns * index // args.esc for index in range(args.esc)]
+    escs = [
+        SimulatedEsc(chosen, seed=args.seed + n, start_ns=start) for n, start in enumerate(starts)
+    ]
     if args.out is not None:
         _to_files(escs, args.out, args.seconds)
     else:
         _to_terminals(escs, args.link, args.seconds)
     return 0
-
-
-def _options(args: argparse.Namespace, number: int) -> EscOptions:
-    """Options of the ESC with this number, from 1."""
-    layout = args.layout
-    if layout == "mixed":
-        layout = "v4" if number % 2 else "legacy"
-    usual = "jivepro" if layout == "legacy" else "kosmik"
-    return EscOptions(
-        device=_DEVICES[args.device or usual],
-        layout=None if layout is None else Layout(layout),
-        profile=IDLE if args.idle else FLIGHT,
-        faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
-    )
 
 
 def _to_files(escs: list[SimulatedEsc], path: str, time_ns: int) -> None:

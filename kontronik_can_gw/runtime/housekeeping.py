@@ -38,9 +38,7 @@ STATUS_NS = SECOND
 
 
 class Housekeeping:
-    """``due``: when ``run`` has something to do; ``wake_due``: when the loop is to be woken for it.
-
-    ``status_ns``: how often a line about everything is logged, 0: never."""
+    """``due``: when ``run`` has something to do; ``wake_due``: when the loop is to be woken for it."""
 
     def __init__(
         self,
@@ -54,7 +52,6 @@ class Housekeeping:
         statistics: Statistics,
         recorder: "Recorder | None",
         program: ProgramFacts,
-        status_ns: int,
     ) -> None:
         self.due = self.wake_due = 0
         self._gateway = gateway
@@ -66,9 +63,6 @@ class Housekeeping:
         self._statistics = statistics
         self._recorder = recorder
         self._program = program
-        self._status_ns = status_ns
-        self._status_due = 0 if status_ns else None
-        self._last_counts: tuple[int, list[int]] = (0, [])
         self._alive_due = 0 if notifier.watchdog_ns is not None else None
         self._notify_due = 0
         self._process, self._process_due = ProcessFacts(), 0
@@ -81,15 +75,12 @@ class Housekeeping:
             esc.report(now)
         self._log_conflicts(now)
         self._conditions.advance(now)
-        if self._status_due is not None and now >= self._status_due:
-            self._log_status(now)
         self.follow_recorder(now)
         self.publish(now)
         self._notify(now)
         self.wake_due = self.due + PERIOD_NS
-        for due in (self._alive_due, self._status_due):
-            if due is not None and due > now:  # else something is stuck
-                self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
+        if (due := self._alive_due) is not None and due > now:  # else something is stuck
+            self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
 
     def publish(self, now: int) -> None:
         """Hand the statistics' thread what a document is made of, if it is time."""
@@ -188,28 +179,6 @@ class Housekeeping:
             return  # not fed: a port that is not served in time is a reason to begin anew
         self._alive_due = now + (self._notifier.watchdog_ns or SECOND)
         self._notifier.watchdog()
-
-    def _log_status(self, now: int) -> None:
-        """One line about everything, for users that want it regularly."""
-        status, states = self._gateway.status, self._gateway.node_states()
-        counts = [status.sent_frames, *(pdos for _, _, pdos in states)]
-        then, before = self._last_counts
-        self._last_counts = (now, counts)
-        self._status_due = now + self._status_ns
-        if not before:
-            return
-        seconds = (now - then) / SECOND
-        rates = [(new - old) / seconds for new, old in zip(counts, before, strict=True)]
-        words = [f"CAN {name_in_words(status.can_state.name)} {rates[0]:.0f} frames/s"]
-        for number, esc in enumerate(self._gateway.escs):
-            rate = "" if esc.frame_rate is None else f" {esc.frame_rate / 10:.0f} Hz"
-            words.append(f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}{rate}")
-            if states and states[number][0] != UNCONFIGURED:
-                node_id, state, _ = states[number]
-                words.append(
-                    f"node {node_id} {name_in_words(state.name)} {rates[1 + number]:.0f} PDOs/s"
-                )
-        log.info("%s", "; ".join(words))
 
 
 def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:

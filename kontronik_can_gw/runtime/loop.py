@@ -50,7 +50,6 @@ class Loop:
         can_config: CanConfig,
         wait_for_devices: bool = False,
         store: "ParameterStore | None" = None,
-        status_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
         notifier: Notifier | None = None,
         statistics: Statistics | None = None,
@@ -87,7 +86,6 @@ class Loop:
             statistics=self._statistics,
             recorder=recorder,
             program=program or ProgramFacts(""),
-            status_ns=status_ns,
         )
         self._wake: Handover[None] = Handover()
         self._poller.register(self._wake.fileno(), self._woken)

@@ -109,12 +109,13 @@ def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
     assert link.read_text() == "precious"
 
 
-def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None:
-    words = ["--esc", "3", "--layout", "mixed", "--seconds", "2s", "--out"]
+@pytest.mark.parametrize("layout", list(Layout))
+def test_several_escs_write_a_file_each(tmp_path: Path, layout: Layout) -> None:
+    words = ["--esc", "2", "--layout", layout.value, "--seconds", "2s", "--out"]
     assert run("simulate", *words, tmp_path / "esc{n}.bin").code == 0
-    files = [tmp_path / f"esc{n}.bin" for n in (1, 2, 3)]
-    layouts = [{frame.layout for frame in frames_of(file.read_bytes())} for file in files]
-    assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
+    for path in tmp_path.iterdir():
+        assert {frame.layout for frame in frames_of(path.read_bytes())} == {layout}
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_what_is_lost_and_disturbed_is_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:

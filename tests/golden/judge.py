@@ -435,6 +435,12 @@ def _dbc(words: list[str]) -> Database:
         return meaning.database(Path(f"{folder}/out.dbc").read_bytes())
 
 
+def _dbc_of(configuration: str) -> Database:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "a.toml").write_text(configuration)
+        return _dbc(["-c", f"{folder}/a.toml"])
+
+
 @cache
 def _flags() -> dict[str, tuple[str, int]]:
     """Names of the shipped flags, in the order of their bits; each has a word of the sheet's row in it."""
@@ -490,12 +496,8 @@ def judge_scenario(file: Path) -> Judge:
     )
     database = None
     if dbc.get("enabled", True):
-        with tempfile.TemporaryDirectory() as folder:
-            plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
-            (Path(folder) / "a.toml").write_text(
-                plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"')
-            )
-            database = _dbc(["-c", f"{folder}/a.toml"])
+        plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
+        database = _dbc_of(plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"'))
     steps: list[tuple[int, str, Any]] = []
     steady = dbc.get("on_loss") != "silent"
     for time, verb, *words in filter(None, (line.partition(";")[0].split() for line in lines)):
@@ -554,7 +556,9 @@ def judge_capture(file: Path) -> Judge:
         escs.append(Esc(prefix, esc["pole_pairs"], gear, esc["cell_count"], timeout))
     database = meaning.database(header["dbc"]["text"].encode("latin-1"))
     if len(listed) > 1:
-        database = _dbc([word for esc in listed for word in ("--name", esc["name"])])
+        database = _dbc_of(
+            "".join(f'[[esc]]\nname = "{e["name"]}"\nport = "{e["name"]}"\n' for e in listed)
+        )
     first, *lines = file.with_suffix(".txt").read_text(encoding="utf-8").splitlines()
     for time, verb, frame in (line.split() for line in lines):
         steps.append((int(first.split()[-5]) + scenario.nanoseconds(time), verb, frame))
