@@ -70,7 +70,6 @@ ACTIONS = {
     "uninstall": ("stop, disable, and remove what install wrote", (
         _INSTANCE,
         _ROOT,
-        option("--purge", "remove configurations, stored parameters and the user too"),
     )),
 }
 # fmt: on
@@ -224,42 +223,34 @@ def _there(instance: str | None) -> list[str]:
 
 
 def _uninstall(args: argparse.Namespace) -> int:
-    """Stop, disable and remove. Configurations and stored parameters stay without --purge."""
+    """Stop, disable and remove. Configurations, stored parameters and the user stay."""
     root = args.root or Path("/")
-    if args.instance and args.purge:
-        raise UserError("--purge removes everything: not with --instance")
     for name in _there(args.instance) if args.root is None else ():
         _call("systemctl", "disable", "--now", name)
         _run("systemctl", "reset-failed", name)
         say(f"{name}: stopped and disabled")
     links = sorted((root / _WANTS).glob("*"))
     found = [path for path in links if any(map(path.match, _units(args.instance)))]
-    data: list[Path] = []
+    kept: list[str] = []
     if not args.instance:
         owned = {root / place: text for place, text in planned("", COMPANIONS)}
         found += filter(os.path.lexists, owned)
         found += (path for place in OBSOLETE for path in root.glob(place))
-        for path, text in () if args.purge else owned.items():
+        for path, text in owned.items():
             take_away(path, text)
-        left = [CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*"]
-        left += [f"etc/systemd/network/50-{NAME}-*"]
-        left += [f"{path.relative_to(root)}.bak*" for path in owned]
-        data = [path for place in left for path in root.glob(place)]
-        if args.purge:
-            found, data = [*found, *data], []
+        held = Path("/proc/locks").read_text()
+        for folder in (root / f"run/{NAME}", *root.glob(f"run/{NAME}-*")):
+            if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
+                remove(folder)
+        places = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*")
+        kept = [str(path) for place in places for path in root.glob(place)]
     for path in found:
         remove(path)
-    held = Path("/proc/locks").read_text()
-    for folder in () if args.instance else (root / f"run/{NAME}", *root.glob(f"run/{NAME}-*")):
-        if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
-            remove(folder)
     if args.root is None and not args.instance:
         _call("systemctl", "daemon-reload")
-        if args.purge:
-            _run("userdel", NAME)
     say("done" if found else "nothing is installed")
-    if data:
-        say(f"kept: {', '.join(map(str, data))} (--purge removes them)")
+    if kept:
+        say(f"kept: {', '.join(kept)}, and the user {NAME} (sudo rm -r, sudo userdel)")
     return 0
 
 

@@ -181,8 +181,7 @@ def trial(facts: Facts) -> None:
     facts["locks after a stop"] = (
         [path.name for path in Path(LOCKS).iterdir()] if Path(LOCKS).is_dir() else None
     )
-    facts["purge"] = service("uninstall", "--purge")
-    facts["after purge"] = [shown(), left_over(), run("id", "kontronik-can-gw")["code"]]
+    facts["end"] = service("uninstall")
 
 
 def left_over() -> list[str]:

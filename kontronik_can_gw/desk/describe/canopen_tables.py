@@ -1,6 +1,5 @@
 """Tables of CANopen: nodes, objects and emergencies, of the EDS in use, its bindings and the errors' definitions."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import PurePath
@@ -10,14 +9,13 @@ from kontronik_can_gw.canopen.data_types import TYPE_NAMES
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
-from kontronik_can_gw.canopen.eds_sections import Problems, read_sections
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.desk.describe.markdown import Row, Table
-from kontronik_can_gw.desk.describe.tables import meanings_of, number, protocols_of
+from kontronik_can_gw.desk.describe.tables import meanings_of, number, place, protocols_of
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
 
@@ -40,7 +38,7 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     ]
     writes = any(settings.read_only for settings in setup.settings)
     refused = "Nothing can be written over the bus: canopen.read_only is true." if writes else ""
-    text = [f"{PurePath(eds.name).name}. {refused}", *_comments(eds)]
+    text = [f"{PurePath(eds.name).name}. {refused}"]
     meanings = meanings_of(escs)
     return [
         Table("COB-IDs", ["A node for each ESC. One that waits for LSS has few."], ids, by="node"),
@@ -66,12 +64,10 @@ def _pdos(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
                     "type": tpdo.type,
                     "inhibit_ms": number(Fraction(tpdo.inhibit_ns, MS)),
                     "event_ms": number(Fraction(tpdo.event_ns, MS)),
-                    "mapped": [f"{_place(entry)} {entry.name}" for entry in entries],
+                    "mapped": [
+                        f"{place(entry.index, entry.sub)} {entry.name}" for entry in entries
+                    ],
                 }
-
-
-def _place(entry: Entry) -> str:
-    return f"{entry.index:04X}h:{entry.sub:02X}"
 
 
 def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
@@ -80,7 +76,7 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
     default = entry.default.decode("latin-1") if isinstance(entry.default, bytes) else entry.default
     name = eds.object_names[entry.index]
     return {
-        "object": _place(entry),
+        "object": place(entry.index, entry.sub),
         "name": entry.name if entry.name.startswith(name) else f"{name}: {entry.name}",
         "type": TYPE_NAMES[entry.data_type],
         "access": entry.access,
@@ -94,14 +90,6 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
         "shows": "" if bound is None else bound.source.name,
         "meaning": "" if bound is None else meanings.get(bound.source.name, ""),
     }
-
-
-def _comments(eds: Eds) -> list[str]:
-    """The lines of [Comments]."""
-    found = read_sections(eds.data, Problems(eds.name)).get("comments")
-    keys = {} if found is None else found.values
-    lines = {int(key[4:]): line for key, line in keys.items() if re.fullmatch(r"line\d+", key)}
-    return [lines[n] for n in sorted(lines) if lines[n]]
 
 
 # --- emergencies
