@@ -22,7 +22,7 @@ from email.utils import formatdate
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cli.service_files import COMPANIONS, planned
+from kontronik_can_gw.cli.service_files import COMPANIONS, PLAIN, planned
 from kontronik_can_gw.native.objects import shared_object
 
 HERE = Path(__file__).resolve().parent
@@ -36,7 +36,6 @@ SERVICE = {
     "etc/sysusers.d": "usr/lib/sysusers.d",
     "etc/tmpfiles.d": "usr/lib/tmpfiles.d",
     "etc/udev/rules.d": "usr/lib/udev/rules.d",
-    "etc/systemd/network": f"usr/share/doc/{NAME}/examples",
 }
 """Where `service install` writes, and where a package puts the same."""
 COMPLETIONS = {
@@ -107,9 +106,12 @@ def compressed(text: str | bytes) -> bytes:
 
 def put_service(tree: Path) -> None:
     """Units and the like, as `service install` writes them for a program in /usr/bin."""
-    for place, text in planned(f"/usr/bin/{NAME}", COMPANIONS, "can0", 500_000):
+    for place, text in planned(f"/usr/bin/{NAME}", COMPANIONS):
         folder = next(folder for folder in SERVICE if place.startswith(folder))
         put(tree / SERVICE[folder] / Path(place).relative_to(folder), text)
+    for kind in ("network", "link"):
+        text = (PLAIN / f"can.{kind}").read_text(encoding="utf-8")
+        put(tree / f"usr/share/doc/{NAME}/examples/50-{NAME}-can0.{kind}", text)
 
 
 def manual_page() -> str:

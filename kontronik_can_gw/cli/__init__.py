@@ -27,7 +27,7 @@ COMMANDS = {
     "status": "show the state of a running gateway",
     "check": "check a configuration and print what it will send",
     "doctor": "check machine, ports, CAN interface and configuration, with remedies",
-    "service": "install the gateway as a systemd service, show its state, remove it",
+    "service": "install the gateway as a systemd service, or remove it",
     "init": "write a commented example configuration",
     "dbc": "write the DBC for several ESCs or for a configuration",
     "eds": "write the EDS, or the DCF of a CANopen node",

@@ -1,10 +1,8 @@
 """``doctor``: checks machine and configuration and prints remedies; it changes nothing and sends nothing."""
 
 import argparse
-import os
 import platform
 import shutil
-import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -17,16 +15,14 @@ from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.nodes import parameter_folder
-from kontronik_can_gw.config.output_keys import SHIPPED
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor.can import check_can
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity
 from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.desk.doctor.ports import check_port, look
+from kontronik_can_gw.desk.doctor.ports import check_port
 from kontronik_can_gw.desk.doctor.service import (
     Unit,
     check_folder,
-    check_readable,
     check_service,
     unit_of,
 )
@@ -35,14 +31,12 @@ from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words, make_core
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.runtime.open_can import check_interface
-from kontronik_can_gw.runtime.store import parameter_file
 
-_COLOURS = {Severity.OK: 32, Severity.NOTE: 36, Severity.WARNING: 33, Severity.ERROR: 31}
-"""Of the severities on a terminal, as ANSI has them."""
 OPTIONS = (CONFIG, JSON)
 EPILOG = (
     "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
-    "As root it sees more. Exit code: 0 no error (there may be warnings), 1 errors, 2 the configuration cannot be used."
+    "It sees what its user may: root more, the service's user (sudo -u kontronik-can-gw) what the service may. "
+    "Exit code: 0 no error (there may be warnings), 1 errors, 2 the configuration cannot be used."
 )
 
 
@@ -86,10 +80,10 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
         for problem in error.problems:
             about.say("config", "mistake", problem=problem, command=command)
     if config is not None:
-        _files(machine, about, config, unit)
+        _folders(machine, about, config, unit)
         for esc in config.esc:
-            line = look if protocol_named(esc.protocol).even_parity else None
-            found += check_port(machine, esc.name, esc.port, unit, line)
+            even = protocol_named(esc.protocol).even_parity
+            found += check_port(machine, esc.name, esc.port, even)
         found += check_can(machine, config.can)
     check_service(machine, rest, unit)
     # a Raspberry Pi's own alarm; it affects USB adapters first
@@ -108,27 +102,12 @@ def _outputs(findings: Findings, loaded: Loaded) -> None:
     findings.say("config", "ok", file=config.file)
     core, why = make_core(loaded.escs, loaded.layout, 0, silent=False)
     findings.say("config.core", "python" if why else "ok", core=in_words(core.language, why))
-    damaged = {
-        f"{loaded.escs[esc].name}: stored parameters: {reason}": loaded.escs[esc].name
-        for esc, reason in loaded.damaged
-    }
     for warning in (*loaded.layout.warnings, *loaded.warnings):
-        if warning not in damaged:
-            findings.say("config.warning", "any", warning=warning)
-    for damage, name in damaged.items():
-        is_open = os.access(parameter_file(parameter_folder(config), name), os.R_OK)
-        findings.say("config.parameters", "damaged" if is_open else "closed", damage=damage)
+        findings.say("config.warning", "any", warning=warning)
 
 
-def _files(machine: Machine, findings: Findings, config: Config, unit: Unit | None) -> None:
-    """Whether its files can be read and its folders filled."""
-    files = [Path(config.file)]
-    if config.dbc.enabled and config.dbc.file != SHIPPED:
-        files.append(config.dbc_path)
-    if config.canopen.enabled and config.canopen.eds != SHIPPED:
-        files.append(config.eds_path)
-    for file in files:
-        check_readable(machine, findings, str(file.absolute()), unit)
+def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | None) -> None:
+    """Whether its folders can be filled."""
     store = parameter_folder(config) if config.canopen.enabled else None
     status = config.statistics_path
     folders = {
@@ -138,7 +117,9 @@ def _files(machine: Machine, findings: Findings, config: Config, unit: Unit | No
     }
     for what, (folder, reserve) in folders.items():
         if folder is not None:
-            check_folder(machine, findings, what, str(folder.absolute()), unit, reserve)
+            path = folder.absolute()
+            own = unit is not None and path.is_relative_to(unit.state_folder)
+            check_folder(machine, findings, what, str(path), own, reserve)
 
 
 def _show(findings: Sequence[Finding]) -> None:
@@ -151,12 +132,8 @@ def _show(findings: Sequence[Finding]) -> None:
                 show()
             group = finding.group
             show(group)
-        word = f"{finding.severity:<9}"
-        if sys.stdout.isatty():
-            word = f"\x1b[{_COLOURS[finding.severity]}m{word}\x1b[0m"
-        sys.stdout.write(f"  {word}")
         first, *lines = textwrap.wrap(finding.text, width - 11, break_on_hyphens=False) or [""]
-        show(first)
+        show(f"  {finding.severity:<9}{first}")
         remedy = textwrap.wrap(finding.remedy, width - 14, break_on_hyphens=False)
         remedy += [finding.command] if finding.command else []
         lines += [f"{'   ' if n else '-> '}{line}" for n, line in enumerate(remedy)]

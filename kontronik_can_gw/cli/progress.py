@@ -3,6 +3,8 @@
 import sys
 from typing import Self
 
+from rich import console, progress
+
 from kontronik_can_gw.printable import printable
 
 
@@ -13,12 +15,8 @@ class Progress:
     """
 
     def __init__(self, name: str, size: int | None, data_on_screen: bool = True) -> None:
-        self._progress = None
-        if not sys.stderr.isatty() or (data_on_screen and sys.stdout.isatty()):
-            return
-        from rich import console, progress
-
-        self._progress = progress.Progress(
+        is_shown = sys.stderr.isatty() and not (data_on_screen and sys.stdout.isatty())
+        self._bar = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(),
             progress.DownloadColumn(),
@@ -26,24 +24,21 @@ class Progress:
             progress.TimeRemainingColumn(),
             console=console.Console(stderr=True),
             transient=True,
+            disable=not is_shown,
         )
-        self._task = self._progress.add_task(printable(name), total=size)
+        self._task = self._bar.add_task(printable(name), total=size)
 
     def __enter__(self) -> Self:
-        if self._progress is not None:
-            self._progress.start()
+        self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._progress is not None:
-            self._progress.stop()
+        self._bar.stop()
 
     def advance(self, size: int) -> None:
         """Add ``size`` processed bytes."""
-        if self._progress is not None:
-            self._progress.advance(self._task, size)
+        self._bar.advance(self._task, size)
 
     def reach(self, position: int) -> None:
         """Set the number of processed bytes."""
-        if self._progress is not None:
-            self._progress.update(self._task, completed=position)
+        self._bar.update(self._task, completed=position)

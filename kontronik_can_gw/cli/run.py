@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cli import need_descriptors
-from kontronik_can_gw.cli.arguments import CONFIG, config_file, number_from, option
+from kontronik_can_gw.cli.arguments import CONFIG, config_file, option
 from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.errors import RunError, UserError
@@ -41,8 +41,6 @@ def _folder(text: str) -> Path:
 OPTIONS = (
     CONFIG,
     option("--wait", "wait for ports and interfaces that are missing at start (run.wait_for_devices)"),
-    option("--status SECONDS", "log a line about telemetry, CAN, NMT states and PDO traffic at this interval in seconds "
-                               "(default: changes only)", type=number_from(0.1, 1e6)),
     option("--record DIR", "write captures of what comes in to this folder (record.directory)", type=_folder),
 )
 # fmt: on

@@ -1,11 +1,10 @@
-"""``service``: installs the gateway as a systemd service, shows its state, removes it.
+"""``service``: installs the gateway as a systemd service, and removes it.
 
 The files of the package's folder ``service`` are copied as they are, with the path of the program in the units. Without --root it works
 on this machine, as root, and calls systemd's tools; with it only files below that folder are changed.
 """
 
 import argparse
-import contextlib
 import os
 import re
 import shutil
@@ -16,8 +15,8 @@ import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import number_from, option
-from kontronik_can_gw.cli.common import say, show
+from kontronik_can_gw.cli.arguments import option
+from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.init import example
 from kontronik_can_gw.cli.service_files import (
     COMPANIONS,
@@ -38,8 +37,6 @@ from kontronik_can_gw.runtime.locks import is_held
 _WANTS = f"{UNITS}/multi-user.target.wants"
 _BOOTED = Path("/run/systemd/system")
 """Exists where systemd runs (sd_booted)."""
-_NOT_RUNNING = 3
-"""Exit code, as of systemctl."""
 
 
 def _name(text: str) -> str:
@@ -57,9 +54,6 @@ def _program(text: str) -> str:
     return text
 
 
-_BITRATE = number_from(
-    5_000, 1_000_000, kind=int, problem="is not a bit rate in bit/s, 5000 to 1000000"
-)
 # fmt: off
 _INSTANCE = option("--instance NAME", "one of several gateways: NAME.toml, kontronik-can-gw@NAME", type=_name)
 _ROOT = option("--root DIR", "only write below DIR, as for a disk image; call no tools", type=Path)
@@ -70,41 +64,34 @@ ACTIONS = {
         _ROOT,
         option("--now", "start it too, or restart it"),
         option("--executable PATH", "the program (default: this one)", type=_program),
-        option("--network BITRATE", "let systemd-networkd set up the CAN interface", type=_BITRATE),
-        option("--channel NAME", "the CAN interface (default can0)", type=_name, default="can0"),
         option("--mqtt", "a second service that publishes to the broker of the table [mqtt]"),
         option("--metrics", "a service that serves the statistics for Prometheus on 127.0.0.1:9123"),
-    )),
-    "status": ("state and last log lines of the services in use; exit code 0 running, 3 not", (
-        _INSTANCE,
-        option("-n --lines N", "lines of the log (default 10)", type=number_from(0, 10_000, "number of lines", kind=int), default=10),
     )),
     "uninstall": ("stop, disable, and remove what install wrote", (
         _INSTANCE,
         _ROOT,
-        option("--purge", "remove configurations, stored parameters and the user too"),
     )),
 }
 # fmt: on
 EPILOG = (
-    "install and uninstall need root, except with --root, and print what they do. "
-    "Exit code: 0 done, 1 something failed, 2 wrong usage; of status 0 running, 3 not running."
+    "They need root, except with --root, and print what they do. systemctl shows how the services fare. "
+    "Exit code: 0 done, 1 something failed, 2 wrong usage."
 )
 
 
 def main(args: argparse.Namespace) -> int:
     """Do it. RunError or UserError where this machine does not allow it, OSError of a file as RunError."""
-    root = vars(args).get("root")
+    root: Path | None = args.root
     if root is not None and not root.is_dir():
         raise UserError(f"{root}: is not a folder. --root names the top folder of a disk image.")
     if root is None and not _BOOTED.is_dir():
         raise RunError(
             "this system does not run systemd. For a disk image: --root DIR. Without systemd: run --wait"
         )
-    if root is None and args.action != "status" and os.geteuid() != 0:
+    if root is None and os.geteuid() != 0:
         raise RunError(f"only root may do that: sudo {_own_program()} service {args.action} ...")
     try:
-        return {"install": _install, "status": _status, "uninstall": _uninstall}[args.action](args)
+        return {"install": _install, "uninstall": _uninstall}[args.action](args)
     except OSError as error:
         raise RunError(f"{error.filename}: {error.strerror}") from None
 
@@ -121,7 +108,7 @@ def _install(args: argparse.Namespace) -> int:
     program = args.executable or _own_program()
     if args.root is None:
         _check_program(program, is_own=args.executable is None)
-    files = dict(planned(program, companions, args.channel, args.network))
+    files = dict(planned(program, companions))
     own = root / CONFIGURATIONS / f"{args.instance or 'gateway'}.toml"
     if not own.exists():
         files[str(own.relative_to(root))] = example()
@@ -134,13 +121,13 @@ def _install(args: argparse.Namespace) -> int:
     for path in (path for place in OBSOLETE for path in root.glob(place)):
         remove(path)
     if args.root is None:
-        _reload(args.network)
+        _reload()
     _enable(args, root, own, companions)
     return 0
 
 
-def _reload(network: int | None) -> None:
-    """Let systemd make user and folders, and read units, udev rules and network files."""
+def _reload() -> None:
+    """Let systemd make user and folders, and read units and udev rules."""
     for words in (
         ("systemd-sysusers", f"/etc/sysusers.d/{NAME}.conf"),
         ("systemd-tmpfiles", "--create", f"/etc/tmpfiles.d/{NAME}.conf"),
@@ -151,9 +138,6 @@ def _reload(network: int | None) -> None:
         if shutil.which(words[0]):
             _call(*words)
     _call("id", NAME)
-    if network:
-        now = "sudo systemctl enable --now systemd-networkd; sudo networkctl reload"
-        say(f"the CAN interface is set up when the machine starts; now: {now}")
 
 
 def _enable(args: argparse.Namespace, root: Path, own: Path, companions: list[str]) -> None:
@@ -218,7 +202,7 @@ def _check_program(program: str, *, is_own: bool) -> None:
                 )
 
 
-# --- status and uninstall
+# --- uninstall
 
 
 def _units(instance: str | None) -> list[str]:
@@ -238,66 +222,35 @@ def _there(instance: str | None) -> list[str]:
     return sorted(name for name in names if not name.endswith("@.service"))
 
 
-def _status(args: argparse.Namespace) -> int:
-    """systemd's own account of the services in use, with their last log lines."""
-    codes = []
-    for name in _there(args.instance):
-        words = ("systemctl", "show", "--value", "--property", "ActiveState,UnitFileState", name)
-        state = _run(*words).stdout.split()
-        if "inactive" in state and "enabled" not in state:
-            continue
-        shown = ("systemctl", "status", "--no-pager", "--full", "--lines", str(args.lines), name)
-        for line in _run(*shown).stdout.splitlines():
-            show(line)
-        codes.append(0 if "active" in state else _NOT_RUNNING)
-    if not codes:
-        show("no service is in use. See: kontronik-can-gw service install --help")
-    return max(codes, default=_NOT_RUNNING)
-
-
 def _uninstall(args: argparse.Namespace) -> int:
-    """Stop, disable and remove. Configurations and stored parameters stay without --purge."""
+    """Stop, disable and remove. Configurations, stored parameters and the user stay."""
     root = args.root or Path("/")
-    if args.instance and args.purge:
-        raise UserError("--purge removes everything: not with --instance")
     for name in _there(args.instance) if args.root is None else ():
         _call("systemctl", "disable", "--now", name)
         _run("systemctl", "reset-failed", name)
         say(f"{name}: stopped and disabled")
     links = sorted((root / _WANTS).glob("*"))
     found = [path for path in links if any(map(path.match, _units(args.instance)))]
-    data: list[Path] = []
+    kept: list[str] = []
     if not args.instance:
-        files = list(planned("", COMPANIONS, "*", 1))
-        texts = {path: text for place, text in files for path in root.glob(place)}
-        found += [*texts, *(path for place in OBSOLETE for path in root.glob(place))]
-        folders = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*")
-        for path, text in () if args.purge else texts.items():
+        owned = {root / place: text for place, text in planned("", COMPANIONS)}
+        found += filter(os.path.lexists, owned)
+        found += (path for place in OBSOLETE for path in root.glob(place))
+        for path, text in owned.items():
             take_away(path, text)
-        data = [
-            path
-            for place in (*folders, *(f"{place}.bak*" for place, _ in files))
-            for path in root.glob(place)
-        ]
-        if args.purge:
-            found, data = [*found, *data], []
+        held = Path("/proc/locks").read_text()
+        for folder in (root / f"run/{NAME}", *root.glob(f"run/{NAME}-*")):
+            if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
+                remove(folder)
+        places = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*")
+        kept = [str(path) for place in places for path in root.glob(place)]
     for path in found:
         remove(path)
-    for folder in root.glob(f"{UNITS}/{NAME}*.service.d"):
-        with contextlib.suppress(OSError):  # it holds drop-ins of others
-            folder.rmdir()
-    held = Path("/proc/locks").read_text()
-    names = [f"{NAME}-{args.instance}"] if args.instance else [NAME, f"{NAME}-*"]
-    for folder in (path for name in names for path in root.glob(f"run/{name}")):
-        if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
-            remove(folder)
     if args.root is None and not args.instance:
         _call("systemctl", "daemon-reload")
-        if args.purge:
-            _run("userdel", NAME)
     say("done" if found else "nothing is installed")
-    if data:
-        say(f"kept: {', '.join(map(str, data))} (--purge removes them)")
+    if kept:
+        say(f"kept: {', '.join(kept)}, and the user {NAME} (sudo rm -r, sudo userdel)")
     return 0
 
 

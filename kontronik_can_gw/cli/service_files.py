@@ -18,11 +18,13 @@ COMPANIONS = {"mqtt": "paho", "metrics": "prometheus_client"}
 """Services that may stand by the gateway's, and the module that each needs."""
 _PROGRAM = f"/usr/bin/{NAME}"
 """The program in the files."""
+_ANY_PROGRAM = r"(?m)^ExecStart=\S*", "ExecStart="
 OBSOLETE = (
     *(f"{UNITS}/{NAME}{end}.service.d/prometheus.conf" for end in ("", "@")),
+    f"{UNITS}/{NAME}*@.service.d/instance.conf",
     f"etc/systemd/network/50-{NAME}-*.example",
 )
-"""What 0.5.0 installed."""
+"""What earlier versions installed."""
 
 
 def unit(instance: str | None, companion: str = "") -> str:
@@ -31,23 +33,17 @@ def unit(instance: str | None, companion: str = "") -> str:
     return f"{NAME}{beside}{'' if instance is None else f'@{instance}'}.service"
 
 
-def planned(
-    program: str, companions: Iterable[str], channel: str, bitrate: int | None
-) -> Iterator[tuple[str, str]]:
+def planned(program: str, companions: Iterable[str]) -> Iterator[tuple[str, str]]:
     """Path below the root and text of each file."""
     for kind in ("", *companions):
         text = _plain(unit(None, kind)).replace(_PROGRAM, program)
-        own = _plain(f"{unit(None, kind)[:-8]}.instance.conf").replace(_PROGRAM, program)
         yield f"{UNITS}/{unit(None, kind)}", text
-        yield f"{UNITS}/{unit('', kind)}", text
-        yield f"{UNITS}/{unit('', kind)}.d/instance.conf", own
+        own = text.replace("/gateway.toml", "/%i.toml")  # what an instance has of its own
+        own = re.sub(r"(?m)^(StateDirectory|RuntimeDirectory)=.*", r"\g<0>-%i", own)
+        yield f"{UNITS}/{unit('', kind)}", own
     yield f"etc/sysusers.d/{NAME}.conf", _plain("sysusers.conf")
     yield f"etc/tmpfiles.d/{NAME}.conf", _plain("tmpfiles.conf")
     yield f"etc/udev/rules.d/70-{NAME}.rules", _plain("udev.rules")
-    for kind in ("network", "link") if bitrate else ():
-        text = _plain(f"can.{kind}").replace("can0", channel)
-        text = text.replace("BitRate=500000", f"BitRate={bitrate}")
-        yield f"etc/systemd/network/50-{NAME}-{channel}.{kind}", text
 
 
 def _plain(name: str) -> str:
@@ -71,9 +67,9 @@ def put(path: Path, text: str) -> None:
 
 
 def take_away(path: Path, text: str) -> None:
-    """Remove a file whose text ``planned`` gives, with any program, interface and bit rate; keep another one aside, and name it."""
+    """Remove a file whose text ``planned`` gives, with any program; keep another one aside, and name it."""
     found = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
-    if _without_choices(found) == _without_choices(text):
+    if re.sub(*_ANY_PROGRAM, found) == re.sub(*_ANY_PROGRAM, text):
         remove(path)
     else:
         say(f"{path}: was changed, kept as {_set_aside(path)}")
@@ -85,10 +81,6 @@ def _set_aside(path: Path) -> str:
     name = next(name for name in names if not os.path.lexists(path.with_name(name)))
     path.rename(path.with_name(name))
     return name
-
-
-def _without_choices(text: str) -> str:
-    return re.sub(r"(?m)^(ExecStart|Name|OriginalName|BitRate)=\S*", r"\1=", text)
 
 
 def remove(path: Path) -> None:

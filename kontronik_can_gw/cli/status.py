@@ -30,7 +30,6 @@ OPTIONS = (
         option("-c --config FILE", "the gateway with this TOML configuration", type=Path),
         option("--file FILE", "the gateway with this statistics file", type=Path),
     ),
-    option("--once", "the default: kept for scripts of before"),
     JSON,
 )
 # fmt: on

@@ -62,16 +62,13 @@ def as_toml(config: Config) -> str:
 
 def _toml_table(head: str, table: Any) -> list[str]:
     lines = [head]
-    nested: list[str] = []
     for f in fields(table):
         value = getattr(table, f.name)
         if isinstance(value, Mapping):
-            if value:
-                nested += ["", f"{head[:-1]}.{f.name}]"]
-                nested += [f"{_toml(key)} = {_toml(entry)}" for key, entry in value.items()]
+            lines += [f"{f.name}.{_toml(key)} = {_toml(entry)}" for key, entry in value.items()]
         elif value is not None:
             lines.append(f"{f.name} = {_toml(value)}")
-    return [*lines, *nested, ""]
+    return [*lines, ""]
 
 
 def _toml(value: Any) -> str:

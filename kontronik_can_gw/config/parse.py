@@ -1,8 +1,8 @@
 """Makes a configuration of TOML: every mistake in it is reported at once, with its place, a remedy and what was meant."""
 
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from posixpath import normpath
 from typing import Any, cast
@@ -12,7 +12,6 @@ from kontronik_can_gw.config.keys import (
     TABLES,
     Config,
     EscConfig,
-    MqttConfig,
     required,
 )
 from kontronik_can_gw.dbc.binding import VALUES_BY_KEY
@@ -54,23 +53,6 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
         # besides TOMLDecodeError: numbers of 5000 digits, 1000 nested brackets
         raise UserError(f"{path}: is not valid TOML: {error}") from None
     return _Parser(str(path)).config(tables)
-
-
-def mqtt_with(config: MqttConfig, given: Mapping[str, Any]) -> MqttConfig:
-    """The table with some values replaced, each checked as in a file. UserError names a key as an option."""
-    kinds = {f.name: f.metadata["kind"] for f in fields(MqttConfig)}
-    problems: list[str] = []
-    values: dict[str, Any] = {}
-    for name, value in given.items():
-        try:
-            values[name] = kinds[name].check(value)
-        except ValueError as error:
-            problems.append(f"--{name.replace('_', '-')}: {error}")
-    made = replace(config, **values)
-    problems = problems or [f"mqtt.{problem}" for problem in _mqtt_problems(made)]
-    if problems:
-        raise UserError(*problems)
-    return made
 
 
 class _Parser:
@@ -152,12 +134,6 @@ class _Parser:
 # --- rules about several keys
 
 
-def name_problem(names: Sequence[str]) -> str | None:
-    """Why these ESC names are ambiguous; None where they are not."""
-    escs = {number: EscConfig(port=str(number), name=name) for number, name in enumerate(names, 1)}
-    return next((line.partition(".name: ")[2] for line in _esc_problems(escs)), None)
-
-
 def _esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
     """Names and ports that are taken, names that are ambiguous. ``escs``: the valid ones, by their number in the file."""
     names = {number: normalize(esc.name) for number, esc in escs.items()}
@@ -232,16 +208,3 @@ def _node_id_problems(config: Config) -> Iterator[str]:
             )
         elif number in taken:
             yield f"esc[{number}].node_id: {node_id} is also that of esc[{taken[number]}]"
-
-
-def _mqtt_problems(mqtt: MqttConfig) -> Iterator[str]:
-    """Keys that need another one."""
-    for name in ("ca_file", "cert_file", "key_file"):
-        if getattr(mqtt, name) is not None and not mqtt.tls:
-            yield f"{name}: is for TLS, which is off. Switch mqtt.tls on (--tls)."
-    if mqtt.key_file is not None and mqtt.cert_file is None:
-        yield (
-            "key_file: needs the certificate that it belongs to. Set mqtt.cert_file (--cert-file)."
-        )
-    if mqtt.password_file is not None and mqtt.username is None:
-        yield "password_file: needs a user name. Set mqtt.username (--username)."

@@ -134,7 +134,7 @@ def among_canopen(copies: Sequence[Copy], node: str) -> str:
         return ""
     return (
         f"{len(left)} of {len(ours)} ids leave {low:X}h..{high:X}h, up to {max(left):X}h, where CANopen has its own. "
-        "Take fewer ESCs, a DBC with 29-bit ids, or an explicit lowest id (dbc.base_id, --base-id)."
+        "Take fewer ESCs, a DBC with 29-bit ids, or an explicit lowest id (dbc.base_id)."
     )
 
 

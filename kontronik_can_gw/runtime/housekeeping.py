@@ -79,9 +79,8 @@ class Housekeeping:
         self.publish(now)
         self._notify(now)
         self.wake_due = self.due + PERIOD_NS
-        if self._alive_due is not None and self._alive_due > now:  # else something is stuck
-            self.due = min(self.due, self._alive_due)
-            self.wake_due = min(self.wake_due, self._alive_due)
+        if (due := self._alive_due) is not None and due > now:  # else something is stuck
+            self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
 
     def publish(self, now: int) -> None:
         """Hand the statistics' thread what a document is made of, if it is time."""

@@ -32,6 +32,7 @@ def test_the_summary_fits_a_screen_and_says_what_is_sent(tmp_path: Path) -> None
         assert said in done.out
     assert run("check", "-c", file).out == done.out
     assert run("check", "-v", file).out.startswith(done.out)
+    assert "not allowed with argument -c" in refused(2, "check", "-c", file, file)
 
 
 def test_the_port_of_the_example_is_a_warning(tmp_path: Path) -> None:
@@ -55,11 +56,6 @@ def test_json_has_messages_and_warnings_or_the_mistakes(tmp_path: Path) -> None:
     done = run("check", "--json", written(tmp_path / "g.toml", f"{LEAST}pole_pair = 7\nx = 1\n"))
     assert (done.code, done.err) == (2, "")
     assert [".pole_pair" in line for line in json.loads(done.out)["mistakes"]] == [True, False]
-
-
-def test_a_configuration_is_named_once(tmp_path: Path) -> None:
-    file = written(tmp_path / "g.toml", LEAST)
-    assert "not allowed with argument -c" in refused(2, "check", "-c", file, file)
 
 
 @pytest.mark.parametrize("command", ["check", "doctor", "run"])
@@ -92,8 +88,9 @@ def test_commands_that_also_work_without_one_say_which_they_take(places: tuple[P
     assert "by gateway.toml" in run("describe").err
     assert run("eds").err == "", "no nodes in it"
     with own.open("a") as file:
-        file.write("[canopen]\nenabled = true\n")
+        file.write('[canopen]\nenabled = true\n[statistics]\nfile = "state.json"\n')
     assert "by gateway.toml" in run("eds").err
+    assert "state.json" in refused(3, "status")
 
 
 def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another_layout(
@@ -114,11 +111,3 @@ def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another
     assert run("dbc", "-c", own).out == text
     written(own.with_name("sent.dbc"), text.replace("(0.01,", "(0.02,", 1))
     assert fingerprint() != first
-
-
-def test_status_without_a_service_is_that_of_the_configuration_of_the_folder(
-    places: tuple[Path, Path],
-) -> None:
-    own, _ = places
-    written(own, f'{LEAST}[statistics]\nfile = "state.json"\n')
-    assert "state.json" in refused(3, "status")

@@ -13,7 +13,6 @@ import pytest
 from command_line import refused, run
 
 from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
-from kontronik_can_gw.config.keys import REMOVED_KEYS
 from kontronik_can_gw.desk.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -52,18 +51,14 @@ def test_a_removed_option_is_one_line_with_what_to_type_instead(
         monkeypatch.setitem(REMOVED_OPTIONS, ("describe", removed), "Type -o x.")
     assert refused(2, "describe", *given.split()) == f"{option}: was removed. Type -o x."
     assert "unrecognized arguments: --tape" in refused(2, "schema", "--tape")
+    monkeypatch.setitem(REMOVED_OPTIONS, ("decode", "--tape"), "Type -o x.")
+    assert "No such file" in refused(1, "decode", "--", "--tape")
 
 
 @pytest.mark.parametrize("words", ["describe --form json", "service install --root . --chan can1"])
 def test_the_beginning_of_an_option_is_none(words: str) -> None:
     """A script that abbreviates would mean another option after an update."""
     assert f"unrecognized arguments: {words.split()[-2]}" in refused(2, *words.split())
-
-
-@pytest.mark.parametrize("words", ["-o a.log", "--output=a.log", "--force", "--to log"])
-def test_every_removed_option_of_replay_says_what_to_type(words: str) -> None:
-    said = refused(2, "replay", "a.kcap", *words.split())
-    assert "was removed" in said and "convert FILE flight.log" in said
 
 
 def test_no_removed_option_is_in_use() -> None:
@@ -76,27 +71,7 @@ def test_no_removed_option_is_in_use() -> None:
         assert advice.endswith("."), option
 
 
-def test_a_removed_key_is_a_warning_of_every_command_that_reads_the_configuration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(REMOVED_KEYS, "can.queue", "Leave it out.")
-    file = configuration(tmp_path, can='interface = "virtual"\nqueue = 3')
-    line = f"{file}: can.queue: was removed and is ignored. Leave it out."
-    done = run("check", "-c", file)
-    assert (done.code, done.err) == (0, f"kontronik-can-gw: warning: {line}\n")
-    assert line in run("doctor", "-c", file, "--json").out
-
-
 # --- ports
-
-
-@pytest.mark.parametrize("kind", ["directory", "pipe"])
-def test_what_is_no_serial_port_is_reported_with_where_to_look(tmp_path: Path, kind: str) -> None:
-    port = tmp_path / "port"
-    port.mkdir() if kind == "directory" else os.mkfifo(port)
-    said = refused(1, "run", "-c", configuration(tmp_path, port))
-    assert said.startswith(f"esc1: {port}: is not a serial port")
-    assert "/dev/serial/by-id" in said
 
 
 def forbidden(path: str, mode: int) -> list[str]:
@@ -136,24 +111,6 @@ def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
     assert ("usermod" in done.stderr) == (mode == 0o660)
 
 
-def test_a_second_gateway_on_a_port_gets_the_name_of_the_first(
-    tmp_path: Path, terminal: PtyEsc
-) -> None:
-    file = configuration(tmp_path, terminal.path)
-    command = [*PROGRAM, "run", "-c", str(file)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as first:
-        try:
-            assert first.stderr is not None
-            assert any(f"{terminal.path} is open" in line for line in first.stderr)
-            said = refused(1, "run", "-c", file)
-            assert f"esc1: {terminal.path}: is in use by another program" in said
-            assert f"(pid {first.pid})" in said
-            assert first.poll() is None
-        finally:
-            first.terminate()
-        assert first.wait(60) == 0
-
-
 def test_one_device_by_two_names_is_refused(tmp_path: Path, terminal: PtyEsc) -> None:
     link = tmp_path / "by-id"
     link.symlink_to(terminal.path)
@@ -175,7 +132,7 @@ LONG = "x" * 300
     [
         *(f"convert a {LONG}.csv", f"convert {LONG} a.csv", f"report a -o {LONG}"),
         *(f"replay {LONG} --on pty", f"monitor {LONG}", f"dbc -o {LONG}", f"check -c {LONG}"),
-        *(f"mqtt {LONG} --broker x", f"service install --root {LONG}", f"decode {LONG}"),
+        *(f"mqtt -c {LONG}", f"service install --root {LONG}", f"decode {LONG}"),
     ],
 )
 def test_a_name_that_is_too_long_is_one_line(
@@ -188,24 +145,6 @@ def test_a_name_that_is_too_long_is_one_line(
     assert "File name too long" in done.err
 
 
-# --- CAN interface
-
-
-@pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.bin --on can"])
-def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Some adapters are written to at opening; to an ESC nothing may be written."""
-    monkeypatch.chdir(tmp_path)
-    port = tmp_path / "ttyESC"
-    port.touch()
-    (tmp_path / "x.bin").write_bytes(b"KODL")
-    file = configuration(tmp_path, port)
-    adapter = ["--interface", "slcan", "--channel", f"{port}@115200"]
-    assert "nothing may be sent to an ESC" in refused(2, *words.split(), "-c", file, *adapter)
-    assert port.read_bytes() == b""
-
-
 def test_socketcan_that_is_not_there_is_reported_with_the_command_that_makes_it(
     tmp_path: Path, terminal: PtyEsc
 ) -> None:
@@ -216,9 +155,6 @@ def test_socketcan_that_is_not_there_is_reported_with_the_command_that_makes_it(
     assert no_socketcan or (
         "there is none" in said and "ip link set nocan7 up type can bitrate 500000" in said
     )
-
-
-# --- init, check, schema
 
 
 # --- dbc
@@ -263,9 +199,4 @@ def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -
 
 def test_a_reader_that_goes_away_gets_no_message() -> None:
     done = shell("PROGRAM dbc --esc 8 | head -c 10")
-    assert (done.stdout, done.stderr) == ('VERSION ""', "")
-
-
-def test_a_file_may_have_the_name_of_a_removed_option(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(REMOVED_OPTIONS, ("decode", "--tape"), "Type -o x.")
-    assert "No such file" in refused(1, "decode", "--", "--tape")
+    assert (done.stdout, done.stderr) == ('VERSION "l', "")

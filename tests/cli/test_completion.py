@@ -35,8 +35,8 @@ ASKED = r"""
     ("typed", "offered"),
     [
         ("des", {"describe"}),
-        ("service st", {"status"}),
-        ("service status --l", {"--lines"}),
+        ("service in", {"install"}),
+        ("service install --r", {"--root"}),
         ("describe --dbc car.dbc --format j", {"json"}),
         ("describe --dbc car", {"car.dbc"}),
         ("run -c car", {"car.toml"}),

@@ -1,14 +1,13 @@
 """``eds``: the EDS byte for byte, and DCFs that read back with the values of the node."""
 
 import io
-import os
 import re
 from pathlib import Path
 from typing import Any
 
 import canopen
 import pytest
-from command_line import refused, run
+from command_line import run
 
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.objects import BINDINGS
@@ -68,6 +67,8 @@ def dcf_values(*words: object) -> dict[Key, int | bytes]:
 
 
 def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
+    assert command("-o", tmp_path / "out.eds")[0] == 0
+    assert (tmp_path / "out.eds").read_bytes() == command()[1].encode() == EDS.read_bytes()
     mine = EDS.read_bytes().replace(b"ProductName=KONTRONIK ESC gateway", b"ProductName=my ESC")
     (tmp_path / "mine.eds").write_bytes(mine)
     file = configuration(tmp_path, 'enabled = true\neds = "mine.eds"')
@@ -85,14 +86,6 @@ def test_a_dcf_without_a_configuration_names_no_serial_number_to_look_for() -> N
     assert values(imported(text))[0x1018, 4] == 0
     assert imported(text).node_id == 3
     assert imported(text).bitrate == 500_000
-
-
-def test_telemetry_states_and_commands_are_not_in_a_dcf() -> None:
-    """A tool that writes all values must not store, restore or clear anything."""
-    found = dcf_values("--node-id", 1)
-    states = (0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x1020, 0x1021, 0x2010, 0x2102, 0x603F)
-    assert not {index for index, _ in found} & set(states)
-    assert not set(found) & set(BINDINGS)
 
 
 @pytest.mark.parametrize(
@@ -158,22 +151,10 @@ def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
     dictionary = imported(command("--node-id", 5)[1])
     found = values(dictionary)
     assert len(found) > 100
+    # a tool that writes all values must not store, restore or clear anything
+    states = (0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x1020, 0x1021, 0x2010, 0x2102, 0x603F)
+    assert not {index for index, _ in found} & set(states) and not set(found) & set(BINDINGS)
     for (index, sub), value in found.items():
         text = value.decode() if isinstance(value, bytes) else value
         data = dictionary.get_variable(index, sub).encode_raw(text)
         assert data == node.dictionary.upload(index, sub, 0), f"{index:04X}h:{sub:02X}"
-
-
-def test_a_node_id_that_no_node_has_is_refused_with_the_one_there_is(tmp_path: Path) -> None:
-    file = configuration(tmp_path, "enabled = true\nnode_id = 20", right="node_id = 255")
-    said = refused(2, "eds", "-c", file, "--node-id", 5)
-    assert said == "--node-id 5: no node of the configuration has it. There is 20."
-
-
-def test_without_a_node_id_the_shipped_eds_is_written_byte_for_byte(tmp_path: Path) -> None:
-    out = tmp_path / "out.eds"
-    assert command("-o", out) == (0, "", f"kontronik-can-gw: {out} written\n")
-    assert out.read_bytes() == EDS.read_bytes()
-    assert os.listdir(tmp_path) == ["out.eds"]
-    code, text, said = command()
-    assert (code, text.encode(), said) == (0, EDS.read_bytes(), "")

@@ -4,20 +4,14 @@ import io
 import json
 import logging
 import re
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_line import run
-from rich.console import Console
 
 from kontronik_can_gw.cli import main, say, show
-from kontronik_can_gw.cli.doctor import _show
-from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.doctor.findings import Finding, Severity
-from kontronik_can_gw.desk.monitor.lines import line
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.log_writer import BackgroundHandler
@@ -26,19 +20,6 @@ EVIL = "a\x1b]0;x\x07\x9b31m\u202eb\u2066\x7f\r\nINFO fake"
 SHOWN = "a?]0;x??31m?b????INFO fake"
 DBC = shipped("dbc/kontronik_esc.dbc").read_text("utf-8")
 EDS = shipped("eds/kontronik_esc.eds").read_text("ascii")
-
-
-class Terminal(io.TextIOWrapper):
-    def __init__(self) -> None:
-        super().__init__(io.BytesIO(), encoding="utf-8", newline="")
-
-    def isatty(self) -> bool:
-        return True
-
-    def text(self) -> str:
-        self.flush()
-        self.seek(0)
-        return bytes(self.buffer.read()).decode()
 
 
 def is_clean(text: str) -> bool:
@@ -65,26 +46,6 @@ def test_talk_lines_and_errors(capsys: pytest.CaptureFixture[str]) -> None:
     assert UserError(EVIL, "b").problems == (SHOWN, "b")
 
 
-@pytest.mark.parametrize("style", ["", "bold"])
-def test_screens(style: str) -> None:
-    terminal = Terminal()
-    Console(file=terminal, force_terminal=True, color_system=None, width=99).print(
-        line((EVIL, style))
-    )
-    assert re.sub(r"\x1b\[\d*m", "", terminal.text()).rstrip("\n") == SHOWN
-
-
-@pytest.mark.parametrize("is_terminal", [True, False])
-def test_findings_of_doctor(is_terminal: bool) -> None:
-    found = [Finding(EVIL, "x", Severity.ERROR, EVIL, EVIL, EVIL)]
-    out = Terminal() if is_terminal else io.StringIO()
-    with redirect_stdout(out):
-        _show(found)
-    text = re.sub(r"\x1b\[[\d;]*m", "", out.text() if isinstance(out, Terminal) else out.getvalue())
-    assert is_clean(text)
-    assert text.count("fake") == 4
-
-
 def record(name: str, level: int, text: str, *args: str, error: Exception | None = None) -> Any:
     info = None if error is None else (type(error), error, error.__traceback__)
     return logging.LogRecord(name, level, "", 0, text, args, info)
@@ -102,18 +63,6 @@ def test_a_log_line_is_one_line() -> None:
     handler.close()
     assert stream.getvalue().startswith(f"WARNING said {SHOWN}\nERROR b\nTraceback")
     assert is_clean(stream.getvalue())
-
-
-def test_a_file_that_is_written_to_a_terminal() -> None:
-    text = f'VERSION "{EVIL}"\n'
-    terminal = Terminal()
-    with redirect_stdout(terminal):
-        write_output("-", text, "utf-8")
-    assert is_clean(terminal.text().replace("\r", ""))
-    pipe = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
-    with redirect_stdout(pipe):
-        write_output("-", text, "utf-8")
-    assert pipe.buffer.getvalue().decode() == text
 
 
 def test_what_a_library_logs(
@@ -146,7 +95,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("words", [["check", "-v"], ["describe"], ["describe", "--format", "json"]])
+@pytest.mark.parametrize("words", [["describe"], ["describe", "--format", "json"]])
 def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> None:
     done = run(*words, "-c", folder / "gateway.toml")
     assert done.code == 0, done.err

@@ -9,7 +9,7 @@ import pytest
 from dbc_bench import compiled, gateway_with, packed, refused
 
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.cli import check_details as check
+from kontronik_can_gw.cli import check
 from kontronik_can_gw.dbc.loss import unreported
 from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.reader import parse_database
@@ -240,9 +240,15 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
         read |= dict(theirs.decode_simple(packed(plan, gateway), decode_choices=False))
     expected = {"BatteryVoltage": 44.42, "Torque": -512.5, "Warm": 15, "Gear": 5}
     assert read == expected | {"Ratio": 1.5, "Cool": -2}
-    said = "\n".join(check.unbound(layout))
-    assert "Motor_20: Torque = -512.5 Nm, Warm = 15" in said
-    assert "Motor_21: Ratio = 1.5, Cool = -2" in said
+    said = {
+        name: s["source"]
+        for m in check.messages(layout, ["esc1"])
+        for name, s in m["signals"].items()
+    }
+    held = {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}
+    assert {name: said[name] for name in held} == {
+        name: f"(nothing: always {value})" for name, value in held.items()
+    }
     assert [line for line in layout.warnings if "sent once" in line] == [
         "my_car.dbc: sent once at the start, without a cycle and a value that changes: Motor_21"
     ]
@@ -459,7 +465,9 @@ def test_check_names_the_signal_that_reports_the_loss_and_warns_where_there_is_n
     beside: str, reporter: str | None
 ) -> None:
     layout = compiled(FLAG + beside)
-    (row,) = [line for line in check.table(layout, ["esc1"]) if "Undervoltage" in line]
+    (row,) = [
+        line for line in check.table([*check.messages(layout, ["esc1"])]) if "Undervoltage" in line
+    ]
     assert ("reports the loss" in row) == (reporter is not None)
     assert reporter is None or f"{reporter} reports the loss" in row
     warned = unreported(layout, silent=False)
@@ -512,7 +520,9 @@ def test_a_word_that_only_ends_alike_is_neither(name: str) -> None:
 def test_a_flag_with_room_for_a_code_hides_no_loss() -> None:
     layout = compiled(FLAG.replace("0|1@1+", "0|2@1+"))
     assert not unreported(layout, silent=False)
-    assert not any("reports the loss" in line for line in check.table(layout, ["esc1"]))
+    assert not any(
+        "reports the loss" in line for line in check.table([*check.messages(layout, ["esc1"])])
+    )
 
 
 def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_that_advice() -> (

@@ -179,7 +179,7 @@ def script(board: Path, name: str, *words: str) -> str:
 
 def installed(board: Path) -> list[Path]:
     """What `service install` of a program in /opt writes."""
-    files = planned("/opt/x/bin/kontronik-can-gw", COMPANIONS, "can0", 500_000)
+    files = planned("/opt/x/bin/kontronik-can-gw", COMPANIONS)
     for place, content in files:
         make_deb.put(board / place, content)
     return sorted(path for path in (board / "etc").rglob("*") if path.is_file())
@@ -196,10 +196,9 @@ def test_the_package_takes_over_what_service_install_wrote(
     link.symlink_to(board / "etc/systemd/system/kontronik-can-gw@.service")
     assert "changed by hand" not in script(board, *words)
     left = {str(path.relative_to(board / "etc")) for path in (board / "etc").rglob("*")}
-    network = "systemd/network/50-kontronik-can-gw-can0"
-    folders = ["sysusers.d", "systemd", "systemd/network", "systemd/system", "tmpfiles.d"]
+    folders = ["sysusers.d", "systemd", "systemd/system", "tmpfiles.d", "udev", "udev/rules.d"]
     assert left == {
-        *(*folders, "udev", "udev/rules.d", f"{network}.link", f"{network}.network"),
+        *folders,
         *(str(path.relative_to(board / "etc")) for path in (link.parent, link)),
     }
     assert link.readlink() == board / "usr/lib/systemd/system/kontronik-can-gw@.service"
@@ -211,14 +210,14 @@ def test_what_was_changed_by_hand_stays_and_is_named(board: Path) -> None:
         path.write_text(path.read_text() + "# mine\n")
     said = script(board, "take-over").splitlines()
     suffix = ": was changed by hand, kept in place of the package's"
-    named = {f"{path}{suffix}" for path in files if path.parent.name != "network"}
-    assert set(said) == named
+    assert set(said) == {f"{path}{suffix}" for path in files}
     assert all(path.exists() for path in files)
 
 
 def test_a_purge_leaves_network_files_and_what_another_installation_needs(board: Path) -> None:
     kept = [board / "etc/kontronik-can-gw/gateway.toml", board / "var/lib/kontronik-can-gw/esc1"]
-    for path in kept:
+    network = board / "etc/systemd/network/50-kontronik-can-gw-can0.network"
+    for path in (*kept, network):
         make_deb.put(path, "x")
     installed(board)
     said = script(board, "postrm", "purge")
@@ -227,7 +226,7 @@ def test_a_purge_leaves_network_files_and_what_another_installation_needs(board:
     script(board, "take-over")
     assert "userdel kontronik-can-gw" in script(board, "postrm", "purge")
     left = [path.name for name in ("etc", "var") for path in (board / name).rglob("*kontronik*")]
-    assert sorted(left) == [f"50-kontronik-can-gw-can0.{kind}" for kind in ("link", "network")]
+    assert left == [network.name]
 
 
 def test_every_library_is_pinned_or_left_out_by_name() -> None:

@@ -1,7 +1,6 @@
 """The description is complete and true, as cantools and canopen read the same files; whatever they hold is shown as text."""
 
 import json
-from enum import IntEnum
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import canopen
 import cantools.database
 import pytest
 from canopen.objectdictionary import ODVariable
-from command_line import run
 from described import DBC, EDS, NASTY, NASTY_NAME, NASTY_UNIT, TWO_ESCS, configuration, nasty
 from described import described as text_of
 from hypothesis import example, given
@@ -49,24 +47,17 @@ def holds(found: Facts, **expected: object) -> None:
 
 
 STATES = [state.about for state in OperatingState]
+OTHERS = [*LINK_STATES.values(), *CAN_STATES.values(), *GATEWAY_STATES.values()]
 
 
-@pytest.mark.parametrize("kind", [OperatingError, SelfTestError, STATES, GatewayError])
+@pytest.mark.parametrize("kind", [OperatingError, SelfTestError, STATES, GatewayError, OTHERS])
 def test_each_error_and_state_has_a_meaning_of_its_own_and_a_remedy(kind: Any) -> None:
+    assert [list(LINK_STATES), list(CAN_STATES), list(GATEWAY_STATES)] == [
+        list(states) for states in (LinkState, CanState, GatewayState)
+    ]
     assert all(each.meaning.strip() == each.meaning != "" for each in kind)
     assert all(each.remedy.endswith(".") for each in kind)
     assert len({each.meaning for each in kind}) == len(kind)
-
-
-@pytest.mark.parametrize(
-    ("texts", "states"),
-    [(LINK_STATES, LinkState), (CAN_STATES, CanState), (GATEWAY_STATES, GatewayState)],
-)
-def test_each_state_of_line_controller_and_gateway_has_a_meaning_and_a_remedy(
-    texts: dict[IntEnum, tuple[str, str]], states: type[IntEnum]
-) -> None:
-    assert list(texts) == list(states)
-    assert all(meaning and remedy.endswith(".") for meaning, remedy in texts.values())
 
 
 # --- tables, as JSON
@@ -194,31 +185,13 @@ def test_of_two_escs_each_has_its_signals_and_cob_ids(tmp_path: Path, facts: Fac
         0x180 + 21, 0x280 + 21, 0x380 + 21, 0x480 + 21,
     ]  # fmt: skip
     assert two["objects"] == facts["objects"]
-
-
-def test_a_node_that_waits_for_lss_has_no_cob_ids_of_its_own(tmp_path: Path) -> None:
-    text = '[canopen]\nenabled = true\nnode_id = 255\nstore = "s"\n[[esc]]\nport = "/dev/ttyUSB0"\n'
-    found = facts_of("-c", configuration(tmp_path, text))
-    assert found["tpdos"] == []
-    assert {row["use"] for row in found["cob-ids"]} == {"NMT", "LSS"}
-
-
-def test_without_a_dbc_and_nodes_there_are_values_and_the_faults(tmp_path: Path) -> None:
-    text = '[dbc]\nenabled = false\n[[esc]]\nport = "/dev/ttyUSB0"\n'
-    found = facts_of(
-        "-c", configuration(tmp_path, text + '[canopen]\nenabled = true\nstore = "s"\n')
-    )
-    assert "signals" not in found and found["objects"] and found["values"]
-    found = facts_of("-c", configuration(tmp_path, '[[esc]]\nport = "/dev/ttyUSB0"\n'))
-    assert "objects" not in found
-    assert {e["byte3"] for e in found["emergencies"]} == {"FFh"}
-
-
-def test_the_same_files_give_the_same_text_without_a_path(tmp_path: Path) -> None:
-    file = tmp_path / "x.json"
-    assert run("describe", "--format", "json", "-o", file).code == 0
-    assert file.read_text(encoding="utf-8") == text_of("--format", "json")
-    assert str(DBC.parent) not in file.read_text(encoding="utf-8")
+    text = '[[esc]]\nport = "x"\n[canopen]\nstore = "s"\nenabled = '
+    none = facts_of("-c", configuration(tmp_path, f"{text}false\n"))
+    assert "objects" not in none and {e["byte3"] for e in none["emergencies"]} == {"FFh"}
+    text = text.replace("enabled", "node_id = 255\nenabled")
+    waits = facts_of("-c", configuration(tmp_path, f"{text}true\n[dbc]\nenabled = false\n"))
+    assert "signals" not in waits and waits["values"]
+    assert {row["use"] for row in waits["cob-ids"]} == {"NMT", "LSS"}
 
 
 # --- the document, read back by a parser that knows nothing of us

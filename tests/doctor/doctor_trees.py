@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kontronik_can_gw.desk.doctor.findings import Finding, Severity
-from kontronik_can_gw.desk.doctor.machine import Machine, User
+from kontronik_can_gw.desk.doctor.machine import Machine
 
 DIALOUT = 20
-ME = User("anna", 1000, frozenset({1000, DIALOUT}))
 _DEVICE_FOLDER = 6
 _ROOM = (False, 1 << 30)
 
@@ -24,7 +23,6 @@ class Tree(Machine):
         self.full: dict[str, tuple[bool, int]] = {}
         self.closed: set[str] = set()
         """Files and folders that we may not open or fill."""
-        self.me = ME
         root.chmod(0o755)  # pytest's own is closed
         self.file("/proc/1/comm", "systemd\n")
         self.file("/proc/cmdline", "root=/dev/mmcblk0p2 rw quiet\n")
@@ -58,18 +56,8 @@ class Tree(Machine):
         """A character device of root's."""
         self.file(name, "")
         inode = 100 + len(self.devices)
-        values = (
-            stat.S_IFCHR | mode,
-            inode,
-            os.makedev(0, _DEVICE_FOLDER),
-            1,
-            0,
-            group,
-            0,
-            0,
-            0,
-            0,
-        )
+        place = os.makedev(0, _DEVICE_FOLDER)
+        values = (stat.S_IFCHR | mode, inode, place, 1, 0, group, 0, 0, 0, 0)
         self.devices[name] = os.stat_result(values, {"st_rdev": os.makedev(*number)})
 
     def process(self, pid: int, *words: str, opens: Sequence[str] = ()) -> None:
@@ -79,49 +67,35 @@ class Tree(Machine):
         for number, name in enumerate(opens, 3):
             self.link(f"/proc/{pid}/fd/{number}", name)
 
-    def ftdi(
-        self, tty: str = "ttyUSB0", serial: str = "A1234", latency: int = 1, minor: int = 0
-    ) -> None:
+    def ftdi(self, serial: str = "A1234") -> None:
         """An FTDI adapter with its device node and udev's names."""
-        usb = f"/sys/devices/pci0/usb1/1-{minor + 1}"
-        port = f"{usb}/1-{minor + 1}:1.0/{tty}"
+        usb = "/sys/devices/pci0/usb1/1-1"
+        port = f"{usb}/1-1:1.0/ttyUSB0"
         self.file(f"{usb}/idVendor", "0403\n")
         self.file(f"{usb}/product", "FT232R USB UART\n")
-        self.file(f"{usb}/power/control", "on\n")
         if serial:
             self.file(f"{usb}/serial", f"{serial}\n")
-        self.file(f"{port}/latency_timer", f"{latency}\n")
-        self.folder("/sys/bus/usb-serial/drivers/ftdi_sio")
-        self.link(f"{port}/driver", "/sys/bus/usb-serial/drivers/ftdi_sio")
-        self.folder(f"{port}/tty/{tty}")
-        self.link(f"/sys/class/tty/{tty}", f"{port}/tty/{tty}")
-        self.link(f"{port}/tty/{tty}/device", port)
-        self.device(f"/dev/{tty}", (188, minor))
-        self.link(f"/dev/serial/by-id/usb-FTDI_{serial or 'none'}-port0", f"/dev/{tty}")
-        self.link(f"/dev/serial/by-path/pci-usb-0:{minor + 1}", f"/dev/{tty}")
+        self.folder(f"{port}/tty/ttyUSB0")
+        self.link("/sys/class/tty/ttyUSB0", f"{port}/tty/ttyUSB0")
+        self.link(f"{port}/tty/ttyUSB0/device", port)
+        self.device("/dev/ttyUSB0", (188, 0))
+        self.link(f"/dev/serial/by-id/usb-FTDI_{serial or 'none'}-port0", "/dev/ttyUSB0")
+        self.link("/dev/serial/by-path/pci-usb-0:1", "/dev/ttyUSB0")
 
-    def uart(
-        self, tty: str, driver: str, compatible: str = "", number: tuple[int, int] = (4, 64)
-    ) -> None:
+    def uart(self, tty: str, compatible: str = "") -> None:
         """A UART on the board, as kernels since 6.6 show it: two devices of the serial core between it and the tty."""
         board = f"/sys/devices/platform/soc/{tty}.serial"
         core = f"{board}/{tty}:0/{tty}:0.0"
         self.folder(f"{core}/tty/{tty}")
-        self.folder("/sys/bus/serial-base/drivers/port")
-        self.link(f"{core}/driver", "/sys/bus/serial-base/drivers/port")
-        self.folder(f"/sys/bus/platform/drivers/{driver}")
-        self.link(f"{board}/driver", f"/sys/bus/platform/drivers/{driver}")
         if compatible:
             self.file(f"{board}/of_node/compatible", compatible + "\0")
         self.link(f"/sys/class/tty/{tty}", f"{core}/tty/{tty}")
         self.link(f"{core}/tty/{tty}/device", core)
-        self.device(f"/dev/{tty}", number)
+        self.device(f"/dev/{tty}", (4, 64))
 
     def systemd(self, **shown: str) -> None:
         """systemd with our unit, which shows these properties besides the usual ones."""
         self.folder("/run/systemd/system")
-        # for it cannot be given to the service's user
-        self.folder("/run/kontronik-can-gw/lock", 0o777)
         usual = {
             "LoadState": "loaded",
             "ActiveState": "active",
@@ -129,8 +103,7 @@ class Tree(Machine):
             "UnitFileState": "enabled",
             "NRestarts": "0",
             "Result": "success",
-            "User": "kontronik-can-gw",
-            "SupplementaryGroups": "dialout",
+            "User": "anna",
         }
         text = "".join(f"{name}={value}\n" for name, value in {**usual, **shown}.items())
         self.programs["systemctl", "show"] = text
@@ -138,15 +111,8 @@ class Tree(Machine):
     # --- what the checks see
 
     @property
-    def user(self) -> User:
-        return self.me
-
-    def user_named(self, name: str, more_groups: str = "") -> User | None:
-        numbers = {"root": 0, "kontronik-can-gw": 990}
-        if name not in numbers:
-            return None
-        more = {DIALOUT} if "dialout" in more_groups else set()
-        return User(name, numbers[name], frozenset({numbers[name], *more}))
+    def user(self) -> str:
+        return "anna"
 
     def group_name(self, gid: int) -> str:
         return {0: "root", DIALOUT: "dialout"}.get(gid, str(gid))

@@ -1,5 +1,6 @@
 """The command: exit codes, the JSON document, and that nothing reaches an ESC or is changed on the disk."""
 
+import ast
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import run, written
 
+from kontronik_can_gw.desk.doctor import ports
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.native.load import PURE, library
 
@@ -94,3 +96,10 @@ def test_nothing_is_made_or_changed(tmp_path: Path, esc: PtyEsc) -> None:
     findings, _ = document(configuration(tmp_path, esc.path, more), 0)
     assert sum(f["text"].endswith(", will be made") for f in findings) == 2
     assert [p.name for p in tmp_path.iterdir()] == ["gateway.toml"]
+
+
+def test_no_module_of_doctor_opens_a_device() -> None:
+    for path in Path(ports.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            name = getattr(node, "attr", getattr(node, "id", ""))
+            assert not name.startswith(("open", "write", "O_", "tcset")) or name == "openers"

@@ -378,6 +378,12 @@ def _dbc(words: list[str]) -> Database:
         return meaning.database(Path(f"{folder}/out.dbc").read_bytes())
 
 
+def _dbc_of(configuration: str) -> Database:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "a.toml").write_text(configuration)
+        return _dbc(["-c", f"{folder}/a.toml"])
+
+
 @cache
 def _flags() -> dict[str, tuple[str, int]]:
     """Names of the shipped flags, in the order of their bits; each has a word of the sheet's row in it."""
@@ -431,12 +437,8 @@ def judge(file: Path) -> Judge:
     )
     database = None
     if dbc.get("enabled", True):
-        with tempfile.TemporaryDirectory() as folder:
-            plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
-            (Path(folder) / "a.toml").write_text(
-                plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"')
-            )
-            database = _dbc(["-c", f"{folder}/a.toml"])
+        plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
+        database = _dbc_of(plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"'))
     steps: list[tuple[int, str, Any]] = []
     steady = dbc.get("on_loss") != "silent"
     for time, verb, *words in filter(None, (line.partition(";")[0].split() for line in lines)):

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,9 @@ from harness import LoggedProcess
 from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench
 
+from kontronik_can_gw.cli.metrics import _status_file
 from kontronik_can_gw.desk import metrics
 from kontronik_can_gw.desk.metrics import server_of
-from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 
@@ -62,73 +63,38 @@ def port(file: Path, clock: Clock) -> Iterator[int]:
         thread.join()
 
 
-def ask(
-    port: int, path: str = "/metrics", method: str = "GET", **headers: str
-) -> tuple[int, str, str]:
+def ask(port: int, path: str = "/metrics", **headers: str) -> tuple[int, str, str]:
     """Status, content type and text of an answer."""
-    connection = HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
-    try:
-        connection.request(method, path, headers=headers)
+    with closing(HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
+        connection.request("GET", path, headers=headers)
         answer = connection.getresponse()
         return answer.status, answer.headers["Content-Type"], answer.read().decode()
-    finally:
-        connection.close()
 
 
-def test_metrics_are_fetched_as_prometheus_does(port: int) -> None:
+def test_the_newest_metrics_are_fetched_as_prometheus_does(
+    port: int, file: Path, clock: Clock, document: dict[str, Any]
+) -> None:
     for accept in ("*/*", "application/openmetrics-text;version=1.0.0", "a/b;version=x;;=,"):
         status, _, text = ask(port, Accept=accept)
-        assert status == 200
-        assert text.count("\nkontronik_battery_voltage_volts{") == 8
-    status, kind, text = ask(port, "/metrics?x=1")
-    assert (status, kind) == (200, "text/plain; version=0.0.4; charset=utf-8")
+        assert (status, text.count("\nkontronik_battery_voltage_volts{")) == (200, 8)
+    kind, text = ask(port, "/metrics?x=1")[1:]
+    assert kind == "text/plain; version=0.0.4; charset=utf-8"
     found = {family.name: family for family in text_string_to_metric_families(text)}
     assert found["kontronik_snapshot_age_seconds"].samples[0].value == 0.5
-
-
-def test_what_the_gateway_replaces_is_read_anew(
-    port: int, file: Path, document: dict[str, Any]
-) -> None:
     file.unlink()
-    status, _, text = ask(port)
-    assert (status, text.startswith(f"{file}: not running: there is no such file.")) == (503, True)
+    assert ask(port)[0] == 503
     file.write_text(json.dumps(document | {"version": "9.9.9"}))
     assert 'kontronik_build_info{version="9.9.9"} 1.0' in ask(port)[2]
-
-
-@pytest.mark.parametrize(
-    ("age_ns", "said"),
-    [(STALE_NS, ""), (STALE_NS + 9 * SECOND, "since 12.0 s"), (-STALE_NS - 1, "not running")],
-)
-def test_a_frozen_gateway_and_one_of_before_a_reboot_have_no_values(
-    port: int, clock: Clock, document: dict[str, Any], age_ns: int, said: str
-) -> None:
-    clock.now = document["monotonic_ns"] + age_ns
-    status, _, text = ask(port)
-    assert (status, said in text) == (503 if said else 200, True)
-
-
-def test_a_damaged_file_is_one_line_and_never_a_traceback(
-    port: int, file: Path, document: dict[str, Any], capfd: pytest.CaptureFixture[str]
-) -> None:
-    text = json.dumps(document)
-    damaged: list[object] = [None, 3, [], "x", {}, {"program": "x"}, document | {"format": 99}]
-    for key in ("can", "escs", "gateway", "monotonic_ns", "nodes", "process", "units", "version"):
-        damaged.append({k: v for k, v in document.items() if k != key})
-    for key in ("can", "escs", "gateway", "monotonic_ns", "process", "units"):
-        damaged += [document | {key: wrong} for wrong in ("x", ["x"])]
-    cut = [text[: len(text) * part // 9].encode() for part in range(9)]
-    for data in [*cut, b"\xff\xfe", b"[" * 100_000, *(json.dumps(d).encode() for d in damaged)]:
-        file.write_bytes(data)
-        status, _, line = ask(port)
-        assert (status, str(file) in line, line.count("\n")) == (503, True, 1), data[:99]
-    assert "Traceback" not in capfd.readouterr().err
+    for age_ns, said in ((STALE_NS + 9 * SECOND, "since 12.0 s"), (-STALE_NS - 1, "not running")):
+        clock.now = document["monotonic_ns"] + age_ns
+        status, _, text = ask(port)
+        assert (status, said in text) == (503, True)
 
 
 @pytest.mark.parametrize(
     ("status", "hosts"),
     [
-        (200, ["localhost", "LOCALHOST:1", "127.0.0.1:9123", "127.9.9.9", "[::1]:5"]),
+        (200, ["localhost", "LOCALHOST:1", "127.0.0.1:9123", "[::1]:5"]),
         (403, ["example.com", "localhost.example.com", "127.0.0.1.example.com", "10.0.0.1", ""]),
     ],
 )
@@ -136,6 +102,21 @@ def test_a_page_that_has_its_own_name_lead_here_is_refused(
     port: int, status: int, hosts: list[str]
 ) -> None:
     assert [ask(port, Host=host)[0] for host in hosts] == [status] * len(hosts)
+
+
+def test_a_damaged_file_is_one_line_and_never_a_traceback(
+    port: int, file: Path, document: dict[str, Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    text = json.dumps(document)
+    damaged: list[object] = [None, 3, [], "x", {}, {"program": "x"}, document | {"format": 99}]
+    for key in ("can", "escs", "gateway", "monotonic_ns", "process", "units"):
+        damaged += [{k: v for k, v in document.items() if k != key}, document | {key: ["x"]}]
+    cut = [text[: len(text) * part // 9].encode() for part in range(9)]
+    for data in [*cut, b"\xff\xfe", b"[" * 100_000, *(json.dumps(d).encode() for d in damaged)]:
+        file.write_bytes(data)
+        status, _, line = ask(port)
+        assert (status, str(file) in line, line.count("\n")) == (503, True, 1), data[:99]
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
@@ -159,22 +140,6 @@ def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
 # --- the command
 
 
-def test_an_address_that_cannot_be_had_is_one_line_with_the_remedy(port: int, file: Path) -> None:
-    at = f"127.0.0.1:{port}"
-    said = refused(1, "metrics", "--file", file, "--listen", at)
-    assert (
-        said
-        == f"--listen {at}: cannot be listened to: Address already in use. Choose another address or port."
-    )
-    with pytest.raises(RunError, match=r"--listen 192.0.2.1:9123: cannot be listened to: Cannot"):
-        server_of(file, "192.0.2.1", 9123)
-
-
-@pytest.mark.parametrize("text", ["0.0.0.0:9123", "10.0.0.1:1", "9123", "localhost:x", "[::]:1"])
-def test_other_machines_are_not_served(text: str) -> None:
-    assert "is no port on this machine" in refused(2, "metrics", "--listen", text)
-
-
 def test_without_the_library_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(sys.modules):
         if name.startswith(("prometheus_client", "kontronik_can_gw.desk.metrics")):
@@ -184,37 +149,33 @@ def test_without_the_library_its_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     assert said == "needs prometheus-client: pip install 'kontronik-can-gw[metrics]'"
 
 
-@pytest.mark.parametrize(
-    ("name", "words", "own", "shown"),
-    [
-        ("gateway.toml", ["-c", "gateway.toml"], "", "/run/kontronik-can-gw/status.json"),
-        ("left.toml", ["left.toml"], "", "/run/kontronik-can-gw-left/status.json"),
-        ("gateway.toml", [], '[statistics]\nfile = "own.json"\n', "own.json"),
-    ],
-)
-def test_it_serves_the_file_of_a_configuration_until_sigterm(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    name: str,
-    words: list[str],
-    own: str,
-    shown: str,
+def test_it_serves_the_file_of_a_configuration_on_this_machine_until_sigterm(
+    tmp_path: Path, port: int, file: Path
 ) -> None:
-    written(tmp_path / name, f'{own}[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n')
-    command = [sys.executable, "-m", "kontronik_can_gw", "metrics", *words]
+    text = '[[esc]]\nport = "/dev/ttyS0"\n[statistics]\nfile = '
+    toml = written(tmp_path / "g.toml", f'{text}"own.json"\n')
+    for text in ("0.0.0.0:9123", "10.0.0.1:1", "9123", "localhost:x", "[::]:1"):
+        assert "is no port on this machine" in refused(2, "metrics", toml, "--listen", text)
+    said = refused(1, "metrics", "--file", file, "--listen", f"127.0.0.1:{port}")
+    assert "cannot be listened to: Address already in use. Choose another" in said
+    command = [sys.executable, "-m", "kontronik_can_gw", "metrics", str(toml)]
     paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    monkeypatch.chdir(tmp_path)
     program = LoggedProcess([*command, "--listen", "127.0.0.1:0"], paths)
     try:
         end = time.monotonic() + PATIENCE
         while "serves" not in program.log:
             assert time.monotonic() < end
             time.sleep(0.01)
-        assert program.log.endswith(shown)
-        port = int(program.log.partition("127.0.0.1:")[2].partition("/")[0])
-        assert ask(port)[0] == 503
+        assert program.log.endswith(f"serves {tmp_path}/own.json")
+        assert ask(int(program.log.partition("127.0.0.1:")[2].partition("/")[0]))[0] == 503
         program.process.send_signal(signal.SIGTERM)
         assert program.process.wait(PATIENCE) == 0
     finally:
         program.kill()
-    assert len(program.lines) == 1 + (not words)
+
+
+@pytest.mark.parametrize("name", ["gateway", "left"])
+def test_a_service_of_the_configurations_name_has_its_own_file(tmp_path: Path, name: str) -> None:
+    toml = written(tmp_path / f"{name}.toml", '[[esc]]\nport = "/dev/ttyS0"\n')
+    end = "" if name == "gateway" else f"-{name}"
+    assert str(_status_file(toml)) == f"/run/kontronik-can-gw{end}/status.json"

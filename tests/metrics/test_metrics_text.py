@@ -154,12 +154,3 @@ def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_whe
     assert {bit.text: bit.severity.value for bit in OperatingError} | {"bit30": "error"} == known
     assert {s.labels["error"] for s in samples if s.value == 1} == {"overvoltage", "bit30"}
     assert len(families(bench.document())["kontronik_selftest_error"].samples) == len(SelfTestError)
-
-
-def test_texts_with_quotes_backslashes_and_line_ends_are_read_back(
-    document: dict[str, Any],
-) -> None:
-    channel = 'a"b\\c\nd\\n µ'
-    odd = document | {"can": document["can"] | {"channel": channel}, "version": "\udcff"}
-    (sample,) = families(odd)["kontronik_can_info"].samples
-    assert sample.labels == {"interface": "socketcan", "channel": channel}

@@ -229,7 +229,7 @@ def test_tls_with_an_authority_of_ones_own(
     [
         ({"ca_file": "stranger"}, "its certificate is not accepted: "),
         ({"ca_file": None}, "its certificate is not accepted: "),
-        ({"broker": "127.0.0.1"}, "and that --broker is the name in the certificate."),
+        ({"broker": "127.0.0.1"}, "and that the broker has the name in the certificate."),
         ({"cert_file": None, "key_file": None}, ""),
     ],
 )

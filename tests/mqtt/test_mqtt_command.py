@@ -8,28 +8,32 @@ from typing import NoReturn
 import pytest
 from command_line import refused, run, written
 
-CAPTURE = Path(__file__).parents[1] / "golden/captures/state.kcap"
+HERE = "broker = '127.0.0.1:1'\n"
+
+
+def configuration(folder: Path, mqtt: str) -> Path:
+    text = f'[can]\ninterface = "virtual"\n[mqtt]\n{mqtt}[[esc]]\nport = "x"\n'
+    return written(folder / "gateway.toml", text)
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("mqtt", "words", "code", "said"),
     [
-        (["--broker", "127.0.0.1:1", "--ca-file", "x"], 2, "--tls"),
-        (
-            ["--broker", "127.0.0.1:1", "--username", "x", "--password-file", "empty"], 1,
-            "has no password on its first line",
-        ),
-        (["--broker", "127.0.0.1:1", "--tls", "--ca-file", "empty"], 1, "empty: [X509: NO_CERTIFICATE"),
-        (["--broker", "127.0.0.1:1", "--interface", "socketcan", "--channel", "no0"], 1, "no0"),
-        (["--broker", "127.0.0.1:1", "--discovery", "empty"], 2, "is a file. Give FILE before the options."),
+        ("", [], 2, "no broker is given: --broker HOST"),
+        ("", ["--broker", "a b"], 2, "--broker: 'a b' is not a broker"),
+        ("", ["flight.kcap"], 2, "Type kontronik-can-gw replay flight.kcap --on can"),
+        (HERE + "ca_file = 'x'\n", [], 2, "mqtt.ca_file: means nothing without mqtt.tls"),
+        (HERE + "password_file = 'x'\n", [], 2, "mqtt.password_file: means nothing without mqtt.username"),
+        (HERE + "username = 'x'\npassword_file = 'empty'\n", [], 1, "has no password on its first line"),
+        (HERE + "tls = true\nca_file = 'empty'\n", [], 1, "empty: [X509: NO_CERTIFICATE"),
+        (HERE, ["--interface", "socketcan", "--channel", "no0"], 1, "no0"),
     ],
 )  # fmt: skip
 def test_each_mistake_is_one_line_with_the_remedy(
-    words: list[str], code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mqtt: str, words: list[str], code: int, said: str, tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     written(tmp_path / "empty", "\nx")
-    assert said in refused(code, "mqtt", *words)
+    assert said in refused(code, "mqtt", "-c", configuration(tmp_path, mqtt), *words)
 
 
 def test_a_machine_without_loopback_is_one_line_with_the_remedy(
@@ -39,7 +43,7 @@ def test_a_machine_without_loopback_is_one_line_with_the_remedy(
         raise OSError(errno.ENETUNREACH, "Network is unreachable")
 
     monkeypatch.setattr("paho.mqtt.client.Client.loop_start", unreachable)
-    done = run("mqtt", CAPTURE, "--broker", "192.0.2.1")
+    done = run("mqtt", "-c", configuration(tmp_path, HERE))
     assert (done.code, "Traceback" in done.err) == (1, False)
     assert "127.0.0.1: Network is unreachable." in done.err
     assert done.err.endswith("sudo ip link set lo up\n")

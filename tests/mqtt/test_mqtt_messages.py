@@ -227,16 +227,6 @@ def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -
     assert {silent[key] for key in silent if key not in ("time", "available", "age")} == {None}
 
 
-def test_lasting_is_what_must_be_known_later_and_it_comes_before_the_state() -> None:
-    published = run(publisher("esc1", discovery="ha"), flight(layout_of(["esc1"]), 3), 3)
-    for _, message in published:
-        assert message.lasting is message.retain is not message.topic.endswith("/state")
-    topics = [message.topic for _, message in published]
-    assert topics.index(TOPICS.of("esc1", "available")) < topics.index(TOPICS.of("esc1", "state"))
-    kept = run(publisher("esc1", retain=True), [], 1)
-    assert all(message.retain for _, message in kept)
-
-
 # --- Home Assistant
 
 # From Home Assistant's documentation of sensors: units and state classes that go with a device class.
@@ -310,11 +300,6 @@ def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_
 def discoveries(published: Iterable[tuple[int, Message]]) -> list[tuple[int, dict[str, Any]]]:
     topic = TOPICS.discovery("ha", "esc1")
     return [(now, json.loads(m.payload)) for now, m in published if m.topic == topic]
-
-
-def test_an_esc_is_announced_once_when_it_is_known() -> None:
-    told = discoveries(run(publisher("esc1", discovery="ha"), flight(layout_of(["esc1"]), 20), 20))
-    assert [found["device"]["model"] for _, found in told] == ["KOSMIK"]
 
 
 def test_an_esc_that_does_not_identify_itself_is_announced_nevertheless() -> None:

@@ -1,10 +1,9 @@
-"""``kontronik-can-gw mqtt`` as a process, against a real mosquitto, on a bus without frames or with a recording."""
+"""``kontronik-can-gw mqtt`` as a process, against a real mosquitto, on a bus without frames."""
 
-import json
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,6 @@ from mqtt_bench import (
     wait_for,
 )
 from paho.mqtt import publish
-from simulated_bus import flight, layout_of, write_log
 
 pytestmark = pytest.mark.extended
 
@@ -31,22 +29,23 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mosquitto]:
     made.stop()
 
 
+def configuration(folder: Path, address: str, name: str, more: str = "") -> Path:
+    """Of a gateway on a bus that is quiet."""
+    text = '[can]\ninterface = "virtual"\nchannel = "mqtt"\n[[esc]]\nport = "/dev/ttyS0"\n'
+    text += f'[mqtt]\nbroker = "{address}"\ngateway = "{name}"\nrate = 20.0\n{more}'
+    return written(folder / "gateway.toml", text)
+
+
 @pytest.fixture
-def bus(tmp_path: Path) -> Path:
-    """The configuration of a gateway on a bus that is quiet."""
-    text = '[can]\ninterface = "virtual"\nchannel = "mqtt"\n[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n'
-    return written(tmp_path / "gateway.toml", text)
-
-
-def live(bus: Path, broker: Mosquitto, name: str, *words: object) -> Process:
+def live(tmp_path: Path, broker: Mosquitto) -> Callable[..., Process]:
     """The program on the bus."""
-    return Process("-c", bus, "--broker", broker.address, "--gateway", name, *words)
+    return lambda name, **how: Process("-c", configuration(tmp_path, broker.address, name), **how)
 
 
 def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(
-    bus: Path, broker: Mosquitto
+    live: Callable[..., Process], broker: Mosquitto
 ) -> None:
-    with live(bus, broker, "term") as program:
+    with live("term") as program:
         program.wait_for_line("connected as kontronik-can-gw-term")
         wait_for(
             lambda: kept(broker.port, "kontronik/term/#").get("kontronik/term/online") == b"online",
@@ -58,9 +57,11 @@ def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(
     assert not any(topic.endswith("/state") for topic in found)
 
 
-def test_the_last_will_says_offline_where_it_was_killed(bus: Path, broker: Mosquitto) -> None:
+def test_the_last_will_says_offline_where_it_was_killed(
+    live: Callable[..., Process], broker: Mosquitto
+) -> None:
     with (
-        live(bus, broker, "killed") as program,
+        live("killed") as program,
         Subscriber(broker.port, "kontronik/killed/online") as heard,
     ):
         heard.wait("kontronik/killed/online", b"online")
@@ -72,40 +73,27 @@ def test_the_last_will_says_offline_where_it_was_killed(bus: Path, broker: Mosqu
 # --- Home Assistant
 
 
-def test_discovery_is_kept_and_can_be_removed_as_the_removed_option_says(
-    tmp_path: Path, broker: Mosquitto
+def test_what_is_kept_of_discovery_can_be_removed_as_the_removed_option_says(
+    broker: Mosquitto,
 ) -> None:
-    log = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 2))
-    with Process(log, "--broker", broker.address, "--gateway", "ha", "--discovery") as program:
-        assert program.process.wait(PATIENCE) == 0
-    found = {
-        topic: json.loads(text) for topic, text in kept(broker.port, "homeassistant/#").items()
-    }
-    mine = {
-        "homeassistant/device/kontronik_ha/config",
-        "homeassistant/device/kontronik_ha_esc1/config",
-    }
-    assert set(found) == mine
-    esc = found["homeassistant/device/kontronik_ha_esc1/config"]
-    assert esc["device"]["sw_version"] == "4.17"
-    assert esc["components"]["battery_voltage"]["unique_id"] == "kontronik_ha_esc1_battery_voltage"
-    theirs = "homeassistant/device/kontronik_ha_2/config"
-    publish.single(theirs, b"{}", 1, True, "127.0.0.1", broker.port)
+    topics = {f"homeassistant/device/kontronik_ha{end}/config" for end in ("", "_esc1", "_2")}
+    for topic in topics:
+        publish.single(topic, b"{}", 1, True, "127.0.0.1", broker.port)
     advice = refused(2, "mqtt", "--remove-discovery").partition("Type ")[2]
     command, _, each = advice.replace("kontronik_GATEWAY", "kontronik_ha").partition(", and for ")
     command += each.partition("each ESC")[2].rstrip(".").replace("_ESC", "_esc1")
     words = command.replace("BROKER", f"127.0.0.1 -p {broker.port}").split()
     subprocess.run(words, check=False, capture_output=True, timeout=PATIENCE)
-    assert set(kept(broker.port, "homeassistant/#")) == {theirs}
+    theirs = {"homeassistant/device/kontronik_ha_2/config"}
+    assert set(kept(broker.port, "homeassistant/#")) == theirs
 
 
 # --- brokers that are missing, go away, do not want us
 
 
-def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, bus: Path) -> None:
+def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path) -> None:
     port = free_port()
-    words = ("-c", bus, "--gateway", "late", "--rate", 20)
-    with Process(*words, "--broker", f"127.0.0.1:{port}") as program:
+    with Process("-c", configuration(tmp_path, f"127.0.0.1:{port}", "late")) as program:
         program.wait_for_line(
             f"MQTT broker 127.0.0.1:{port}: connection refused. Does it run, and is the port right?"
         )
@@ -128,16 +116,17 @@ def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, bus: Path
 
 
 def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
-    tmp_path: Path, bus: Path
+    tmp_path: Path,
 ) -> None:
     users, secret = tmp_path / "users", written(tmp_path / "password", "wrong donkey\nmore\n")
     command = ["mosquitto_passwd", "-b", "-c", str(users), "boat", "right horse"]
     subprocess.run(command, check=True, capture_output=True)
     made = Mosquitto(tmp_path, f"allow_anonymous false\npassword_file {users}\n")
     try:
-        with live(bus, made, "pw", "--username", "boat", "--password-file", secret) as program:
+        more = 'username = "boat"\npassword_file = "password"\n'
+        with Process("-c", configuration(tmp_path, made.address, "pw", more)) as program:
             program.wait_for_line(
-                "refuses the connection: not authorized. Check --username, --password-file"
+                "refuses the connection: not authorized. Check username, password_file"
             )
             secret.write_text("right horse\n")
             program.wait_for_line(f"MQTT broker {made.address}: connected")
@@ -154,12 +143,11 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
 
 
 def test_the_same_gateway_twice_on_a_machine_is_refused(
-    bus: Path, broker: Mosquitto, tmp_path: Path
+    live: Callable[..., Process], broker: Mosquitto, tmp_path: Path
 ) -> None:
-    file = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 1))
-    with live(bus, broker, "twice") as program:
+    with live("twice") as program:
         program.wait_for_line("connected as")
-        said = refused(1, "mqtt", file, "--broker", broker.address, "--gateway", "twice")
+        said = refused(1, "mqtt", "-c", tmp_path / "gateway.toml")
         assert (
             f"another process on this machine publishes as twice to MQTT broker {broker.address}"
             in said
@@ -168,16 +156,15 @@ def test_the_same_gateway_twice_on_a_machine_is_refused(
 
 
 def test_the_service_manager_is_reported_and_the_watchdog_fed(
-    tmp_path: Path, bus: Path, broker: Mosquitto
+    tmp_path: Path, live: Callable[..., Process]
 ) -> None:
     told: list[str] = []
     path = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(path)
         manager.settimeout(PATIENCE)
-        words = ("-c", bus, "--broker", broker.address, "--gateway", "sd")
         environment = {"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "1000000"}
-        with Process(*words, environment=environment) as program:
+        with live("sd", environment=environment) as program:
             while (
                 "STATUS=connected" not in "".join(told)
                 or sum("WATCHDOG=1" in text for text in told) < 5

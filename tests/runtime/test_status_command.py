@@ -229,7 +229,7 @@ def test_without_words_all_services_are_shown_and_the_worst_is_the_exit_code(
     written(run_folder / "kontronik-can-gw-a" / "status.json", troubled)
     assert shell()[0] == TROUBLE
     written(run_folder / "kontronik-can-gw-b" / "status.json", heard(), monotonic_ns=1)
-    code, out, _ = shell("--once")
+    code, out, _ = shell()
     assert code == NOT_RUNNING
     assert out.count("kontronik-can-gw ") == 3
 

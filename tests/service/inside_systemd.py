@@ -161,7 +161,7 @@ def trial(facts: Facts) -> None:
 
     write_configuration(CONFIGURATION.with_name("left.toml"), "vcan1", "/dev/ttyUSB7")
     facts["install left"] = service("install", "--instance", "left", "--now")
-    facts["status of both"] = service("status", "-n", "1")
+    facts["both"] = [shown(), shown("kontronik-can-gw@left.service")]
     simulator.terminate()
     facts["uninstall left"] = service("uninstall", "--instance", "left")
     facts["left"] = shown("kontronik-can-gw@left.service")
@@ -171,7 +171,6 @@ def trial(facts: Facts) -> None:
     facts["probe"] = probed()
     facts["metrics"] = service("install", "--metrics", "--now"), fetched(), probed()
     facts["log"] = [[entry.get("PRIORITY"), entry.get("MESSAGE")] for entry in entries()]
-    facts["network"] = service("install", "--network", "500000", "--channel", "vcan1"), networkd()
 
     facts["uninstall"] = service("uninstall")
     facts["after uninstall"] = [shown(), left_over()]
@@ -182,9 +181,7 @@ def trial(facts: Facts) -> None:
     facts["locks after a stop"] = (
         [path.name for path in Path(LOCKS).iterdir()] if Path(LOCKS).is_dir() else None
     )
-    facts["purge"] = service("uninstall", "--purge")
-    facts["after purge"] = [shown(), left_over(), run("id", "kontronik-can-gw")["code"]]
-    facts["status in the end"] = service("status")
+    facts["end"] = service("uninstall")
 
 
 def left_over() -> list[str]:
@@ -194,25 +191,6 @@ def left_over() -> list[str]:
         *Path("/run").glob("kontronik*"),
     ]
     return sorted(str(path) for path in found)
-
-
-def networkd() -> str:
-    """What systemd-networkd says of the file; on a vcan it cannot set a bit rate, but it reads it."""
-    daemon = shutil.which("systemd-networkd", path="/lib/systemd:/usr/lib/systemd")
-    if daemon is None:
-        return "missing"
-    Path("/etc/systemd/network/60-wrong.network").write_text("[Match]\nName=x\n[CAN]\nBitrat=5\n")
-    words = ["env", "SYSTEMD_LOG_LEVEL=debug", "timeout", f"{LIMIT_S:g}", daemon]
-    said = ""
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        for line in process.stderr:
-            said += line
-            if "60-wrong.network:" in line:  # the last of the files, which it reads in order
-                break
-        process.terminate()
-        process.stderr.read()
-    return said
 
 
 def probed() -> Facts:

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,29 +20,19 @@ ENABLE = "no systemd-analyze on this machine: sudo apt-get install systemd"
 MAX_EXPOSED = 2.0
 
 
-def files(**more: Any) -> dict[str, str]:
+def files() -> dict[str, str]:
     """Texts of all files by their names, *.conf by its folder's."""
-    usual: dict[str, Any] = {
-        "program": "/bin/true",
-        "companions": (),
-        "channel": "can0",
-        "bitrate": None,
-    }
-    made = {Path(place): text for place, text in planned(**(usual | more))}
+    made = {Path(place): text for place, text in planned("/bin/true", COMPANIONS)}
     return {(p.parent if p.suffix == ".conf" else p).name: text for p, text in made.items()}
 
 
 def units(folder: Path, beside: bool = False) -> list[Path]:
-    """The gateway's units in a folder, or those of the services beside it; the template as an instance with its drop-in."""
-    made = files(companions=COMPANIONS if beside else ())
-    for name, text in made.items():
-        if name.endswith((".service", ".service.d")):
-            path = folder / name.replace("@", "@left")
-            if name.endswith(".d"):
-                path.mkdir()
-                path /= "instance.conf"
-            path.write_text(text)
-    return [folder / name.replace("@", "@left") for name in (BESIDE if beside else NAMES)]
+    """The gateway's units in a folder, or those of the services beside it; the template as an instance."""
+    found = []
+    for name in BESIDE if beside else NAMES:
+        found.append(folder / name.replace("@", "@left"))
+        found[-1].write_text(files()[name])
+    return found
 
 
 def settings(text: str) -> dict[str, list[str]]:
@@ -76,12 +65,6 @@ def test_systemd_finds_nothing_to_complain_about(tmp_path: Path, beside: bool) -
             if "kontronik" in line or str(tmp_path) in line
         ]
         assert (done.returncode, ours) == (0, []), done.stderr
-
-
-def test_verify_would_have_found_a_mistake(tmp_path: Path) -> None:
-    unit = units(tmp_path)[0]
-    unit.write_text(unit.read_text().replace("RestartSec=", "RestartSecs="))
-    assert "RestartSecs" in analyze("verify", "--man=no", str(unit)).stderr
 
 
 @pytest.mark.parametrize("beside", [False, True])
@@ -118,9 +101,8 @@ def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet
 
 
 def test_metrics_are_for_this_machine_only() -> None:
-    made = files(companions=["metrics"])
-    unit = settings(made["kontronik-can-gw-metrics.service"])
-    own = settings(made["kontronik-can-gw-metrics@.service.d"])
+    unit = settings(files()["kontronik-can-gw-metrics.service"])
+    own = settings(files()["kontronik-can-gw-metrics@.service"])
     for shown, name in ((unit, "gateway"), (own, "%i")):
         command = f"/bin/true metrics -c /etc/kontronik-can-gw/{name}.toml --listen ${{LISTEN}}"
         assert shown["ExecStart"][-1] == command
@@ -145,7 +127,7 @@ def test_it_may_open_serial_ports_and_nothing_else() -> None:
 
 def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it() -> None:
     """In the plain unit's runtime folder, which systemd would remove with it; every instance and the publisher write there."""
-    made = files(companions=["mqtt"])
+    made = files()
     lines = [line for line in made["tmpfiles.d"].splitlines() if line.startswith("d ")]
     assert f"d {SYSTEM_FOLDER} 0755 kontronik-can-gw kontronik-can-gw -" in lines
     for name in (*NAMES, "kontronik-can-gw-mqtt.service", "kontronik-can-gw-mqtt@.service"):
@@ -156,17 +138,15 @@ def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it() -> None:
     assert "RuntimeDirectoryPreserve" in settings(made[NAMES[0]])
 
 
-# --- network and udev
+def test_an_instance_has_a_configuration_and_folders_of_its_own() -> None:
+    plain, own = (settings(files()[name]) for name in NAMES)
+    changed = {name for name in plain if plain[name] != own[name]}
+    assert changed == {"ExecStart", "StateDirectory", "RuntimeDirectory"}
+    assert own["ExecStart"][0].endswith(" -c /etc/kontronik-can-gw/%i.toml")
+    assert own["StateDirectory"] == own["RuntimeDirectory"] == ["kontronik-can-gw-%i"]
 
 
-def test_the_network_file_has_what_the_bus_needs() -> None:
-    assert not [name for name in files() if name.startswith("50-")]
-    made = files(bitrate=250_000, channel="can1")
-    network = settings(made["50-kontronik-can-gw-can1.network"])
-    bus = {"BitRate": ["250000"], "SamplePoint": ["87.5%"], "RestartSec": ["100ms"]}
-    assert network == {"Name": ["can1"], "RequiredForOnline": ["no"], **bus}
-    link = settings(made["50-kontronik-can-gw-can1.link"])
-    assert link == {"OriginalName": ["can1"], "TransmitQueueLength": ["128"]}
+# --- udev
 
 
 RULE = re.compile(
@@ -182,6 +162,9 @@ def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
     assert all(RULE.fullmatch(part) for line in lines for part in line.split(", "))
     for label in ('GOTO="kontronik_can_gw_end"', 'LABEL="kontronik_can_gw_end"'):
         assert text.count(label) == 1
+    ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
+    assert [line.split(",")[0] for line in ignored] == ['SUBSYSTEM=="usb"', 'SUBSYSTEM=="tty"']
+    assert all("0403" in line for line in ignored)
     udevadm = shutil.which("udevadm", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/bin")
     rules = tmp_path / "70-kontronik-can-gw.rules"
     rules.write_text(text)
@@ -191,12 +174,3 @@ def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
     ):
         done = subprocess.run([udevadm, "verify", str(rules)], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr + done.stdout
-
-
-def test_udev_rules_keep_modem_manager_away() -> None:
-    text = files()["70-kontronik-can-gw.rules"]
-    # the gateway asks for it once echo is off, and nothing before that
-    assert "latency_timer" not in text
-    ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
-    assert [line.split(",")[0] for line in ignored] == ['SUBSYSTEM=="usb"', 'SUBSYSTEM=="tty"']
-    assert all("0403" in line for line in ignored)

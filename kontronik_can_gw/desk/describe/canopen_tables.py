@@ -1,6 +1,5 @@
 """Tables of CANopen: nodes, objects and emergencies, of the EDS in use, its bindings and the errors' definitions."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import PurePath
@@ -9,7 +8,6 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.data_types import TYPE_NAMES
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds, Entry
-from kontronik_can_gw.canopen.eds_sections import read_sections
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -39,7 +37,7 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     ]
     writes = any(settings.read_only for settings in setup.settings)
     refused = "Nothing can be written over the bus: canopen.read_only is true." if writes else ""
-    text = [f"{PurePath(eds.name).name}. {refused}", *_comments(eds)]
+    text = [f"{PurePath(eds.name).name}. {refused}"]
     meanings = meanings_of(escs)
     return [
         Table("COB-IDs", ["A node for each ESC. One that waits for LSS has few."], ids, by="node"),
@@ -89,14 +87,6 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
         "shows": "" if bound is None else bound.source.name,
         "meaning": "" if bound is None else meanings.get(bound.source.name, ""),
     }
-
-
-def _comments(eds: Eds) -> list[str]:
-    """The lines of [Comments]."""
-    found = read_sections(eds.data, []).get("comments")
-    keys = {} if found is None else found.values
-    lines = {int(key[4:]): line for key, line in keys.items() if re.fullmatch(r"line\d+", key)}
-    return [lines[n] for n in sorted(lines) if lines[n]]
 
 
 # --- emergencies

@@ -150,7 +150,7 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
             "unit": value.unit,
             "available": _AVAILABLE[value.group] + (", where supplied" if value.optional else ""),
             "counter": value.rolls,
-            "objects": [_key(key) for key, each in BINDINGS.items() if each.source.name == name],
+            "objects": [place(*key) for key, each in BINDINGS.items() if each.source.name == name],
             "only_objects": name in others,
             "meaning": meanings.get(name, name.replace("_", " ").capitalize()),
             "names": {int(key): word for key, word in value.names.items()},
@@ -176,8 +176,9 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
 _VALUES = "What a signal of a DBC of your own can be bound to, by its name or under [dbc.bind]; the signal's unit may be another."
 
 
-def _key(key: tuple[int, int]) -> str:
-    return f"{key[0]:04X}h:{key[1]:02X}"
+def place(index: int, sub: int) -> str:
+    """An object as it is written."""
+    return f"{index:04X}h:{sub:02X}"
 
 
 def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> Table:

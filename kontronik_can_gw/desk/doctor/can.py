@@ -3,13 +3,11 @@
 import json
 import platform
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER, is_held, lock_folder, lock_name
 
 MIN_QUEUE = 8
 """Frames: more than the few that the gateway keeps in the queue itself."""
@@ -18,8 +16,6 @@ _CAN_TYPE = "280"
 _FD_MTU = 72
 _STATES = {"ERROR-ACTIVE": "active", "ERROR-WARNING": "warning", "ERROR-PASSIVE": "warning"}
 _MODES = {"LISTEN-ONLY": "listen_only", "LOOPBACK": "loopback"}
-_EVENTS = ("error_passive", "bus_error", "restarts")
-_LOSSES = ("rx_dropped", "rx_errors", "rx_over_errors", "tx_dropped", "tx_errors")
 
 
 def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
@@ -34,25 +30,10 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         set=f"type can bitrate {can.bitrate}{fd}",
     )
     if can.interface != "socketcan":
-        _driver(findings, can.interface)
+        findings.say("can.driver", "unseen", interface=can.interface)
     elif _kernel(machine, findings) and _exists(machine, findings, can.channel):
         _interface(machine, findings, can)
-        _other_gateways(machine, findings, can.channel)
     return findings.found
-
-
-def _driver(findings: Findings, interface: str) -> None:
-    """Check a python-can driver that bypasses the kernel: without opening it only its import can be tested."""
-    from kontronik_can_gw.lean import without_asammdf
-
-    with without_asammdf():
-        from can.interfaces import BACKENDS
-    try:
-        import_module(BACKENDS.get(interface, ("", ""))[0])
-    except Exception as error:  # without its vendor's library a driver fails in its own way
-        findings.say("can.driver", "broken", interface=interface, error=error)
-    else:
-        findings.say("can.driver", "ok", interface=interface)
 
 
 def _kernel(machine: Machine, findings: Findings) -> bool:
@@ -97,14 +78,8 @@ def _interface(machine: Machine, findings: Findings, can: CanConfig) -> None:
     length = machine.text(f"{folder}/tx_queue_len")
     if length.isdigit() and not virtual and int(length) < MIN_QUEUE:  # other programs share it
         findings.say("can.queue", "short", length=length)
-    losses = {name: machine.text(f"{folder}/statistics/{name}") for name in _LOSSES}
-    events = link.get("info_xstats", {})
-    if times := events.get("bus_off"):
+    if times := link.get("info_xstats", {}).get("bus_off"):
         findings.say("can.bus_off", "some", times=times)
-    counts = {key: str(events.get(key, 0)) for key in _EVENTS} | losses
-    seen = [f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n not in ("", "0")]
-    if seen:
-        findings.say("can.statistics", "some", counts=", ".join(seen))
 
 
 def _link(machine: Machine, name: str) -> Mapping[str, Any]:
@@ -140,20 +115,3 @@ def _controller(
         findings.say("can.state", case, counts=counts, state=state.lower())
     for mode in set(_MODES) & set(data.get("ctrlmode", ())):
         findings.say("can.mode", _MODES[mode])
-
-
-def _other_gateways(machine: Machine, findings: Findings, channel: str) -> None:
-    """Find other gateways by held locks; a lock file alone may be left by a killed gateway."""
-    namespace = machine.status("/proc/self/ns/net")
-    held = machine.text("/proc/locks")
-    found = set()
-    for path in {str(SYSTEM_FOLDER), str(lock_folder())}:
-        for file in machine.names(path):
-            status = machine.status(f"{path}/{file}")
-            name = lock_name(file, namespace.st_ino if namespace else 0) or ""
-            if status and name.startswith(f"{channel}/") and is_held(status, held):
-                found.add(name.removeprefix(f"{channel}/").replace("/", " "))
-    if found:
-        running = [str(process) for process in machine.processes.values() if process.is_gateway]
-        who = ", ".join(running) or "a gateway"
-        findings.say("can.gateway", "runs", who=who, what=", ".join(sorted(found)))

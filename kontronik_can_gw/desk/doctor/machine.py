@@ -36,19 +36,6 @@ class Process(NamedTuple):
         return f"{'kontronik-can-gw' if self.is_gateway else self.name} (pid {self.pid})"
 
 
-class User(NamedTuple):
-    """A user: name, user-ID and the IDs of all groups."""
-
-    name: str
-    uid: int
-    groups: frozenset[int]
-
-    def may(self, status: os.stat_result, bits: int) -> bool:
-        """True if the mode allows all of ``bits`` (4 read, 2 write, 1 enter or run)."""
-        shift = 6 if status.st_uid == self.uid else 3 if status.st_gid in self.groups else 0
-        return self.uid == 0 or status.st_mode >> shift & bits == bits
-
-
 class Machine:
     """The machine below ``root``."""
 
@@ -113,22 +100,13 @@ class Machine:
     def has_systemd(self) -> bool:
         return self.exists("/run/systemd/system")
 
-    @cached_property
-    def user(self) -> User:
-        """The user of this process."""
-        name = str(os.geteuid())
-        with contextlib.suppress(KeyError):
-            name = pwd.getpwuid(os.geteuid()).pw_name
-        return User(name, os.geteuid(), frozenset((*os.getgroups(), os.getegid())))
-
-    def user_named(self, name: str, more_groups: str = "") -> User | None:
-        """A user with the groups of the system and ``more_groups``, names with spaces between; None where there is none."""
+    @property
+    def user(self) -> str:
+        """The name of this process's user."""
         try:
-            found = pwd.getpwnam(name)
+            return pwd.getpwuid(os.geteuid()).pw_name
         except KeyError:
-            return None
-        more = [group.gr_gid for group in grp.getgrall() if group.gr_name in more_groups.split()]
-        return User(name, found.pw_uid, frozenset([*os.getgrouplist(name, found.pw_gid), *more]))
+            return str(os.geteuid())
 
     def group_name(self, gid: int) -> str:
         try:

@@ -29,12 +29,12 @@ KEEPALIVE_S = 15
 """The broker publishes the last will after 1.5 times this without a packet."""
 MIN_PAUSE_S, MAX_PAUSE_S = 1, 30
 """Time between two attempts to connect; paho doubles it each time."""
-_CERTIFICATE = "its certificate is not accepted: {}. Check --ca-file, and that --broker is the name in the certificate."
+_CERTIFICATE = "its certificate is not accepted: {}. Check mqtt.ca_file, and that the broker has the name in the certificate."
 _FAILURES: tuple[tuple[type[BaseException], str], ...] = (
     (ssl.SSLCertVerificationError, _CERTIFICATE),
     (ssl.SSLError, "TLS failed. Is this the port for TLS?"),
-    (socket.gaierror, "the host's name is not known. Check --broker and the network."),
-    (TimeoutError, "does not answer. Check --broker, the network and firewalls."),
+    (socket.gaierror, "the host's name is not known. Check it and the network."),
+    (TimeoutError, "does not answer. Check its name, the network and firewalls."),
     (ConnectionRefusedError, "connection refused. Does it run, and is the port right?"),
 )
 
@@ -193,9 +193,7 @@ class MqttClient:
         self._answered = True
         if reason.is_failure:
             text = str(reason).lower()
-            self.problem = (
-                f"refuses the connection: {text}. Check --username, --password-file, --gateway."
-            )
+            self.problem = f"refuses the connection: {text}. Check username, password_file and gateway of [mqtt]."
             return
         self._connections += 1
         self._ended.clear()
@@ -211,11 +209,11 @@ class MqttClient:
         if self.problem == "":
             self.problem = (
                 "the connection was lost. If that goes on: does another program use the client id "
-                f"{self._client_id!r} (--gateway)?"
+                f"{self._client_id!r} (mqtt.gateway)?"
             )
         elif not self._answered:
             self.problem = (
-                "does not answer as an MQTT broker. Is the port right, does it want TLS (--tls)?"
+                "does not answer as an MQTT broker. Is the port right, does it want mqtt.tls?"
             )
         self._ended.set()
 

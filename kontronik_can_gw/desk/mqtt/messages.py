@@ -154,10 +154,8 @@ def _in_words(flags: Sequence[Flag] | None) -> list[dict[str, str]] | None:
 class Publisher:
     """Takes frames, returns messages. ``now``: nanoseconds of one clock; ``wall_ns``: Unix time."""
 
-    def __init__(
-        self, bus: BusLayout, topics: Topics, config: MqttConfig, is_replay: bool = False
-    ) -> None:
-        self._topics, self._config, self._is_replay = topics, config, is_replay
+    def __init__(self, bus: BusLayout, topics: Topics, config: MqttConfig) -> None:
+        self._topics, self._config = topics, config
         self._view = View(SignalReader(bus.layout))
         columns = self._view.reader.columns
         indices = sorted({column.esc for column in columns if column.esc is not None})
@@ -185,14 +183,14 @@ class Publisher:
         """The messages to publish now."""
         self._view.expire(now)
         made: list[Message] = []
-        time = {"time": iso(wall_ns)} | ({"replay": True} if self._is_replay else {})
         for member in self._members:
             if member.is_due(now, round(SECOND / self._config.rate)):
                 for topic, payload in self._lasting_of(member, now).items():
                     if self._lasting.get(topic) != payload:
                         made.append(Message(topic, payload, lasting=True, retain=True))
                         self._lasting[topic] = payload
-                topic, state = self._topics.of(member.name, "state"), time | member.document(now)
+                topic = self._topics.of(member.name, "state")
+                state = {"time": iso(wall_ns)} | member.document(now)
                 made.append(Message(topic, _json(state), retain=self._config.retain))
         return made
 
