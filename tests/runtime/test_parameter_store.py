@@ -64,9 +64,7 @@ def mode(path: Path) -> int:
 # --- there and back
 
 
-def test_what_was_saved_is_loaded_by_the_next_process(
-    tmp_path: Path, store: ParameterStore
-) -> None:
+def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterStore) -> None:
     assert store.load("a") == (Stored(), None)
     assert list(tmp_path.iterdir()) == [], "nothing is made by reading"
     assert put(store, "a", OLD) is None
@@ -204,9 +202,7 @@ def test_a_file_that_cannot_be_moved_or_read_is_not_written_over(
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
-def test_a_left_over_temporary_file_is_never_read_and_hinders_no_saving(
-    tmp_path: Path, store: ParameterStore
-) -> None:
+def test_a_left_over_temporary_file_is_never_read(tmp_path: Path, store: ParameterStore) -> None:
     folder = place(tmp_path, OLD)
     for left_over in (NEW, bytes(10_000)):
         (folder / "esc1.params.tmp").write_bytes(left_over)
@@ -401,7 +397,7 @@ def test_at_every_instant_a_loss_of_power_finds_the_old_or_the_new_content(
     assert faults(files, steps) == []
 
 
-def test_at_every_instant_of_moving_a_damaged_file_it_is_somewhere(
+def test_a_damaged_file_is_somewhere_at_every_instant(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = place(tmp_path, b"rubbish")

@@ -220,7 +220,7 @@ def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
     assert stat.S_ISFIFO(target.stat().st_mode)
 
 
-def test_a_document_has_the_recorder_as_it_was_when_it_was_published(
+def test_a_document_has_the_recorder_as_it_was(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The recorder's thread goes on while the statistics' thread makes it."""

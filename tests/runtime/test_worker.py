@@ -47,7 +47,7 @@ def test_a_closed_handover_writes_to_no_descriptor_that_is_anothers_by_now() -> 
         os.close(other)
 
 
-def test_an_end_whose_wake_is_read_with_the_last_items_is_not_lost(
+def test_an_end_read_with_the_last_items_is_not_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[int] = []
