@@ -502,18 +502,3 @@ def test_a_driver_that_cannot_filter_or_fails(
         assert receive(port, 1) == [CanFrame(1, b"")]
         port.set_receive_ids({2})
         assert port.gone
-
-
-def test_closing_ends_a_thread_that_waits_and_gives_back_every_descriptor() -> None:
-    def descriptors() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
-    with virtual():
-        pass  # what is imported late
-    before = descriptors()
-    for _ in range(5):
-        with virtual() as (port, _other):
-            port.set_receive_ids({1})
-            port.close()
-            assert readers() == []
-    assert descriptors() == before

@@ -191,24 +191,6 @@ def test_an_esc_is_found_by_its_adapter(there: dict[str, Identity | None], bench
     assert not bench.escs[0].is_at("/dev/ttyUSB1")
 
 
-def test_a_port_that_is_away_for_a_day_is_tried_once_a_second_and_said_once(
-    there: dict[str, Identity | None], bench: Bench, caplog: pytest.LogCaptureFixture
-) -> None:
-    there.clear()
-    bench.lose(0, 0)
-    tries, now = 0, 0
-    while now < 3600 * SECOND:
-        (esc,) = bench.lost
-        due = esc.due
-        assert due - now <= SECOND
-        now = due
-        bench.reopen(now)
-        tries += 1
-    assert 3600 <= tries < 3610
-    said = [record for record in caplog.records if record.levelname == "WARNING"]
-    assert len(said) == 2, "lost, and no such port"
-
-
 def test_line_errors_are_counted_by_kind_over_every_plugging_in(
     bench: Bench,
 ) -> None:
@@ -264,18 +246,6 @@ def test_there_is_no_diagnosis_while_telemetry_comes_and_one_when_not(bench: Ben
             assert said is None, "frames come, or did so a moment ago"
     assert said is not None
     assert said.startswith("no bytes")
-
-
-def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(bench: Bench) -> None:
-    esc = bench.escs[0]
-    assert [esc.is_stuck() for _ in range(3)] == [False] * 3
-    bench.port().waits_to_be_read = True
-    assert [esc.is_stuck() for _ in range(3)] == [False, True, True]
-    bench.port().reads = [LIVE]
-    esc.serve(SECOND)
-    assert not esc.is_stuck()
-    bench.lose(0, SECOND)
-    assert not esc.is_stuck(), "not open: known to be lost"
 
 
 def test_a_usb_adapter_is_known_by_numbers_and_interface(
