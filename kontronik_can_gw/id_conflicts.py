@@ -1,6 +1,7 @@
 """Others on the bus that send with ids that only this gateway may send with."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import MAX_EXTENDED_ID, block_of, ids_in_words
@@ -11,20 +12,20 @@ _OVER_NS = 10 * SECOND
 _ECHO_NS = SECOND // 5
 
 
+@dataclass
 class Conflict:
     """Another device sends with an id of ours. ``whose``: what it is here; ``output``: that has it, None: the gateway.
 
     ``over``: that has ceased.
     """
 
-    def __init__(self, key: int, owner: Owner, output: Output | None, now: int) -> None:
-        self.key = key
-        self.output = output
-        self.whose = owner.what
-        self.node = owner.esc
-        self.begun = self.last = now
-        self.count = 0
-        self.over = False
+    key: int
+    whose: str
+    node: int | None
+    output: Output | None
+    last: int
+    count: int = 0
+    over: bool = False
 
     @property
     def can_id(self) -> int:
@@ -96,7 +97,8 @@ class IdConflicts:
             return False
         conflict = self._present.get(own)
         if conflict is None:
-            conflict = self._present[own] = Conflict(own, *self._own[own], now)
+            owner, output = self._own[own]
+            conflict = self._present[own] = Conflict(own, owner.what, owner.esc, output, now)
             self._news.append(conflict)
             self._report(conflict, True, now)
         conflict.count += 1

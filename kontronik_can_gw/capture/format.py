@@ -173,24 +173,25 @@ def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
     at = _COUNT.size + count * _ENTRY.size
     if at > len(payload):
         raise ValueError("is shorter than its table")
-    for time_ns, kind, flags, index, length in _ENTRY.iter_unpack(payload[_COUNT.size : at]):
-        data, came_ns = payload[at : at + length], None
-        if version > 1 and kind in _WITH_ARRIVAL:
-            if len(data) < _NUMBER.size:
-                raise ValueError("has an entry without its time of arrival")
-            came_ns, data = _NUMBER.unpack_from(data)[0], data[_NUMBER.size :]
-        yield Entry(time_ns, kind, index, data, flags, came_ns)
-        at += length
+    for head in _ENTRY.iter_unpack(payload[_COUNT.size : at]):
+        yield _entry(head, payload[at : at + head[-1]], version)
+        at += head[-1]
     if at != len(payload):
         raise ValueError("is not as long as its table says")
 
 
 def entry_at(payload: bytes, number: int, begin: int) -> Entry:
     """One entry of an intact data block (of version 2). ``begin``: where its data begin."""
-    at = _COUNT.size + number * _ENTRY.size
-    time_ns, kind, flags, index, length = _ENTRY.unpack_from(payload, at)
-    data, came_ns = payload[begin : begin + length], None
-    if kind in _WITH_ARRIVAL:
+    head = _ENTRY.unpack_from(payload, _COUNT.size + number * _ENTRY.size)
+    return _entry(head, payload[begin : begin + head[-1]], VERSION)
+
+
+def _entry(head: tuple[int, ...], data: bytes, version: int) -> Entry:
+    time_ns, kind, flags, index, _ = head
+    came_ns = None
+    if version > 1 and kind in _WITH_ARRIVAL:
+        if len(data) < _NUMBER.size:
+            raise ValueError("has an entry without its time of arrival")
         came_ns, data = _NUMBER.unpack_from(data)[0], data[_NUMBER.size :]
     return Entry(time_ns, kind, index, data, flags, came_ns)
 

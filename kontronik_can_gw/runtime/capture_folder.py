@@ -3,21 +3,18 @@
 import contextlib
 import fcntl
 import os
+import re
 from pathlib import Path
 
 from kontronik_can_gw.capture.format import SUFFIX
 
-_LOGS_OF_0_5_0 = (".log", ".asc", ".blf", ".trc")
-"""Logs of CAN frames beside captures, which 0.5.0 wrote: they are removed as captures are."""
+_OURS = re.compile(rf"[0-9]{{8}}T[0-9]{{6}}Z-[0-9a-f]{{6}}-[0-9]+({SUFFIX}|\.(log|asc|blf|trc))")
+"""Names of captures, and of logs of CAN frames beside them, which 0.5.0 wrote."""
 
 
 def is_ours(name: str) -> bool:
     """True for the name of a capture, or of a log beside one."""
-    stem, _, suffix = name.partition(".")
-    stamp, _, rest = stem.partition("-")
-    run, _, part = rest.partition("-")
-    made = len(stamp) == 16 and stamp.endswith("Z") and len(run) == 6 and part.isdecimal()
-    return made and f".{suffix}" in (SUFFIX, *_LOGS_OF_0_5_0)
+    return _OURS.fullmatch(name) is not None
 
 
 def remove_oldest(folder: Path, keep_bytes: int) -> None:

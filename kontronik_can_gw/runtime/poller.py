@@ -9,27 +9,21 @@ import contextlib
 import select
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.output import NEVER
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.can_link import CanLink
+    from kontronik_can_gw.runtime.can_port import CanPort
+    from kontronik_can_gw.runtime.serial_port import SerialPort
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (select.POLLIN, POLLOUT)."""
 
 
 _IN = select.POLLIN
-
-
-class Waiting(Protocol):
-    """A port that is read."""
-
-    @property
-    def waits_to_be_read(self) -> bool:
-        """True while a read would find something."""
 
 
 class PortInput:
@@ -53,7 +47,7 @@ class StuckCheck:
         noted.served = True
         self._seen_waiting = False
 
-    def is_stuck(self, port: Waiting | None) -> bool:
+    def is_stuck(self, port: "SerialPort | CanPort | None") -> bool:
         """True if something has waited since the last call but one and nothing was read."""
         waiting = port is not None and not self._noted.served and port.waits_to_be_read
         stuck = waiting and self._seen_waiting

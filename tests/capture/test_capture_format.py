@@ -90,9 +90,7 @@ def test_version_1_has_no_times_of_arrival_and_version_2_is_refused_without_them
     st.lists(st.tuples(st.sampled_from([b"H", b"D", b"I", b"E"]), payloads), max_size=6),
     st.integers(1, 300),
 )
-def test_blocks_come_back_however_they_are_cut(
-    listed: list[tuple[bytes, bytes]], size: int
-) -> None:
+def test_blocks_come_back_however_cut(listed: list[tuple[bytes, bytes]], size: int) -> None:
     data = b"".join(block(kind, number, payload) for number, (kind, payload) in enumerate(listed))
     found = scanned(data, size)
     assert [(b.kind, b.payload) for b in found if isinstance(b, Block)] == listed

@@ -96,7 +96,7 @@ def read_all(path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_wrong_values_in_the_header(
+def test_wrong_header_values(
     seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.kcap"
@@ -142,7 +142,7 @@ def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> 
         read_all(path)
 
 
-def test_what_only_looks_like_blocks_costs_no_more_than_a_while(
+def test_what_only_looks_like_blocks_costs_little(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Heads that promise megabytes, one after the other: each would have to be read to its end."""
@@ -176,9 +176,7 @@ def test_a_file_of_nothing_but_damage_is_summed_up(header: dict[str, Any], tmp_p
         assert "and more of that kind" in found.damage
 
 
-def test_a_name_from_the_header_cannot_forge_lines(
-    header: dict[str, Any], bench: Bench, tmp_path: Path
-) -> None:
+def test_a_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
     entries = block(b"D", 1, data_payload(bench.entries))
     for given, shown in (("t1", "t1"), ("can0 123#11\\n(1.0) can0", "can0")):

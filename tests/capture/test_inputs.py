@@ -9,7 +9,6 @@ from capture_bench import START, Bench, capture, made
 from simulated_bus import write_log
 
 from kontronik_can_gw.desk.recordings.inputs import (
-    BytesInput,
     CanLogInput,
     CaptureInput,
     Input,
@@ -81,7 +80,7 @@ def test_rows_of_a_capture_are_the_esc_s_frames_at_their_times(tmp_path: Path) -
         assert found.damage == []
 
 
-def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_frame(
+def test_a_loss_is_a_row_without_values_until_the_next_frame(
     tmp_path: Path,
 ) -> None:
     bench, _ = plain_run(12, faults=Faults(dropout=Dropout(2 * SECOND, 6 * SECOND)))
@@ -96,21 +95,6 @@ def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_fram
             assert back.values[at["battery_voltage"]] is not None
             before = rows[rows.index(lost) - 1]
             assert 250 * MS <= lost.time_ns - before.time_ns < 300 * MS
-
-
-def test_the_bytes_of_an_esc_come_out_as_they_went_in(tmp_path: Path) -> None:
-    bench, _ = plain_run(4, escs=2, faults=Faults(noise=1.0, lost_bytes=0.01))
-    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
-    for index in range(2):
-        with open_input(path) as found:
-            data = b"".join(found.esc_bytes(index))
-        assert data == b"".join(e.data for e in bench.entries if e.kind == 1 and e.esc == index)
-        dump = tmp_path / f"{index}.bin"
-        dump.write_bytes(data)
-        with open_input(dump) as plain:
-            assert isinstance(plain, BytesInput)
-            assert plain.times_assumed
-            assert b"".join(plain.esc_bytes(0)) == data
 
 
 def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> None:

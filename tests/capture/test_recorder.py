@@ -140,9 +140,7 @@ def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_room_again_and_it_goes_on_and_the_loss_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     free = 0
     real = os.statvfs(tmp_path)
 
@@ -195,9 +193,7 @@ def test_what_somebody_else_is_writing_stays(tmp_path: Path) -> None:
     first.it.close()
 
 
-def test_a_disk_that_fails_costs_what_is_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = threading.Event()
     real = os.write
 
@@ -224,9 +220,7 @@ def test_a_disk_that_fails_costs_what_is_counted(
     recorded(tmp_path, "was not closed")
 
 
-def test_a_disk_that_stands_still_holds_nobody_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stuck, go_on = threading.Event(), threading.Event()
     real = os.fdatasync
 
@@ -273,7 +267,7 @@ def test_a_folder_that_cannot_be_used_is_said_at_once_or_waited_for(tmp_path: Pa
     assert bed.closed() == (entries(3, 3), 3, [True, False])
 
 
-def test_another_file_is_never_overwritten_nor_a_link_followed(
+def test_no_file_is_overwritten_nor_link_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "urandom", lambda n: bytes(n))
@@ -291,9 +285,7 @@ def test_another_file_is_never_overwritten_nor_a_link_followed(
     assert "cannot be written" in bed.it.reports(0)[0].text
 
 
-def test_the_wall_clock_that_is_set_is_followed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wall_clock_that_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now, shift = 10 * SECOND, 1_700_000_000 * SECOND
     monkeypatch.setattr(time, "time_ns", lambda: now + shift)  # before the thread asks for it
     bed = Bed(tmp_path, lambda: now)

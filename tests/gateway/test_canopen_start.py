@@ -24,9 +24,7 @@ def gateway() -> Gateway:
     return Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
 
 
-def test_an_interface_that_goes_down_again_before_a_frame_was_sent_makes_the_nodes_boot_when_it_is_up() -> (
-    None
-):
+def test_nodes_boot_again_when_an_interface_was_down() -> None:
     made = gateway()
     made.start(0)
     assert [f.can_id for f in made.take_frames(0)] == [0x701]
@@ -40,36 +38,30 @@ def test_an_interface_that_goes_down_again_before_a_frame_was_sent_makes_the_nod
         assert [(f.can_id, f.data) for f in made.take_frames(now)] == [(0x701, b"\0")]
 
 
-def refused(tmp_path: Path, eds: bytes = b"", dbc: str = "") -> str:
-    tables: dict[str, object] = {"esc": [{"port": "a"}, {"port": "b"}]}
-    canopen: dict[str, object] = {"enabled": True, "store": str(tmp_path)}
-    if eds:
-        (tmp_path / "my.eds").write_bytes(eds)
-        canopen["eds"] = str(tmp_path / "my.eds")
-    if dbc:
-        (tmp_path / "my.dbc").write_text(dbc)
-        tables["dbc"] = {"file": str(tmp_path / "my.dbc")}
-    with pytest.raises(UserError) as caught:
-        assemble(parse({**tables, "canopen": canopen}, "test"))
-    (problem,) = caught.value.problems
-    return problem
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (0x182, "Volts: id 182h is used by TPDO 1 of CANopen node 2"),
+        (0x80, "SYNC"),
+        (0x581, "SDO answers of CANopen node 1"),
+    ],
+)
+def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused_by_name(
+    tmp_path: Path, number: int, said: str
+) -> None:
+    text = f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Logger\nBO_ {number} Volts: 8 Gw\n'
+    text += ' SG_ esc2BatteryVoltage : 0|16@1+ (0.01,0) [0|0] "V" Logger\n'
+    (tmp_path / "my.dbc").write_text(text)
+    tables = {
+        "esc": [{"port": "a"}, {"port": "b"}],
+        "canopen": {"enabled": True, "store": str(tmp_path)},
+        "dbc": {"file": str(tmp_path / "my.dbc")},
+    }
+    with pytest.raises(UserError, match=said):
+        assemble(parse(tables, "test"))
 
 
-def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused_by_name(tmp_path: Path) -> None:
-    message = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Logger\nBO_ {} Volts: 8 Gw\n SG_ esc2BatteryVoltage : 0|16@1+ (0.01,0) [0|0] "V" Logger\n'
-    said = refused(tmp_path, dbc=message.format(0x182))
-    assert "Volts: id 182h is used by TPDO 1 of CANopen node 2" in said
-    assert "SYNC" in refused(tmp_path, dbc=message.format(0x80))
-    assert "SDO answers of CANopen node 1" in refused(tmp_path, dbc=message.format(0x581))
-
-
-def test_an_eds_that_gives_two_nodes_one_cob_id_is_refused(tmp_path: Path) -> None:
-    eds = shipped("eds/kontronik_esc.eds").read_bytes()
-    said = refused(tmp_path, eds.replace(b"DefaultValue=$NODEID+0x80\r", b"DefaultValue=0xA0\r"))
-    assert "COB-ID 0A0h is that of 1014h:00 of node 1 and of 1014h:00 of node 2" in said
-
-
-def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(
+def test_a_pdo_with_error_code_and_register_is_sent_when_they_change(
     tmp_path: Path,
 ) -> None:
     eds = shipped("eds/kontronik_esc.eds").read_bytes()

@@ -81,7 +81,7 @@ NO_BEC_CURRENT = 0xFFFF
 
 
 @pytest.mark.parametrize(("device", "then"), [(Device.JIVEPRO, NO_BEC_CURRENT), (Device.KOSMIK, 5)])
-def test_a_jivepros_bec_current_stays_unavailable_when_its_information_has_expired(
+def test_a_jivepros_bec_current_stays_unavailable_without_information(
     device: Device, then: int
 ) -> None:
     bench = Bench(BEC_CURRENT)
@@ -104,9 +104,7 @@ def test_after_an_outage_of_the_bus_what_has_no_cycle_is_sent_again() -> None:
 @pytest.mark.parametrize(
     ("kind", "name", "per_second"), [("", "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)]
 )
-def test_counters_in_messages_without_a_cycle_do_not_go_stale(
-    kind: str, name: str, per_second: int
-) -> None:
+def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_second: int) -> None:
     unit = "s" if name == "Uptime" else ""
     bench = Bench(f' SG_ {name} : 0|32@1+ (1,0) [0|0] "{unit}" Car\n', kind)
     good = wire(battery_voltage=5000)
@@ -141,18 +139,6 @@ def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others() -> 
         sent += [data[0] for data in bench.read(wire(battery_voltage=n))]
     assert sent.count(0) >= 297
     assert sent.count(1) >= 9 and sent.count(2) >= 9
-
-
-def test_information_that_runs_out_is_not_available_on_every_page() -> None:
-    bench = Bench(pages("MinBatteryVoltage", "MaxBatteryVoltage"))
-    sent = bench.read(
-        encode(InfoData(min_battery_voltage=1, max_battery_voltage=2), codec.Layout.V4)
-    )
-    while bench.now < INFO_TIMEOUT_NS + SECOND:
-        sent += bench.read(wire())
-    for page, value in ((0, b"\1\0"), (1, b"\2\0")):
-        shown = [data[1:3] for data in sent if data[0] == page]
-        assert value in shown and shown[-1] == b"\xff\xff"
 
 
 def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:

@@ -170,7 +170,7 @@ def test_behind_a_restart_the_node_boots_and_says_8140h_as_soon_as_the_queue_run
     assert bench.gateway.status.bus_off_count == 1
 
 
-def test_a_driver_that_goes_on_telling_of_bus_off_behind_a_restart_does_not_make_the_node_boot_twice(
+def test_a_driver_that_reports_bus_off_late_makes_one_boot_up(
     bench: Bench,
     kernel: Kernel,
 ) -> None:
@@ -200,9 +200,7 @@ def test_a_controller_that_nobody_restarts_costs_nothing_and_is_said_with_the_re
     assert sum("restart-ms is 0" in line for line in caplog.messages) == 1
 
 
-def test_an_interface_that_is_missing_at_start_makes_one_boot_up_when_it_comes(
-    bench: Bench, kernel: Kernel
-) -> None:
+def test_an_interface_that_comes_late_makes_one_boot_up(bench: Bench, kernel: Kernel) -> None:
     kernel.facts = LinkFacts(exists=False)
     Port.there = False
     bench.start()
@@ -216,9 +214,7 @@ def test_an_interface_that_is_missing_at_start_makes_one_boot_up_when_it_comes(
     assert told(bench.take()) == []
 
 
-def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(
-    bench: Bench, kernel: Kernel
-) -> None:
+def test_old_news_of_a_link_does_not_close_what_was_opened(bench: Bench, kernel: Kernel) -> None:
     bench.begin()
     kernel.facts = LinkFacts(exists=False)
     Port.there = False
@@ -290,7 +286,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> 
     side.close()
 
 
-def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
+def test_a_bus_that_stood_still_gets_no_backlog(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
@@ -317,9 +313,7 @@ def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
     assert "CAN can0: frames are sent again, after 4.0 s" in caplog.messages
 
 
-def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_saturated_bus_is_no_dead_adapter(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
     monkeypatch.setattr(Port, "reports_full", False)
     bench.start()

@@ -18,7 +18,7 @@ def told(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
     return caplog
 
 
-def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(
+def test_a_condition_is_one_line_at_each_end(
     told: pytest.LogCaptureFixture,
 ) -> None:
     conditions = FaultLog()
@@ -34,7 +34,7 @@ def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(
     assert conditions.reason("port") == ""
 
 
-def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(
+def test_what_comes_and_goes_is_summed_up_once_a_minute(
     told: pytest.LogCaptureFixture,
 ) -> None:
     conditions = FaultLog()
@@ -60,7 +60,7 @@ def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(
     assert told.messages[-1] == "lost"
 
 
-def test_a_condition_that_lasts_while_it_is_summed_up_is_said_to_last(
+def test_a_condition_that_lasts_is_said_to_last(
     told: pytest.LogCaptureFixture,
 ) -> None:
     conditions = FaultLog()

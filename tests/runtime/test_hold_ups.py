@@ -125,7 +125,7 @@ def test_the_loop_looks_at_its_ports_four_times_within_the_shortest_time_out_wha
     loop.close()
 
 
-def test_a_port_that_never_drains_is_as_old_as_the_wire_allows_and_no_older(
+def test_a_port_that_never_drains_is_as_old_as_the_wire_allows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A pseudo terminal whose writer is faster than any wire; and more than one read in a port that waited."""
@@ -143,7 +143,7 @@ def test_a_port_that_never_drains_is_as_old_as_the_wire_allows_and_no_older(
     loop.close()
 
 
-def test_what_waited_beyond_one_read_is_dated_by_its_place_in_the_stream(
+def test_what_waited_beyond_one_read_is_dated_by_its_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World()
@@ -204,7 +204,7 @@ def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     assert len(fed) == 0 if blind else len(fed) > 8
 
 
-def test_bytes_that_came_while_an_interface_was_tried_again_are_as_old_as_that(
+def test_bytes_that_came_while_the_interface_was_tried_are_old(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World()
@@ -250,7 +250,7 @@ def test_a_bus_that_is_slower_than_what_comes_has_the_newest_values_in_order(
     loop.close()
 
 
-def test_a_frame_that_came_while_a_turn_was_held_up_is_as_old_as_it_is(
+def test_a_frame_that_came_in_a_hold_up_is_as_old_as_it_is(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """However the wall clock was set meanwhile: it came between the two looks at the bus."""

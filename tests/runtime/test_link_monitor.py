@@ -84,9 +84,7 @@ def heard(*datagrams: bytes | int, name: str = "can0") -> list[LinkFacts]:
         (77, None),
     ],
 )
-def test_state_bit_rate_restart_time_and_error_counters_of_a_controller(
-    number: int, state: CanState | None
-) -> None:
+def test_what_a_controller_reports(number: int, state: CanState | None) -> None:
     data = can_data(state=number, bitrate=125_000, restart_ms=0, counters=(130, 7))
     assert heard(link_message(can=data)) == [
         LinkFacts(True, True, "can", state, 125_000, 0, (130, 7))
@@ -121,9 +119,7 @@ def test_after_an_overrun_the_kernel_is_asked_anew() -> None:
 
 
 @given(st.integers(1, len(LINK)), st.integers(0, 255), st.integers(0, 200), st.binary(max_size=200))
-def test_a_damaged_message_and_rubbish_raise_nothing(
-    end: int, value: int, place: int, rubbish: bytes
-) -> None:
+def test_damage_and_rubbish_raise_nothing(end: int, value: int, place: int, rubbish: bytes) -> None:
     message = bytearray(LINK)
     message[min(place, len(message) - 1)] = value
     heard(bytes(message[:end]), rubbish or b"?")

@@ -64,9 +64,7 @@ def mode(path: Path) -> int:
 # --- there and back
 
 
-def test_what_was_saved_is_loaded_by_the_next_process(
-    tmp_path: Path, store: ParameterStore
-) -> None:
+def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterStore) -> None:
     assert store.load("a") == (Stored(), None)
     assert list(tmp_path.iterdir()) == [], "nothing is made by reading"
     assert put(store, "a", OLD) is None
@@ -132,18 +130,6 @@ def test_a_slow_disk_holds_up_nobody_and_results_come_in_order(
     assert [number_of(store.load(f"esc{n}")[0]) for n in range(3)] == [9, 7, 8]
 
 
-def test_a_system_without_a_thread_to_give_refuses_the_saving(
-    store: ParameterStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def start(thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(threading.Thread, "start", start)
-        assert not store.save("esc1", OLD)
-    assert put(store, "esc1", OLD) is None
-
-
 # --- damage
 
 
@@ -204,9 +190,7 @@ def test_a_file_that_cannot_be_moved_or_read_is_not_written_over(
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
-def test_a_left_over_temporary_file_is_never_read_and_hinders_no_saving(
-    tmp_path: Path, store: ParameterStore
-) -> None:
+def test_a_left_over_temporary_file_is_never_read(tmp_path: Path, store: ParameterStore) -> None:
     folder = place(tmp_path, OLD)
     for left_over in (NEW, bytes(10_000)):
         (folder / "esc1.params.tmp").write_bytes(left_over)
@@ -401,7 +385,7 @@ def test_at_every_instant_a_loss_of_power_finds_the_old_or_the_new_content(
     assert faults(files, steps) == []
 
 
-def test_at_every_instant_of_moving_a_damaged_file_it_is_somewhere(
+def test_a_damaged_file_is_somewhere_at_every_instant(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = place(tmp_path, b"rubbish")

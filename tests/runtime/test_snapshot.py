@@ -81,9 +81,7 @@ def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
         assert (esc["link"], esc["fresh"], esc["layout"]) == ("ok", True, "V4")
 
 
-def test_values_are_null_as_soon_as_they_are_older_than_the_time_out_whatever_the_gateway_was_told() -> (
-    None
-):
+def test_values_older_than_the_time_out_are_null() -> None:
     bench = Bench(1)
     bench.run(1)
     heard = bench.gateway.escs[0].live_ns

@@ -186,6 +186,15 @@ def test_a_folder_that_is_missing_is_told_once_and_the_file_comes_with_it(tmp_pa
     statistics.close()
 
 
+def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "device")
+    statistics = Statistics(tmp_path / "device")
+    publish(statistics, 1)
+    assert "no plain file" in reports(statistics, 1)[0].text
+    statistics.close()
+    assert stat.S_ISFIFO((tmp_path / "device").stat().st_mode)
+
+
 def test_a_full_disk_leaves_the_old_document_and_no_half_one(
     file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,18 +218,7 @@ def test_a_full_disk_leaves_the_old_document_and_no_half_one(
     put(statistics, file, 3)
 
 
-def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
-    target = tmp_path / "device"
-    os.mkfifo(target)
-    statistics = Statistics(target)
-    publish(statistics, 1)
-    (report,) = reports(statistics, 1)
-    assert report.begins and "no plain file" in report.text
-    statistics.close()
-    assert stat.S_ISFIFO(target.stat().st_mode)
-
-
-def test_a_document_has_the_recorder_as_it_was_when_it_was_published(
+def test_a_document_has_the_recorder_as_it_was(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The recorder's thread goes on while the statistics' thread makes it."""
