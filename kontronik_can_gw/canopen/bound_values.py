@@ -40,23 +40,23 @@ def bits_of(variable: Variable) -> int:
 
 def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatus) -> None:
     """Let the objects that show a value of the ESC or of the gateway do so."""
+    source = (esc, gateway)
     for (index, sub), bound in bindings_of(esc.protocol).items():
         variable = dictionary.get(index, sub)
         if variable is not None:
             variable.bound = bound
-            ends = range_of(variable.entry.data_type)
-            variable.read = partial(_read, bound, ends, dictionary, (esc, gateway))
+            variable.read = partial(_read, bound, variable.entry.data_type, dictionary, source)
 
 
 def _read(
     bound: Bound,
-    ends: tuple[int, int],
+    data_type: int,
     dictionary: Dictionary,
     source: tuple[EscTelemetry, GatewayStatus],
     now: int,
 ) -> Value:
     """The value of an object by SDO. Without one it aborts, or shows what 2100h:5 says."""
-    esc, (low, high) = source[0], ends
+    esc, (low, high) = source[0], range_of(data_type)
     behaviour = dictionary.number(at.SETTINGS, 5)
     value, why = None, Abort.NO_DATA
     if bound.source.group is not Group.LIVE or esc.live is not None:

@@ -92,19 +92,16 @@ _SERVER = {(0x1200, 1): SDO_REQUEST, (0x1200, 2): SDO_ANSWER}
 _MANDATORY = {(0x1000, 0), (0x1001, 0), (0x1018, 1)}
 
 
-def check_eds(
-    eds: Eds, escs: EscSettings | Sequence[EscSettings], node_ids: Iterable[int] = (1,)
-) -> None:
+def check_eds(eds: Eds, escs: Sequence[EscSettings], node_ids: Iterable[int] = (1,)) -> None:
     """Whether nodes with these node-IDs, for these ESCs, can be built from an EDS. UserError with every mistake."""
-    all_escs = [escs] if isinstance(escs, EscSettings) else escs
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
-    found = (*_objects(entries), *_settings(entries, all_escs))
+    found = (*_objects(entries), *_settings(entries, escs))
     problems = [f"{entry.place} {entry.name}: {what}" for entry, what in found]
     problems += _missing(entries)
     if not problems:
         numbers = list(node_ids) or [1]  # where all wait for LSS any node-ID may come
         for node_id in numbers:
-            problems += _defaults(eds, all_escs[0], node_id)
+            problems += _defaults(eds, escs[0], node_id)
         problems += _shared_ids(Dictionary(eds), numbers)
     if problems:
         raise UserError(*(f"{eds.name}: {what}" for what in dict.fromkeys(problems)))

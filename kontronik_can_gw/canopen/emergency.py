@@ -58,18 +58,10 @@ class Emergencies:
         self._open = False
         self._last_ns = -NEVER
         self._risen = False  # since the last reset something was wrong
-        self._bind()
-
-    def _bind(self) -> None:
-        bind = self._dictionary.bind
+        bind = dictionary.bind
         bind(0x1001, read=lambda _now: self.register)
-        bind(
-            0x1003,
-            read=lambda _now: len(self.history),
-            check=_only_zero,
-            written=self._clear_history,
-        )
-        for variable in self._dictionary.subs(0x1003):
+        bind(0x1003, read=lambda _now: len(self.history), check=_only_zero, written=self._clear)
+        for variable in dictionary.subs(0x1003):
             variable.read = partial(self._kept, variable.entry.sub)
         bind(0x1014, check=self._check_cob_id)
         bind(0x1015, written=lambda _now: self.configure(self._node_id))
@@ -215,7 +207,7 @@ class Emergencies:
             raise SdoAbort(Abort.NO_DATA)
         return self.history[number - 1]
 
-    def _clear_history(self, _now: int) -> None:
+    def _clear(self, _now: int) -> None:
         self.history.clear()
 
     def _check_cob_id(self, value: int) -> None:

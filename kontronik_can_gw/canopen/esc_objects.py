@@ -1,51 +1,43 @@
 """What a node does for its ESC: settings 2100h, status register 1002h, texts of 2010h, statistics 2102h, emergencies of ESC and link."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, signature
-from kontronik_can_gw.canopen.emergency import Emergencies
+from kontronik_can_gw.canopen.dictionary import signature
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
+from kontronik_can_gw.esc.telemetry import EscSettings, Event, LinkState
 from kontronik_can_gw.gateway_status import GatewayStatus
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.canopen.node import Node
 
 
 class EscObjects:
-    """``changed`` is called with other settings of the ESC, ``lost`` with the time when its telemetry is lost."""
+    """``changed`` is called with other settings of the ESC."""
 
     def __init__(
-        self,
-        dictionary: Dictionary,
-        esc: EscTelemetry,
-        gateway: GatewayStatus,
-        emergencies: Emergencies,
-        expected: int | None,
-        changed: Callable[[EscSettings], None],
-        lost: Callable[[int], None],
+        self, node: "Node", gateway: GatewayStatus, changed: Callable[[EscSettings], None]
     ) -> None:
-        self._dictionary = dictionary
-        self._esc = esc
+        self._dictionary = dictionary = node.dictionary
+        self._esc = esc = node.esc
         self._base = esc.settings
         self._errors = esc.protocol.by_name.get("operating_errors")
         self._gateway = gateway
-        self._emergencies = emergencies
-        self._expected = expected
+        self._emergencies = node.emergencies
+        self._nmt = node.nmt
+        self._expected = node.settings.device
         self._changed = changed
-        self._lost = lost
         self._live = False  # for the edge of 1029h:2
         dictionary.bind(0x1002, read=self._status_register)
         dictionary.bind(at.INFO, 6, read=self._device_name)
         dictionary.bind(at.INFO, 7, read=self._firmware)
         for variable in dictionary.subs(at.SETTINGS):
             variable.written = self.apply_settings
-        dictionary.bind(
-            at.RESET_STATISTICS,
-            1,
-            check=signature(b"rset"),
-            written=lambda _now: esc.reset_statistics(),
-        )
+        reset = at.RESET_STATISTICS, 1
+        dictionary.bind(*reset, check=signature(b"rset"), written=lambda _: esc.reset_statistics())
 
     def apply_settings(self, now: int) -> None:
         """Take over 2100h."""
@@ -77,7 +69,7 @@ class EscObjects:
             device = esc.protocol.value("device_raw", esc.info)
             found.set(GatewayError.OTHER_DEVICE, device != self._expected, now)
         if self._live and esc.live is None and link in (LinkState.LOST, LinkState.PORT_ERROR):
-            self._lost(now)
+            self._nmt.behave(2, now)
         self._live = esc.live is not None
 
     # --- objects

@@ -32,16 +32,11 @@ class Identity:
         self._parameters = parameters
         self._taken = taken
         self._boot = boot
-        dictionary.bind(at.NODE_ID, 1, read=lambda _now: self.active_node_id)
-        dictionary.bind(
-            at.NODE_ID,
-            2,
-            read=lambda _now: self.pending_node_id,
-            check=self._check_node_id,
-            written=self._node_id_written,
-        )
-        dictionary.bind(at.NODE_ID, 3, read=lambda _now: settings.bitrate)
-        dictionary.bind(at.NODE_ID, 4, read=lambda _now: settings.bitrate)
+        bind = dictionary.bind
+        bind(at.NODE_ID, 1, read=lambda _now: self.active_node_id)
+        bind(at.NODE_ID, 2, read=self._pending, check=self._check_node_id, written=self._written)
+        bind(at.NODE_ID, 3, read=lambda _now: settings.bitrate)
+        bind(at.NODE_ID, 4, read=lambda _now: settings.bitrate)
 
     @property
     def identity(self) -> tuple[int, int, int, int]:
@@ -84,5 +79,8 @@ class Identity:
         if self._taken(value):
             raise SdoAbort(Abort.INCOMPATIBLE)
 
-    def _node_id_written(self, _now: int) -> None:
+    def _pending(self, _now: int) -> int:
+        return self.pending_node_id
+
+    def _written(self, _now: int) -> None:
         self._set_pending(self._dictionary.number(at.NODE_ID, 2))

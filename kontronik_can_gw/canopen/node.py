@@ -73,15 +73,8 @@ class Node:
         self.lss = LssSlave(self.identity, partial(self._send, LSS_ANSWER))
         bind_values(dictionary, esc, gateway)
         self.tpdos = Tpdos(dictionary, partial(owner.slot, number), taken)
-        self._esc_objects = EscObjects(
-            dictionary,
-            esc,
-            gateway,
-            self.emergencies,
-            settings.device,
-            partial(owner.settings_changed, number),
-            partial(self.nmt.behave, 2),
-        )
+        changed = partial(owner.settings_changed, number)
+        self._esc_objects = EscObjects(self, gateway, changed)
         self._timers = (self._producer, self.consumer, self.sdo, self.emergencies)
         dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
         dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS

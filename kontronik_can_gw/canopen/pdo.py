@@ -49,15 +49,15 @@ class Tpdo:
         self._sync_start = 0
         self._syncs = 0
         self._sync_waits = False
-        bind = dictionary.bind
-        bind(index, COB_ID, check=self._check_cob_id, written=self.configure)
-        bind(index, TYPE, check=self._check_type, written=self.configure)
-        bind(index, INHIBIT, check=self._check_while_invalid, written=self.configure)
-        bind(index, EVENT_TIMER, written=self.configure)
-        bind(index, SYNC_START, check=self._check_sync_start, written=self.configure)
-        bind(mapping, check=self._check_count, written=self.configure)
+        bind, written, check_entry = dictionary.bind, self.configure, self._check_entry
+        bind(index, COB_ID, check=self._check_cob_id, written=written)
+        bind(index, TYPE, check=self._check_type, written=written)
+        bind(index, INHIBIT, check=self._check_while_invalid, written=written)
+        bind(index, EVENT_TIMER, written=written)
+        bind(index, SYNC_START, check=self._check_sync_start, written=written)
+        bind(mapping, check=self._check_count, written=written)
         for variable in self.mappings:
-            bind(mapping, variable.entry.sub, check=self._check_entry, written=self.configure)
+            bind(mapping, variable.entry.sub, check=check_entry, written=written)
 
     @property
     def sent(self) -> int:

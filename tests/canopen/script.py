@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import ndiff
+from itertools import zip_longest
 from pathlib import Path
 from typing import Protocol
 
@@ -136,27 +137,16 @@ def play_lines(talker: Talker, lines: Sequence[Line]) -> None:
         time = ms(talker.now)  # a restart begins with 0
         actual += talker.heard_lines()
     wanted = [_padded(line) for _, line in expected]
-    got = [_with_wildcards(*pair) for pair in zip(actual, wanted, strict=False)] + actual[
-        len(wanted) :
-    ]
-    if got == wanted:
-        return
-    at = next(
-        (n for n, pair in enumerate(zip(got, wanted, strict=False)) if pair[0] != pair[1]),
-        min(len(got), len(wanted)),
-    )
-    place = (
-        expected[at][0]
-        if at < len(expected)
-        else f"after {expected[-1][0]}"
-        if expected
-        else "at the begin"
-    )
-    diff = "\n".join(ndiff(wanted, got))
-    raise AssertionError(
-        f"{place}: expected {wanted[at] if at < len(wanted) else 'nothing'!r}, "
-        f"got {got[at] if at < len(got) else 'nothing'!r}; expected (-), got (+):\n{diff}"
-    )
+    got = [_with_wildcards(*pair) for pair in zip(actual, wanted, strict=False)]
+    got += actual[len(wanted) :]
+    pairs = zip_longest(wanted, got, fillvalue="nothing")
+    for at, (line, other) in enumerate(pairs):
+        if line != other:
+            last = expected[-1][0] if expected else "the begin"
+            place = expected[at][0] if at < len(expected) else f"after {last}"
+            diff = "\n".join(ndiff(wanted, got))
+            text = f"expected {line!r}, got {other!r}; expected (-), got (+):\n{diff}"
+            raise AssertionError(f"{place}: {text}")
 
 
 def bytes_of(text: str) -> bytes:

@@ -28,7 +28,7 @@ def problems(text: str | bytes) -> tuple[str, ...]:
     """What is wrong with an EDS that nodes 1 and 2 are to have, () for nothing."""
     data = text if isinstance(text, bytes) else text.encode("ascii")
     try:
-        check_eds(reader.load(data, "mine.eds"), EscSettings(), (1, 2))
+        check_eds(reader.load(data, "mine.eds"), [EscSettings()], (1, 2))
     except UserError as error:
         return error.problems
     return ()

@@ -41,7 +41,7 @@ def pdos_with(index: int) -> frozenset[int]:
 def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
     """What a node says, with its times, to a session in which every service has something to do. No SDO: that shows what is there."""
     eds = changed(load(without(DATA, dropped), "my.eds"), EVERY_SYNC)
-    check_eds(eds, EscSettings())
+    check_eds(eds, [EscSettings()])
     bench = Bench(eds=eds, boot=False, self_start=self_start)
     bench.can_state("ERROR_ACTIVE")
     bench.put(0, "01 00")
@@ -103,7 +103,7 @@ def test_only_the_objects_of_a_pdo_take_it_away(number: int) -> None:
 
 def problems(data: bytes, node_ids: tuple[int, ...] = (1,)) -> list[str]:
     with pytest.raises(UserError) as caught:
-        check_eds(load(data, "my.eds"), EscSettings(), node_ids)
+        check_eds(load(data, "my.eds"), [EscSettings()], node_ids)
     return list(caught.value.problems)
 
 
@@ -115,19 +115,19 @@ def test_a_cob_id_of_emergencies_that_are_not_in_the_eds_is_taken() -> None:
 
 def test_a_default_pdo_that_maps_nothing_is_named() -> None:
     data = changed(shipped_eds(), {(0x1A01, 0): {"default": 0}})
-    check_eds(data, EscSettings())  # a board that ran so with 0.5.0 goes on
+    check_eds(data, [EscSettings()])  # a board that ran so with 0.5.0 goes on
     setup = CanopenSetup(data, (NodeSettings(5),), (Stored(),), (EscSettings(),))
     (said,) = without_objects(setup.nodes(setup.esc_settings((EscSettings(),))))
     assert said.startswith("TPDO 2 is never sent: 1A01h maps nothing, so 1801h:01 cannot be valid.")
 
 
 def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
-    check_eds(shipped_eds(), EscSettings(), range(1, 128))
+    check_eds(shipped_eds(), [EscSettings()], range(1, 128))
 
 
 def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F").encode()
-    check_eds(load(text, "my.eds"), EscSettings(), [1])
+    check_eds(load(text, "my.eds"), [EscSettings()], [1])
     said = "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3"
     assert said in problems(text, (3,))[0]
 
@@ -137,7 +137,7 @@ def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -
     for key, value in (("DataType", "0x0005"), ("HighLimit", "0xFF"), ("DefaultValue", "0xFA")):
         text = with_key(text, "2100sub4", key, value)
     eds = load(text.encode(), "my.eds")
-    check_eds(eds, EscSettings())
+    check_eds(eds, [EscSettings()])
     said = "2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"
     with pytest.raises(UserError, match=said):
         check_eds(eds, [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
