@@ -102,7 +102,7 @@ class Feeder:
         self.ports: list[str] = self._line()["ports"]
 
     def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
-        """What the feeder says next."""
+        """What the feeder says next; its lines come apart, and its end wakes who waits for one that was read with another."""
         assert self.process.stdout is not None
         deadline = time.monotonic() + self._limit_s
         while not select.select([self.process.stdout], [], [], 0.2)[0]:
