@@ -71,15 +71,6 @@ TIERS = {
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
 """Of one step: the two that CI runs end within its 90 minutes whatever happens."""
 ENABLE_UML = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
-CROSS = (
-    *(
-        "arm-none-eabi-gcc",
-        "arm-linux-gnueabihf-gcc",
-        "aarch64-linux-gnu-gcc",
-        "s390x-linux-gnu-gcc",
-    ),
-    *("qemu-system-arm", "qemu-arm"),
-)
 ENABLE_CROSS = (
     "sudo apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi gcc-arm-linux-gnueabihf libc6-dev-armhf-cross "
     "gcc-aarch64-linux-gnu libc6-dev-arm64-cross gcc-s390x-linux-gnu libc6-dev-s390x-cross qemu-system-arm qemu-user"
@@ -87,26 +78,21 @@ ENABLE_CROSS = (
 ENABLE_VCAN = (
     f"{ENABLE_UML}  (or, on Ubuntu, linux-modules-extra-{platform.release()} can-utils iproute2)"
 )
+WHEELS = "aarch64-linux-gnu-gcc arm-linux-gnueabihf-gcc qemu-arm"
+ENABLE_WHEELS = "gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user"
 NEEDS = {
-    **dict.fromkeys(("vcan", "masters"), (("ip", "candump", "vcan"), ENABLE_VCAN)),
-    **dict.fromkeys(("faults", "soak"), (("linux.uml",), ENABLE_UML)),
-    "qemu": (("qemu-system-x86_64",), "sudo tests/vm/setup.sh qemu"),
-    "wheels": (
-        ("aarch64-linux-gnu-gcc", "arm-linux-gnueabihf-gcc", "qemu-arm"),
-        "sudo apt-get install gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user",
+    **dict.fromkeys(("vcan", "masters"), ("ip candump vcan", ENABLE_VCAN)),
+    **dict.fromkeys(("faults", "soak"), ("linux.uml", ENABLE_UML)),
+    "qemu": ("qemu-system-x86_64", "sudo tests/vm/setup.sh qemu"),
+    "wheels": (WHEELS, f"sudo apt-get install {ENABLE_WHEELS}"),
+    "machines": (
+        f"{WHEELS} arm-none-eabi-gcc s390x-linux-gnu-gcc qemu-system-arm",
+        ENABLE_CROSS,
     ),
-    "machines": (CROSS, ENABLE_CROSS),
-    "fuzz": (("clang",), "sudo apt-get install clang"),
+    "fuzz": ("clang", "sudo apt-get install clang"),
     "deb": (
-        (
-            "debootstrap",
-            "lintian",
-            "linux.uml",
-            "aarch64-linux-gnu-gcc",
-            "arm-linux-gnueabihf-gcc",
-            "qemu-arm",
-        ),
-        f"{ENABLE_UML} debootstrap lintian gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user",
+        f"{WHEELS} debootstrap lintian linux.uml",
+        f"{ENABLE_UML} debootstrap lintian {ENABLE_WHEELS}",
     ),
 }
 """What a step needs besides Python, "vcan" being a kernel with one, and the line that enables it."""
@@ -152,8 +138,7 @@ def read_report(report: Path, result: Result) -> None:
 
 def missing(step: str) -> str:
     """What a step needs and is not there."""
-    needed, _ = NEEDS.get(step, ((), ""))
-    for program in needed:
+    for program in NEEDS.get(step, ("", ""))[0].split():
         if program == "vcan":
             which = ["python", "tests/vm/vm_run.py", "--which"]
             if subprocess.run(which, cwd=PROJECT, capture_output=True, check=False).returncode:

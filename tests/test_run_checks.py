@@ -80,7 +80,7 @@ def test_a_step_without_tests_is_one_check(
 def test_what_is_missing_is_not_run_and_the_remedy_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(checks.NEEDS, "faults", (("no-such-program",), "sudo make one"))
+    monkeypatch.setitem(checks.NEEDS, "faults", ("no-such-program", "sudo make one"))
     result = checks.run("faults", 60, tmp_path, (), False)
     assert (result.state, result.note) == ("not run", "there is no no-such-program")
     assert checks.summarize([result], strict=False) == 0

@@ -3,11 +3,8 @@
 import os
 import sys
 
-from programs import PROGRAMS, Measured, median, once
+from programs import CANOPEN, EVERYTHING, PROGRAMS, Measured, median, once
 from registry import Context, Figure, LeftOut, benchmark, judged
-
-CANOPEN = '[canopen]\nenabled = true\nself_start = true\nstore = "store"\n'
-
 
 # --- CPU time
 
@@ -137,14 +134,6 @@ def delay(context: Context) -> list[Figure]:
     figures.append(judged("ours / c, median", value, "x", "<= 1.1"))
     figures.append(judged("ours, 99 %", of_runs(found["ours"], "p99"), "us", "<= 2000"))
     return figures
-
-
-EVERYTHING = f"""{CANOPEN}[record]
-directory = "captures"
-[statistics]
-file = "status.json"
-"""
-"""Recorder, status file, nodes."""
 
 
 @benchmark("delay-full", "the same with 8 ESCs, recorder, statistics, CANopen and a polling master")

@@ -26,6 +26,9 @@ from registry import HERE, Context
 FIVE = HERE / "five.dbc"
 STANDIN = HERE / "standin.py"
 PROGRAMS = ("c", "ours", "obvious")
+CANOPEN = '[canopen]\nenabled = true\nself_start = true\nstore = "store"\n'
+EVERYTHING = f'{CANOPEN}[record]\ndirectory = "captures"\n[statistics]\nfile = "status.json"\n'
+"""Nodes, recorder, status file."""
 _PRIORITY = 80
 """Of the feeder, where we may: what it measures is not to be its own delay."""
 
@@ -88,21 +91,18 @@ def end(process: "subprocess.Popen[str]", patience_s: float = 3.0) -> None:
 class Feeder:
     """The ESCs, and the other end of the bus."""
 
-    def __init__(
-        self, context: Context, escs: int, *options: str, seconds: float | None = None
-    ) -> None:
+    def __init__(self, context: Context, escs: int, *options: str) -> None:
         self.bus = f"kontronik-{uuid.uuid4().hex[:12]}"
         program = context.compiled("feeder.c", "-pthread")
-        length = context.seconds if seconds is None else seconds
         warmup = 0.5 if context.quick else 2.0
-        self._limit_s = length + warmup + 30
-        words = f"--bus {self.bus} --escs {escs} --seconds {length} --warmup {warmup}"
+        self._limit_s = context.seconds + warmup + 30
+        words = f"--bus {self.bus} --escs {escs} --seconds {context.seconds} --warmup {warmup}"
         command = [str(program), *words.split(), "--priority", str(_PRIORITY), *options]
         self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self.ports: list[str] = self._line()["ports"]
 
     def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
-        """What the feeder says next."""
+        """What the feeder says next; its lines come apart, and its end wakes who waits for one that was read with another."""
         assert self.process.stdout is not None
         deadline = time.monotonic() + self._limit_s
         while not select.select([self.process.stdout], [], [], 0.2)[0]:
@@ -194,15 +194,10 @@ def config_text(ports: Sequence[str], dbc: Path, folder: Path, further: str = ""
 
 @contextlib.contextmanager
 def running(
-    context: Context,
-    program: str,
-    escs: int,
-    *options: str,
-    seconds: float | None = None,
-    **further: Any,
+    context: Context, program: str, escs: int, *options: str, **further: Any
 ) -> Iterator[tuple[Feeder, Gateway]]:
     """A feeder and a gateway, both ended at the end."""
-    feeder = Feeder(context, escs, *options, seconds=seconds)
+    feeder = Feeder(context, escs, *options)
     try:
         gateway = Gateway(context, program, feeder, **further)
         try:

@@ -9,21 +9,25 @@ import sys
 import tempfile
 import time
 import uuid
+from dataclasses import replace
 from pathlib import Path
 
-from programs import STANDIN, config_text, end, median, running, start
+from programs import (
+    CANOPEN,
+    EVERYTHING,
+    STANDIN,
+    config_text,
+    end,
+    median,
+    running,
+    start,
+)
 from registry import ROOT, Context, Figure, benchmark, judged
 
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.lean import without_asammdf
 
 SHIPPED = ROOT / "dbc" / "kontronik_esc.dbc"
-CANOPEN = '[canopen]\nenabled = true\nnode_id = 1\nstore = "{folder}/store"\n'
-EVERYTHING = (
-    CANOPEN
-    + '[record]\ndirectory = "{folder}/captures"\n'
-    + '[statistics]\nfile = "{folder}/status.json"\n'
-)
 _PATIENCE_S = 20.0
 _EXTENDED = 0x80000000
 
@@ -42,7 +46,7 @@ def first_frame_ms(escs: int, config: str) -> float:
         listener.listen(1)
         listener.settimeout(_PATIENCE_S)
         file = folder / "gateway.toml"
-        file.write_text(config_text(ports, SHIPPED, folder, config.format(folder=folder)))
+        file.write_text(config_text(ports, SHIPPED, folder, config))
         command = [sys.executable, str(STANDIN), name, "ours", "run", "-c", str(file)]
         environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
         log = opened.enter_context((folder / "errors").open("w+"))
@@ -109,16 +113,12 @@ def memory(context: Context) -> list[Figure]:
         "8 ESCs, CANopen": (8, CANOPEN, ""),
         "1 ESC, CANopen, recorder": (1, EVERYTHING, ""),
     }
-    seconds = 0.5 if context.quick else 3.0
+    short = replace(context, seconds=min(context.seconds, 3.0))
     rss: dict[str, float] = {}
     with tempfile.TemporaryDirectory(prefix="kontronik-bench-") as made:
         dbc = many_escs_dbc(Path(made))
         for case, (escs, config, _) in cases.items():
-            text = config.format(folder=made)
-            with running(context, "ours", escs, seconds=seconds, dbc=dbc, config=text) as (
-                feeder,
-                gateway,
-            ):
+            with running(short, "ours", escs, dbc=dbc, config=config) as (feeder, gateway):
                 feeder.measure(gateway)
                 rss[case] = rss_mb(gateway.pid)
             context.say(f"{case}: RSS {rss[case]:.1f} MB")

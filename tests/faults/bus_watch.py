@@ -255,11 +255,12 @@ class Judge:
         fed = self.escs[message.esc]
         newest = fed.newest(at_ns + MS)
         true_age = (at_ns - fed.left(newest)) / MS if newest >= 0 else 1e9
-        if age < true_age - self.slack_ns / MS - 5:
+        excess = int((true_age - age - 5) * MS) - self.slack_ns
+        if excess > self.more_ns:
             sent = fed.sent[newest] if newest >= 0 else None
             what = f"{message.name}: an age of {age} ms; the newest is {true_age:.0f} ms old"
-            excess = int((true_age - age) * MS) - self.slack_ns
             self._suspects.append(Wrong(at_ns, what, sent, excess))
+        self.by_more += 0 < excess <= self.more_ns
 
 
 def _both_clocks() -> tuple[int, int]:

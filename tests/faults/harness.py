@@ -377,11 +377,11 @@ class Bench:
         for esc in escs:
             self._excluded[esc].append((begin_ns, end_ns))
 
-    def account(self, row: Row, until_ns: int | None = None) -> list[tuple[int, str]]:
+    def account(self, row: Row) -> list[tuple[int, str]]:
         """Note in a row how many values that were sent since the last account, outside of all faults, never came; when and which."""
-        if until_ns is None:
-            until_ns = time.monotonic_ns() - 150 * MS
+        until_ns = time.monotonic_ns() - 150 * MS
         self._catch_up()
+        self.forgive(until_ns)
         self.watch.settle(self.metronome.stood_still)
         losses = []
         for index, fed in enumerate(self.escs):
@@ -402,6 +402,9 @@ class Bench:
             self._excluded[index] = [x for x in self._excluded[index] if x[1] > until_ns]
         row.lost += len(losses)
         return losses
+
+    def forgive(self, until_ns: int) -> None:
+        """What was sent until then and may be missing on this bench counts as seen."""
 
     def inject(self, fault: Fault, row: Row, given: Any) -> None:
         """One injection of a fault, noted in the row. NotRecovered, and what else it raises, is noted too and raised again."""

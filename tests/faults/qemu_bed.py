@@ -15,7 +15,6 @@ from pathlib import Path
 
 from bus_watch import MS
 from encoding import Identity
-from fault_report import Row
 from feeder import CURRENT, SPEED, FedEsc
 from harness import Bench
 from qemu_adapter import ESC_LINE, Line, SerialAdapter
@@ -184,19 +183,16 @@ class MachineBench(Bench):
             return None
         return self._gateway.process.pid
 
-    def account(self, row: Row, until_ns: int | None = None) -> list[tuple[int, str]]:
-        if until_ns is None:
-            until_ns = time.monotonic_ns() - 150 * MS
+    def forgive(self, until_ns: int) -> None:
         both = SPEED | CURRENT
-        for fed, accounted in zip(self.escs, self._accounted, strict=True):
+        for esc, accounted in zip(self.escs, self._accounted, strict=True):
             newer = 0
-            for n in range(fed.newest(time.monotonic_ns()), accounted - 1, -1):
-                sent = fed.sent[n]
-                if fed.seen[n] == both:
+            for n in range(esc.newest(time.monotonic_ns()), accounted - 1, -1):
+                sent = esc.sent[n]
+                if esc.seen[n] == both:
                     newer = sent
-                elif fed.whole[n] and sent <= until_ns and newer and newer - sent <= SLACK_NS:
-                    fed.seen[n] = both
-        return super().account(row, until_ns)
+                elif esc.whole[n] and sent <= until_ns and newer and newer - sent <= SLACK_NS:
+                    esc.seen[n] = both
 
 
 @contextlib.contextmanager

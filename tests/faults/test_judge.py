@@ -116,6 +116,10 @@ def test_an_age_that_is_told_too_young_is_wrong(judge: Judge) -> None:
     assert settled(judge) == ""
     judge.take(LINK_ID, (100 << place.start).to_bytes(8, "little"), late)
     assert settled(judge) == "Esc1Link: an age of 100 ms; the newest is 1000 ms old"
+    judge.more_ns = SECOND
+    judge.take(LINK_ID, (100 << place.start).to_bytes(8, "little"), late)
+    judge.settle(lambda _begin, _end: 0)
+    assert (judge.wrong_count, judge.by_more) == (1, 1)
 
 
 def test_boot_ups_and_emergencies_are_noted(judge: Judge) -> None:

@@ -17,15 +17,14 @@ Of the environment it gets PATH, HOME, LANG, CI, VIRTUAL_ENV and what starts wit
 or COVERAGE_. Python finds no asammdf in there, which python-can imports where it is installed, and with it numpy and pandas:
 4 s of each process in UML, a minute in QEMU.
 
-Kept in mind in here: UML does not save the AVX-512 registers over a signal, so glibc, OpenSSL and numpy are told to
-leave them alone, and other number crunchers with a dispatcher of their own must stay outside. /dev/kvm may be there
+Kept in mind in here: UML does not save the AVX-512 registers over a signal, so glibc and OpenSSL are told to leave
+them alone, and number crunchers with a dispatcher of their own, as numpy, must stay outside. /dev/kvm may be there
 and not work: QEMU always emulates. SIGKILL leaves UML's children behind: SIGTERM comes first, then the whole group.
 """
 
 import argparse
 import contextlib
 import glob
-import importlib.metadata
 import os
 import re
 import shlex
@@ -113,23 +112,6 @@ def uml_command(job: str, out: int, err: int) -> list[str]:
         con=null ssl=null ssl0=null,fd:{out} ssl1=null,fd:{err}
         uml_dir={job} umid=uml noreboot quiet loglevel=3
     """.split()
-
-
-def uml_guest_environment() -> dict[str, str]:
-    environment = {
-        "GLIBC_TUNABLES": GLIBC_WITHOUT_AVX512,
-        "OPENSSL_ia32cap": OPENSSL_WITHOUT_AVX512,
-    }
-    with contextlib.suppress(OSError, importlib.metadata.PackageNotFoundError, ValueError):
-        with open("/proc/cpuinfo") as cpuinfo:
-            has_avx512 = "avx512f" in cpuinfo.read()
-        major, minor = map(int, importlib.metadata.version("numpy").split(".")[:2])
-        names = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-        if (major, minor) >= (2, 4):  # numpy warns of a name that it does not know
-            names = "X86_V4 AVX512_ICL AVX512_SPR"
-        if has_avx512:
-            environment["NPY_DISABLE_CPU_FEATURES"] = names
-    return environment
 
 
 def uml_host_environment(job: str) -> dict[str, str]:
@@ -221,7 +203,8 @@ def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence
     }
     environment["PYTHONDONTWRITEBYTECODE"] = "1"
     if backend == "uml":
-        environment |= uml_guest_environment()
+        environment["GLIBC_TUNABLES"] = GLIBC_WITHOUT_AVX512
+        environment["OPENSSL_ia32cap"] = OPENSSL_WITHOUT_AVX512
     lines = [f"export {name}={shlex.quote(value)}" for name, value in environment.items()]
     lines += [
         "echo >/run/job/started",
