@@ -145,7 +145,3 @@ def test_what_only_our_messages_must_not_ask_for_is_said_shortly(text: str, said
     lines = refused(HEAD + text)
     assert any(said in line for line in lines)
     assert len(lines) < 3_000
-
-
-def test_what_cantools_quotes_of_a_file_is_cut_short() -> None:
-    assert len(refused(HEAD + "BO_ x" * 10_000)[0]) < 400

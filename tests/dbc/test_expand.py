@@ -282,9 +282,3 @@ def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_the
     names = [signal.name for message in after.messages for signal in message.signals]
     assert names == ["LeftBatteryVoltage", "RightBatteryVoltage"]
     assert 'BA_ "SystemSignalLongSymbol"' not in text
-
-
-def test_two_messages_that_would_get_one_name_are_refused() -> None:
-    voltage = [Sig("BatteryVoltage", 0, 16)]
-    text = dbc_text(Msg(n, i, 8, voltage) for i, n in enumerate(("EscPower", "Power"), 0x100))
-    assert "LeftPower" in refused(text)

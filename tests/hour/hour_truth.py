@@ -18,6 +18,8 @@ from esc.sheet import INFO_FIELDS, LIVE_FIELDS, Field
 from hour_recording import CELLS, GEAR, MS, SECOND, START, TIMEOUT_NS, Meant, Recording, Times
 from numpy.typing import NDArray
 
+from kontronik_can_gw.dbc.expand import copies_of, expand
+
 Floats = NDArray[np.float64]
 LATE_NS = 110 * MS
 """The gateway's own values in a row are at most so old."""
@@ -468,6 +470,8 @@ def database_of(recording: Recording) -> Database:
         found = cantools.database.load_string(recording.setup.dbc[1].decode("latin-1"), "dbc")
         assert isinstance(found, Database)
         return found
-    made = recording.setup.database()
+    setup = recording.setup
+    made = setup.database()
     assert made is not None
-    return made[0]
+    database, layout = made
+    return expand(database, copies_of(database, layout.file, setup.escs, setup.dbc_settings))
