@@ -89,7 +89,7 @@ class Database:
             ]
         self.nodes: list[str] = [node.name for node in read.nodes]
         self.messages = [
-            Message(m.frame_id, m.name, m.length, *m.senders, [_signal(m, s) for s in m.signals])
+            Message(m.frame_id, m.name, m.length, m.senders[0], [_signal(m, s) for s in m.signals])
             for m in read.messages
         ]
         self.comments = [(key, str(owner.comment)) for key, owner in owners]
