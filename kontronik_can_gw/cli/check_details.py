@@ -1,7 +1,6 @@
 """What ``check -v`` prints: the configuration in effect, and tables of messages, signals and nodes."""
 
 import re
-import struct
 from collections.abc import Iterator, Sequence
 
 from kontronik_can_gw.canopen.nodes import Nodes
@@ -13,6 +12,7 @@ from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.dbc.loss import is_mute, reporter
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.signals.packer import float_of
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 
@@ -96,9 +96,7 @@ def unbound(layout: Layout) -> list[str]:
 def shown(signal: SignalPlan, raw: int) -> str:
     """The physical value of raw bits, or their text in the value table."""
     if signal.is_float:
-        (value,) = struct.unpack(
-            "<f" if signal.length == 32 else "<d", raw.to_bytes(signal.length // 8, "little")
-        )
+        value = float_of(raw, signal.length)
         return f"{value * float(signal.factor) + float(signal.offset):g} {signal.unit}".rstrip()
     return (
         signal.texts.get(raw)

@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals import e2e
-from kontronik_can_gw.signals.plan import Layout, Role
+from kontronik_can_gw.signals.plan import Layout
 
 LIVE = LiveData(
     electrical_speed=70_000,
@@ -158,46 +158,7 @@ def test_the_codes_are_known_by_their_usual_names() -> None:
         assert raw_of(Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})) == 9
 
 
-@pytest.mark.parametrize(
-    ("signal", "raw"),
-    [
-        (Sig("MaxThrottle", 0, 8, texts={254: "NotAvailable"}, start_value=3), 254),
-        (Sig("MaxThrottle", 0, 8, start_value=3), 3),
-        (Sig("MaxThrottle", 0, 8, start_value=300), 255),
-        (Sig("MaxThrottle", 0, 8), 255),
-        (Sig("MaxThrottle", 0, 8, signed=True), -128),
-        (Sig("MaxThrottle", 0, 8, signed=True, start_value=-1), -1),
-        (Sig("SelftestErrors", 0, 64), (1 << 64) - 1),
-    ],
-)
-def test_not_available_is_the_value_table_else_the_start_value_else_the_end_of_the_type(
-    signal: Sig, raw: int
-) -> None:
-    assert raw_of(signal) == raw
-
-
-@pytest.mark.parametrize("code", [0, 4442, 65534])
-def test_a_value_that_equals_the_code_for_not_available_is_sent_as_error(code: int) -> None:
-    signal = Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01", texts={65535: "Error"})
-    signal.start_value = code
-    for number in (code, code - 1, code + 1):
-        if 0 <= number < 65535:
-            raw = raw_of(signal, live=LIVE._replace(battery_voltage=number))
-            assert raw == (65535 if number == code else number)
-
-
 # --- alive counter and E2E profile 1 ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "alive", ["Alive", "alive_counter", "PowerRollingCounter", "MessageCounter", "SequenceCounter"]
-)
-@pytest.mark.parametrize("crc", ["Crc", "CRC8", "Power_Crc", "Checksum"])
-def test_an_alive_counter_and_a_crc_are_known_by_their_names(alive: str, crc: str) -> None:
-    for names, bind in (((crc, alive), {}), (("C", "Z"), {"C": crc, "M.Z": alive})):
-        signals = [Sig(names[0], 0, 8), Sig(names[1], 8, 4)]
-        layout = layout_of([Msg("M", 1, 8, signals)], bind=bind)
-        assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
 
 
 def theirs(data: bytes, at: int, data_id: int) -> bytes:

@@ -261,18 +261,6 @@ def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> Non
         assert all(b - a >= 15 * MS for a, b in pairwise(times)), kind
 
 
-def test_what_has_to_wait_of_one_message_is_no_news_for_another() -> None:
-    """A change that is taken back before it may go is not sent, whatever else there is."""
-    kinds = ((CYCLIC, 10_000), (ON_CHANGE, 0), (ON_CHANGE, 0))
-    messages = [Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]) for n in range(3)]
-    bench = Bench([(m, *kind, 25) for m, kind in zip(messages, kinds, strict=True)])
-    for number in (1, 2, 1):
-        bench.until(bench.now + 10 * MS)
-        bench.live(volts(number))
-    bench.until(200 * MS)
-    assert [(when // MS, frame.can_id) for when, frame in bench.sent] == [(10, 0x101), (10, 0x102)]
-
-
 # --- loss and return ----------------------------------------------------------------------------------------------------
 
 
