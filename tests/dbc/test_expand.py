@@ -246,7 +246,7 @@ def test_names_of_more_than_32_characters_are_refused() -> None:
 def plain_plans(layout: Layout) -> list[MessagePlan]:
     """With the signals in one order: that of the file is sorted by the writer."""
     return [
-        replace(plan, signals=tuple(sorted(plan.signals, key=lambda signal: signal.name)))
+        replace(plan, compiled=tuple(sorted(plan.signals, key=lambda signal: signal.name)))
         for plan in layout.messages
     ]
 
