@@ -120,7 +120,7 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Variable]) -> MessageP
         send_type=SendType.EVENT,
         cycle_ns=0,
         delay_ns=0,
-        signals=tuple(signals),
+        compiled=tuple(signals),
         escs=frozenset({0}),
         paces=frozenset(source.pace or source.group for source in sources),
     )
@@ -177,7 +177,7 @@ def _compile(mapped: Sequence[Variable]) -> SlotPlan:
         pack=compile_pack(plan),
         triggers=triggers,
         watched=sum(place(signal.pieces, -1) for signal in status),
-        pack_watched=compile_pack(replace(plan, signals=tuple(status))) if status else None,
+        pack_watched=compile_pack(replace(plan, compiled=tuple(status))) if status else None,
         needs_live=is_live and not carries_link,
         only_python=only_python,
     )

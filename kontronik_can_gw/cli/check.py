@@ -1,7 +1,6 @@
 """``check``: says in short whether a configuration can be used and what it sends, without opening anything."""
 
 import argparse
-import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.printable import printable_json
+from kontronik_can_gw.signals.packer import float_of
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 _EXAMPLE_PORT = "_EXAMPLE-"
@@ -187,9 +187,7 @@ def table(found: Sequence[dict[str, Any]]) -> Iterator[str]:
 def _held(signal: SignalPlan, raw: int) -> str:
     """The physical value of raw bits, or their text in the value table."""
     if signal.is_float:
-        (value,) = struct.unpack(
-            "<f" if signal.length == 32 else "<d", raw.to_bytes(signal.length // 8, "little")
-        )
+        value = float_of(raw, signal.length)
         return f"{value * float(signal.factor) + float(signal.offset):g} {signal.unit}".rstrip()
     return (
         signal.texts.get(raw)

@@ -1,12 +1,12 @@
 """What signals hide: flags without a code for "not available" where nothing reports lost telemetry, values that a protocol lacks."""
 
 import math
-import struct
 from collections.abc import Sequence
 
 from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.signals.packer import float_of
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
 
 _OF_LINK = frozenset({"link_state", "data_age"})
@@ -38,8 +38,7 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
 def _has_code(signal: SignalPlan) -> bool:
     """True where "not available" is a code of its own, outside the values."""
     if signal.is_float:
-        code = "<f" if signal.length == 32 else "<d"
-        (value,) = struct.unpack(code, signal.not_available.to_bytes(signal.length // 8, "little"))
+        value = float_of(signal.not_available, signal.length)
         return math.isnan(value) or not signal.limits[0] <= value <= signal.limits[1]
     if signal.numbers is not None:
         return signal.not_available not in signal.numbers.values()

@@ -48,7 +48,7 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
         send_type=send_type,
         cycle_ns=cycle_ms * MS if SendType.CYCLIC in send_type else 0,
         delay_ns=delay_ms * MS,
-        signals=tuple(signals),
+        compiled=tuple(signals),
         escs=frozenset(s.esc for s in signals if s.esc is not None),
         paces=frozenset(s.source.pace or s.source.group for s in signals if s.source),
         pages=tuple(pages) or (None,),

@@ -38,7 +38,7 @@ class Traits:
             silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         )
         self.follows_gateway = Group.GATEWAY in plan.paces and (self.by_event or self.on_change)
-        roles = {signal.role: signal for signal in plan.signals}
+        roles = {signal.role: signal for signal in plan.compiled}
         alive = roles.get(Role.ALIVE)
         self.alive_modulus = 0 if alive is None else alive_modulus(alive, Role.CRC in roles)
         self.triggers = Event.NONE

@@ -23,10 +23,6 @@ _LAST_WORDS = {Role.ALIVE: {"bz", "sqc"}, Role.CRC: {"cs", "cks", "chk"}}
 """Too short for endings: they end other words too."""
 _WHOLE = {"counter", "cntr", "cnt", "ctr"}
 """Only as a whole name: an ErrorCounter counts no frames."""
-_SUSPECTS = {
-    Role.ALIVE: re.compile("alive|cntr|cnt|ctr|counter|zaehler|rolling", re.IGNORECASE),
-    Role.CRC: re.compile("crc|chk|check|cksum|pruefsumme", re.IGNORECASE),
-}
 
 
 def normalize(name: str) -> str:
@@ -54,8 +50,3 @@ def is_e2e(crc: str, counter: str) -> bool:
     """True for a pair of names that means AUTOSAR E2E profile 1."""
     pairs = ((crc, Role.CRC), (counter, Role.ALIVE))
     return all(normalize(name).endswith(_E2E_ENDINGS[role]) for name, role in pairs)
-
-
-def suspected_protection(name: str) -> Role | None:
-    """ALIVE or CRC where a name might mean one of them, for hints in messages."""
-    return next((role for role, pattern in _SUSPECTS.items() if pattern.search(name)), None)

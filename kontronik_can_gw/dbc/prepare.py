@@ -6,6 +6,7 @@ limits, value tables and timing come only from the file. All mistakes in a DBC o
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.binding import Binder
@@ -17,7 +18,7 @@ from kontronik_can_gw.dbc.settings import Compilation, DbcSettings
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import block_of
-from kontronik_can_gw.signals.plan import Layout, MessagePlan
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -42,7 +43,7 @@ def prepare(
     copies = copies_of(database, file, escs, settings)
     ours = [copy for copy in copies if node in copy.message.senders]
     job = Compilation(database, file, settings, Binder(escs, settings.bind), fd_allowed)
-    plans = [plan for copy in ours if (plan := compile_message(job, copy)) is not None]
+    plans = [*_compiled(job, ours)]
     job.problems += _clashes(copies, node, taken_ids or {}, file)
     job.problems += _unused_settings(job, ours, node)
     if len(job.unbound) > _MANY:
@@ -56,6 +57,32 @@ def prepare(
     if settings.base_id is None and (reason := among_canopen(copies, node)):
         job.warnings.append(f"{file}: for {len(escs)} ESCs, {reason}")
     return Layout(file, node, tuple(plans), tuple(dict.fromkeys(job.warnings)))
+
+
+def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
+    """The plans of our messages, compiled once for ESCs that differ in nothing that signals know of."""
+    made: dict[object, tuple[Copy, MessagePlan]] = {}
+    for copy in ours:
+        key: object = None
+        if copy.esc is not None:
+            esc = job.binder.escs[copy.esc]
+            bound = (job.binder.bound(copy, signal.name) for signal in copy.message.signals)
+            key = (id(copy.message), esc.protocol, esc.pole_pairs, esc.gear, *bound)
+        if copy.esc is not None and key in made:
+            of, plan = made[key]
+            yield replace(
+                plan,
+                name=copy.name,
+                can_id=copy.frame_id,
+                escs=frozenset((copy.esc,)),
+                renamed=(of.prefix, copy.prefix),
+            )
+        elif (compiled := compile_message(job, copy)) is not None:
+            yield compiled
+            # each copy with a CRC has to be asked for by its own name
+            protected = any(signal.role is Role.CRC for signal in compiled.compiled)
+            if compiled.escs == {copy.esc} and not protected:
+                made[key] = copy, compiled
 
 
 def _clashes(

@@ -1,13 +1,13 @@
 """Raw values of a signal: their bits, their range, numbers as they stand in the file, constants, the codes in a value table."""
 
 import math
-import struct
 from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.esc.values import Value
+from kontronik_can_gw.signals.packer import float_bits
 from kontronik_can_gw.signals.plan import Piece
 
 if TYPE_CHECKING:
@@ -104,15 +104,6 @@ def exact(number: Any) -> Fraction:
 def text(value: Fraction) -> str:
     """A number for people."""
     return f"{float(value):.10g}"
-
-
-def float_bits(number: float | Fraction, length: int) -> int | None:
-    """The bits of a float of 32 or 64 bits; None where it is too large."""
-    try:
-        packed = struct.pack("<f" if length == 32 else "<d", float(number))
-        return int.from_bytes(packed, "little")
-    except OverflowError:
-        return None
 
 
 def constant(signal: "Signal", value: float, factor: Fraction, offset: Fraction) -> int | None:

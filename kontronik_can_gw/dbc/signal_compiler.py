@@ -13,16 +13,11 @@ from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.settings import Compilation, UnfitSignal
 from kontronik_can_gw.esc.values import Group, Value, divisor_of_settings
 from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.packer import float_bits
 from kontronik_can_gw.signals.plan import Role, SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Signal
-
-_SUSPECT = {
-    None: "",
-    Role.ALIVE: ' If it counts the frames: bind = "alive".',
-    Role.CRC: ' If it is the CRC of AUTOSAR E2E profile 1: bind = "crc".',
-}
 
 
 class SignalCompiler:
@@ -56,7 +51,7 @@ class SignalCompiler:
         if signal.is_float and length not in (32, 64):
             raise UnfitSignal(f"a float of {length} bits cannot be sent; 32 and 64 can.")
         if signal.is_float:
-            if any(raw_values.float_bits(raw, length) is None for raw in entries):
+            if any(float_bits(raw, length) is None for raw in entries):
                 raise UnfitSignal(
                     f"has a value table with numbers that no {length}-bit float holds."
                 )
@@ -127,7 +122,7 @@ class SignalCompiler:
     def _float(self, plan: SignalPlan, limits: tuple[Fraction, Fraction] | None) -> SignalPlan:
         """The plan with the codes as bits of a float: from the value table, else NaN."""
         not_available, error = (
-            raw_values.float_bits(math.nan if raw is None else raw, plan.length) or 0
+            float_bits(math.nan if raw is None else raw, plan.length) or 0
             for raw in (self.table.not_available, self.table.error)
         )
         plan = replace(plan, not_available=not_available, error=error)
@@ -166,7 +161,7 @@ class SignalCompiler:
         if bound is None:
             self.job.unbound.add(self._where)
         via = "" if bound is None else f" (bound by dbc.bind to {bound!r})"
-        hints = self.job.binder.suggestions(name) + _SUSPECT[names.suspected_protection(name)]
+        hints = self.job.binder.suggestions(name)
         raise UnfitSignal(f"no such source{via}.{hints} Bind it under [dbc.bind] or rename it.")
 
     def _bound(self, plan: SignalPlan, value: Value, esc: int | None) -> SignalPlan:

@@ -137,7 +137,7 @@ class Tables:
         return counts | {"slots": slots}
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
-        crc = next((s for s in plan.signals if s.role is Role.CRC), None)
+        crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
         traits = Traits(plan, silent)
         flags = EVENT * traits.by_event | ON_CHANGE * traits.on_change | HAS_CRC * (crc is not None)
         flags |= SILENT * traits.silent_able | OF_THE_GATEWAY * traits.follows_gateway
@@ -281,7 +281,7 @@ def places_of(protocol: EscProtocol) -> Places:
 
 def _constants(plan: MessagePlan, page: int | None, words: int) -> list[int]:
     bits = 0
-    for signal in plan.signals:
+    for signal in plan.compiled:
         if signal.role is Role.CONSTANT and signal.page in (None, page):
             bits |= place(signal.pieces, signal.constant)
         elif signal.role is Role.MULTIPLEXER and page is not None:

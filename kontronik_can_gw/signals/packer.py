@@ -8,6 +8,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import Group, divisor, steps
@@ -141,7 +142,11 @@ def _raw(signal: SignalPlan) -> _Raw:
         if found is None or by is None:
             return not_available
         if signal.is_float:
-            return float_bits(_float(signal, found, by), signal)
+            number = _float(signal, found, by)
+            if number is None or not signal.limits[0] <= number <= signal.limits[1]:
+                return error
+            bits = float_bits(number, signal.length)
+            return error if bits is None or bits == not_available else bits
         if numbers is not None:
             return numbers.get(found, error)
         over, under = by
@@ -173,17 +178,17 @@ def ratio(numerator: int, denominator: int) -> float:
         return math.inf if numerator > 0 else -math.inf
 
 
-def float_bits(value: float | None, signal: SignalPlan) -> int:
-    """The IEEE 754 bits of a value in a float signal.
-
-    Its Error code for what is outside its limits, has no float of this length, or would look like NotAvailable.
-    """
-    low, high = signal.limits
-    if value is None or not low <= value <= high:
-        return signal.error
+def float_bits(number: float | Fraction, length: int) -> int | None:
+    """The IEEE 754 bits of a float of 32 or 64 bits; None where it is too large."""
     try:
-        packed = struct.pack("<f" if signal.length == 32 else "<d", value)
+        packed = struct.pack("<f" if length == 32 else "<d", float(number))
     except OverflowError:
-        return signal.error
-    bits = int.from_bytes(packed, "little")
-    return signal.error if bits == signal.not_available else bits
+        return None
+    return int.from_bytes(packed, "little")
+
+
+def float_of(bits: int, length: int) -> float:
+    """The number that IEEE 754 bits hold."""
+    number: float
+    (number,) = struct.unpack("<f" if length == 32 else "<d", bits.to_bytes(length // 8, "little"))
+    return number

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, Flag
 from fractions import Fraction
 from functools import cached_property
@@ -103,13 +103,27 @@ class MessagePlan:
     """0: not cyclic."""
     delay_ns: int
     """Minimum distance between two frames."""
-    signals: tuple[SignalPlan, ...]
+    compiled: tuple[SignalPlan, ...]
+    """Its signals, or those of the message that it is a copy of."""
     escs: frozenset[int]
     paces: frozenset[Group]
     """What the message's values change with."""
     pages: tuple[int | None, ...] = (None,)
     data_id: int = 0
     """AUTOSAR E2E profile 1 data id, used where the message has a CRC signal."""
+    renamed: tuple[str, str] | None = None
+    """Of a copy for another ESC: with what names of signals begin in ``compiled``, and with what here."""
+
+    @property
+    def signals(self) -> tuple[SignalPlan, ...]:
+        """Those of a copy are made when they are asked for: with many ESCs they would be most of the memory."""
+        if self.renamed is None:
+            return self.compiled
+        (esc,), (old, new) = self.escs, self.renamed
+        return tuple(
+            replace(s, name=new + s.name.removeprefix(old), esc=None if s.esc is None else esc)
+            for s in self.compiled
+        )
 
     @property
     def bits(self) -> tuple[int, int]:

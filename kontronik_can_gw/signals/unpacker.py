@@ -5,7 +5,6 @@ or a float in the signal's unit, a text where the signal is an enumeration, None
 Error code). A flag, which has no code for that, is not available where the other values of its message are not.
 """
 
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -14,7 +13,7 @@ from typing import NamedTuple
 
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.signals.packer import place, take
+from kontronik_can_gw.signals.packer import float_of, place, take
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 Value = int | float | str | None
@@ -241,9 +240,7 @@ def float_value(
     """The physical value of a float signal's bits; None for its codes and for NaN."""
     if bits in codes:
         return None
-    raw: float = struct.unpack(
-        "<f" if length == 32 else "<d", bits.to_bytes(length // 8, "little")
-    )[0]
+    raw = float_of(bits, length)
     return None if raw != raw else raw * factor + offset
 
 

@@ -398,8 +398,9 @@ def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
     escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
     text = written(escs)
     db = parse(text.encode())
-    for rule in ("names_are_unique", "everything_has_one_comment", "every_line_is_understood"):
-        assert list(RULES[rule](db)) == []
+    for names in ([m.name for m in db.messages], [s.name for s in db.signals]):
+        assert len({name.lower() for name in names}) == len(names)
+    assert list(RULES["everything_has_a_comment"](db)) == []
     read(text)
     names = [message.name for message in db.messages] + [signal.name for signal in db.signals]
     assert max(map(len, names)) == 32

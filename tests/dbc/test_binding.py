@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals import e2e
-from kontronik_can_gw.signals.plan import Layout, Role
+from kontronik_can_gw.signals.plan import Layout
 
 LIVE = LiveData(
     electrical_speed=70_000,
@@ -91,13 +91,6 @@ def test_a_binding_overrides_the_name_and_one_of_message_and_signal_that_of_the_
     assert [s.name for s in sources if s] == ["battery_voltage", "operating_state_raw"]
 
 
-def test_a_source_of_a_named_esc_can_be_bound() -> None:
-    signals = [Sig(name, at, 16, unit=unit) for name, at, unit in zip("ABC", (0, 16, 32), "VVs", strict=True)]  # fmt: skip
-    bind = {"A": "esc2.battery_voltage", "B": "esc1.battery_voltage", "C": "uptime"}
-    layout = layout_of([Msg("Both", 1, 8, signals)], ("esc1", "esc2"), bind=bind)
-    assert [signal.esc for signal in layout.messages[0].signals] == [1, 0, None]
-
-
 def test_bindings_of_a_one_esc_layout_go_to_every_esc() -> None:
     voltage = Sig("U", 0, 16, unit="V", factor="0.01")
     message = Msg("Power", 0x100, 8, [voltage, Sig("Id", 16, 8), Sig("Up", 24, 32, unit="s")])
@@ -165,65 +158,7 @@ def test_the_codes_are_known_by_their_usual_names() -> None:
         assert raw_of(Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})) == 9
 
 
-@pytest.mark.parametrize(
-    ("signal", "raw"),
-    [
-        (Sig("MaxThrottle", 0, 8, texts={254: "NotAvailable"}, start_value=3), 254),
-        (Sig("MaxThrottle", 0, 8, start_value=3), 3),
-        (Sig("MaxThrottle", 0, 8, start_value=300), 255),
-        (Sig("MaxThrottle", 0, 8), 255),
-        (Sig("MaxThrottle", 0, 8, signed=True), -128),
-        (Sig("MaxThrottle", 0, 8, signed=True, start_value=-1), -1),
-        (Sig("SelftestErrors", 0, 64), (1 << 64) - 1),
-    ],
-)
-def test_not_available_is_the_value_table_else_the_start_value_else_the_end_of_the_type(
-    signal: Sig, raw: int
-) -> None:
-    assert raw_of(signal) == raw
-
-
-@pytest.mark.parametrize("code", [0, 4442, 65534])
-def test_a_value_that_equals_the_code_for_not_available_is_sent_as_error(code: int) -> None:
-    signal = Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01", texts={65535: "Error"})
-    signal.start_value = code
-    for number in (code, code - 1, code + 1):
-        if 0 <= number < 65535:
-            raw = raw_of(signal, live=LIVE._replace(battery_voltage=number))
-            assert raw == (65535 if number == code else number)
-
-
-def test_each_page_has_its_own_constants_beside_those_of_every_frame() -> None:
-    signals = [
-        Sig("Page", 0, 8, mux="M"),
-        Sig("A", 8, 8, mux="m0"),
-        Sig("B", 8, 8, mux="m6"),
-        Sig("C", 20, 4),
-        Sig("AliveCounter", 16, 4),
-    ]
-    layout = layout_of([Msg("M", 0x100, 3, signals)], bind={"A": 0x51, "B": 0x92, "C": 7})
-    for page, constant in ((0, 0x51), (6, 0x92)):
-        data = packed(layout.messages[0], gateway_with(layout), page=page)
-        assert data == bytes((page, constant, 0x70))
-
-
 # --- alive counter and E2E profile 1 ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "alive", ["Alive", "alive_counter", "PowerRollingCounter", "MessageCounter", "SequenceCounter"]
-)
-@pytest.mark.parametrize("crc", ["Crc", "CRC8", "Power_Crc", "Checksum"])
-def test_an_alive_counter_and_a_crc_are_known_by_their_names(alive: str, crc: str) -> None:
-    for names, bind in (((crc, alive), {}), (("C", "Z"), {"C": crc, "M.Z": alive})):
-        signals = [Sig(names[0], 0, 8), Sig(names[1], 8, 4)]
-        layout = layout_of([Msg("M", 1, 8, signals)], bind=bind)
-        assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
-
-
-def test_crc_errors_is_no_crc_and_live_frames_no_alive_counter() -> None:
-    layout = layout_of([Msg("M", 1, 8, [Sig("CrcErrors", 0, 8), Sig("LiveFrames", 8, 8)])])
-    assert all(signal.role is Role.SOURCE for signal in layout.messages[0].signals)
 
 
 def theirs(data: bytes, at: int, data_id: int) -> bytes:

@@ -35,14 +35,6 @@ def frame(message: Message, raw: dict[str, int]) -> bytes:
     return bits.to_bytes(message.dlc, "little")
 
 
-def not_available(message: Message) -> dict[str, int]:
-    return {s.name: s.not_available if s.has_codes else 0 for s in message.signals}
-
-
-def error(message: Message) -> dict[str, int]:
-    return {s.name: s.error if s.has_codes else 0 for s in message.signals}
-
-
 # --- cantools -------------------------------------------------------------------------------------------------------
 
 

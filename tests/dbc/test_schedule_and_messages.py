@@ -1,11 +1,9 @@
 """When frames go out and what stands in them, with time passed in."""
 
 import random
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -13,18 +11,16 @@ from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get, read
 
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.dbc.schedule import phases
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 
-SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
 TIMEOUT = 250 * MS
 VOLTAGE = Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01")
@@ -130,6 +126,8 @@ SCENES: list[tuple[str, int, int, int, str, list[tuple[int, int]]]] = [
      "7 live 1, 9 live 2, 23", [(0, NONE), (7, 1), (12, 2)]),
     ("a change that is taken back before it may go is not sent", ON_CHANGE, 0, 25,
      "10 live 1, 20 live 2, 30 live 1, 200", [(10, 1)]),
+    ("on change goes only when a raw value changes", ON_CHANGE, 0, 0,
+     "10 live 1, 20 live 1, 30 live 2, 40 live 2, 50 live 1, 60 live 1", [(10, 1), (30, 2), (50, 1)]),
     ("cyclic and event does both", CYCLIC_AND_EVENT, 100, 0,
      "50 live 1, 120 live 2, 210", [(0, NONE), (50, 1), (100, 1), (120, 2), (200, 2)]),
     ("cyclic and on change does both", CYCLIC_AND_ON_CHANGE, 100, 10,
@@ -215,23 +213,6 @@ def test_a_late_call_sends_one_frame_and_the_grid_stays(late: int) -> None:
     assert len(bench.times()) == 4
 
 
-@pytest.mark.parametrize("count", [2, 3, 8])
-def test_the_same_message_of_several_escs_never_goes_at_one_instant(count: int) -> None:
-    escs = [EscSettings(f"esc{n + 1}") for n in range(count)]
-    layout = prepare(load_database(SHIPPED), "x", escs, DbcSettings())
-    gateway = Gateway(escs, layout, 0)
-    escs_of_one: dict[tuple[str, int], list[int]] = {}
-    names = {plan.can_id: re.sub("^Esc[0-9]", "", plan.name) for plan in layout.messages}
-    while (now := gateway.next_deadline()) < 3 * SECOND:
-        gateway.advance(now)
-        frames = gateway.take_frames(now)
-        assert len(frames) <= 2
-        for frame in frames:
-            escs_of_one.setdefault((names[frame.can_id], now), []).append(frame.can_id)
-    assert escs_of_one
-    assert all(len(ids) == 1 for ids in escs_of_one.values())
-
-
 @given(
     st.lists(
         st.sampled_from([0, 10 * MS, 20 * MS, 50 * MS, 100 * MS, 1000 * MS, 7 * MS]),
@@ -267,18 +248,6 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
     assert len(bench.times()) == 1 + lives
 
 
-def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
-    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("CellCount", 0, 8)]), EVENT, 0, 0)])
-    bench.now = 50 * MS
-    bench.live()
-    bench.forget()
-    bench.live(InfoData(cell_count=6))
-    assert bench.raws(8) == [6]
-    bench.until(100 * MS)
-    bench.live()
-    assert bench.raws(8) == [6]
-
-
 def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> None:
     cycles = {EVENT: 0, ON_CHANGE: 0, CYCLIC_AND_EVENT: 40, CYCLIC_AND_ON_CHANGE: 30, CYCLIC: 50}
     for kind, cycle in cycles.items():
@@ -292,44 +261,7 @@ def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> Non
         assert all(b - a >= 15 * MS for a, b in pairwise(times)), kind
 
 
-def test_what_has_to_wait_of_one_message_is_no_news_for_another() -> None:
-    """A change that is taken back before it may go is not sent, whatever else there is."""
-    kinds = ((CYCLIC, 10_000), (ON_CHANGE, 0), (ON_CHANGE, 0))
-    messages = [Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]) for n in range(3)]
-    bench = Bench([(m, *kind, 25) for m, kind in zip(messages, kinds, strict=True)])
-    for number in (1, 2, 1):
-        bench.until(bench.now + 10 * MS)
-        bench.live(volts(number))
-    bench.until(200 * MS)
-    assert [(when // MS, frame.can_id) for when, frame in bench.sent] == [(10, 0x101), (10, 0x102)]
-
-
-# --- on change ----------------------------------------------------------------------------------------------------------
-
-
-def test_on_change_goes_only_when_a_raw_value_changes() -> None:
-    bench = lone(ON_CHANGE, 0, 0, Sig("AliveCounter", 56, 4))
-    for n, number in enumerate((1, 1, 1, 2, 2, 1, 1), 1):
-        bench.until(n * 10 * MS)
-        bench.live(LiveData(battery_voltage=number, electrical_speed=n))
-    assert bench.times() == [10, 40, 60]
-    assert bench.raws(4, 56) == [0, 1, 2]
-
-
 # --- loss and return ----------------------------------------------------------------------------------------------------
-
-
-def test_on_loss_a_cyclic_message_goes_on_with_not_available_from_the_first_frame_after_the_time_out() -> (
-    None
-):
-    bench = lone(CYCLIC, 10)
-    bench.feed(500 * MS)
-    bench.forget()
-    bench.until(2 * SECOND)
-    for when, frame in bench.sent:
-        fresh = when - 500 * MS <= TIMEOUT
-        assert get(frame.data, 0, 16, True) == (2442 if fresh else 65535), when
-    assert len(bench.sent) == 150
 
 
 @pytest.mark.parametrize("kind", [EVENT, ON_CHANGE])
@@ -409,16 +341,6 @@ def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
     bench.live(volts(4), 0)
     assert bench.raws(16, 0)[-1] == 4
     assert set(bench.raws(16, 16)) == {65535}
-
-
-def test_info_is_not_available_as_soon_as_it_is_too_old() -> None:
-    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("CellCount", 0, 8)]), CYCLIC, 100, 0)])
-    bench.feed(330 * MS)
-    bench.live(InfoData(cell_count=6))
-    bench.feed(15 * SECOND)
-    for when, frame in bench.sent:
-        known = 330 * MS <= when <= 330 * MS + INFO_TIMEOUT_NS
-        assert get(frame.data, 0, 8, True) == (6 if known else 255), when
 
 
 # --- alive counter, pages ---------------------------------------------------------------------------------------------
@@ -504,47 +426,6 @@ def test_a_cycle_adds_its_page_to_a_changed_one_that_had_to_wait() -> None:
     assert sent == [
         (0, 1, 0xFFFF), (100, 2, 0x8000), (130, 1, 1), (160, 2, 0), (190, 2, 5), (220, 2, 6), (250, 1, 1),
     ]  # fmt: skip
-
-
-# --- ids of 29 bits, CAN FD, other lengths -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("extended", "size", "at", "fd_format"),
-    [
-        (False, 8, 48, 0),
-        (True, 8, 0, 0),
-        (False, 3, 8, 0),
-        (False, 64, 496, 14),
-        (False, 8, 0, 14),
-        (True, 12, 80, 15),
-    ],
-)
-@pytest.mark.parametrize(("kind", "cycle"), [(EVENT, 0), (CYCLIC_AND_EVENT, 10_000)])
-def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
-    kind: int, cycle: int, extended: bool, size: int, at: int, fd_format: int
-) -> None:
-    message = Msg(
-        "EscWide", 0x123, size, [Sig("BatteryVoltage", at, 16, unit="V", factor="0.01")], extended
-    )
-    fd = 'BA_DEF_ BO_ "VFrameFormat" INT 0 15;\nBA_DEF_DEF_ "VFrameFormat" 0;\n'
-    fd += f'BA_ "VFrameFormat" BO_ {message.dbc_id} {fd_format};\n'
-    bench = Bench([(message, kind, cycle, 0)], start=True, attributes=fd)
-    bench.until(SECOND)
-    bench.forget()
-    for number in (1, 2400, 0xFFF0):
-        bench.until(bench.now + 10 * MS)
-        bench.live(volts(number))
-        frame = bench.sent[-1][1]
-        assert (frame.can_id, frame.extended, frame.fd) == (0x123, extended, fd_format > 0)
-        assert frame.data == (number << at).to_bytes(size, "little")
-    assert len(bench.sent) == 3
-    for other, conflicts in ((not extended, 0), (extended, 1)):  # of the number, and its id
-        bench.gateway.receive_frame(CanFrame(0x123, b"", other), bench.now, bench.now)
-        assert bench.gateway.status.id_conflicts == conflicts
-
-
-# --- settings that a master writes --------------------------------------------------------------------------------------
 
 
 # --- the gateway itself -------------------------------------------------------------------------------------------------

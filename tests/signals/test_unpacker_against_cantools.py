@@ -17,7 +17,6 @@ from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 
@@ -172,12 +171,3 @@ def test_what_comes_with_telemetry_is_fresh_for_a_second(tmp_path: Path) -> None
     assert view.expire(2000 * MS + 250 * MS + 1)
     assert view.value("losses", 0) is None
     assert view.next_expiry is None
-
-
-def test_without_any_cycle_nobody_knows_and_values_stay(tmp_path: Path) -> None:
-    view = view_of(tmp_path, ("variant", 0, "OnChange"))
-    view.take(100, b"\1" * 8, 0)
-    assert view.next_expiry is None
-    assert not view.expire(3600 * SECOND)
-    assert view.value("variant", 0) == 0x0101
-    assert isinstance(view.reader.layout, Layout)
