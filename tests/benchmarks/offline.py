@@ -119,8 +119,8 @@ def convert_here(arguments: list[str]) -> Run:
             choice = Choice.of(recording.fields, names)
             convert_all = partial(to_table, form=args.form, choice=choice)
         cpu, wall = time.process_time(), time.perf_counter()
-        with Output(Path(args.target), args.form) as out:
-            told = convert_all(recording, out, lambda position: None)
+        with Output(Path(args.target)) as out:
+            told = convert_all(recording, out)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     return Run(cpu, wall, int(peak[1]) / 1024 if peak else 0.0, f"{told}")

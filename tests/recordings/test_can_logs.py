@@ -118,30 +118,6 @@ def test_a_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
     ]
 
 
-def test_what_candump_shows_on_the_screen_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "screen.txt"
-    path.write_text(
-        " (1700000000.000001)  can0  681   [8]  00 11 22 33 44 55 66 77\n"
-        " (1700000000.000002)  can0  RX - -  18FF0102   [2]  AB CD   '..'\n"
-        " (1700000000.000003)  can0  TX B -  123  [12]  00 11 22 33 44 55 66 77 88 99 AA BB\n"
-        " (1700000000.000004)  can0  123   [0]  remote request\n"
-        " (1700000000.000005)  can0  20000004   [8]  00 01 00 00 00 00 00 00   ERRORFRAME\n"
-        " (1700000000.000006)  can0  123   [0] \n"
-        " (1700000000.000007)  can0  123   [3]  00 11\n"
-    )
-    with opened(path) as log:
-        found = list(log.frames())
-        assert log.wall_ns(0) == 0
-        assert log.damage == ["1 damaged line: 7"]
-    at = 1_700_000_000_000_000_000
-    assert found == [
-        (at + 1000, CanFrame(0x681, bytes.fromhex("0011223344556677")), False),
-        (at + 2000, CanFrame(0x18FF0102, b"\xab\xcd", True), True),
-        (at + 3000, CanFrame(0x123, bytes.fromhex("00112233445566778899AABB"), fd=True), False),
-        (at + 6000, CanFrame(0x123, b""), False),
-    ]
-
-
 def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> None:
     path = tmp_path / "decimal.asc"
     path.write_text(

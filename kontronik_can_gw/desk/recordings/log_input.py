@@ -28,7 +28,7 @@ class CanLogInput(Input):
         self.format = log_format(path) or ""
         if not self.format:
             raise UserError(f"{path}: is no CAN log that is known (candump, ASC, BLF, TRC, MF4).")
-        super().__init__(str(path), layout, path.stat().st_size)
+        super().__init__(str(path), layout)
         self._path = path
         self._open()
 
@@ -52,12 +52,10 @@ class CanLogInput(Input):
         self.others = 0
         try:
             for item in self._in_time():
-                self.position = min(self._reader.position, self.size)
                 self.others += item.frame.key not in ours
                 yield item
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
-        self.position = self.size
         self.damage = self._damage.texts()
 
     def _in_time(self) -> Iterator[TimedFrame]:
