@@ -11,7 +11,6 @@ from pathlib import Path
 from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, number_from, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.cli.progress import Progress
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
     FORMATS,
@@ -123,10 +122,9 @@ def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input
                 f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
             )
         conversion = _conversion(args, form, recording)
-        name, size = Path(args.input).name or recording.name, recording.size or None
         try:
-            with Progress(name, size, target is None) as progress, Output(target) as out:
-                summary = conversion(recording, out, progress.reach)
+            with Output(target) as out:
+                summary = conversion(recording, out)
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -168,7 +166,7 @@ def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
-    """What is to be done with recording, output and progress. UserError for what the recording has not."""
+    """What is to be done with recording and output. UserError for what the recording has not."""
     if form == BYTES:
         return partial(to_bytes, esc=_esc(args, recording, needed=True) or 0)
     if form in LOGS:

@@ -7,7 +7,6 @@ from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.output import write_output
-from kontronik_can_gw.cli.progress import Progress
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.report.analysis import Analysis, needed_columns
 from kontronik_can_gw.desk.report.flight import Flight
@@ -100,11 +99,9 @@ def _analysed(recording: Input, args: argparse.Namespace) -> Flight | None:
             f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
         )
     try:
-        with Progress(recording.name, recording.size or None, args.output == "-") as progress:
-            for block in filter(len, recording.blocks(chosen)):
-                if not analysis.take(block):
-                    break
-                progress.reach(recording.position)
+        for block in filter(len, recording.blocks(chosen)):
+            if not analysis.take(block):
+                break
     except KeyboardInterrupt:
         return None
     return analysis.finish()

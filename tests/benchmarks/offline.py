@@ -94,8 +94,8 @@ def convert_here(arguments: list[str]) -> Run:
             choice = Choice.of(recording.fields, names)
             convert_all = partial(to_table, form=args.form, choice=choice)
         begun = time.process_time()
-        with Output(Path(args.target), args.form) as out:
-            written = convert_all(recording, out, lambda position: None)
+        with Output(Path(args.target)) as out:
+            written = convert_all(recording, out)
         return Run(time.process_time() - begun, str(written))
 
 

@@ -123,7 +123,6 @@ def test_parts_by_size_go_on_from_each_other(tmp_path: Path) -> None:
             assert isinstance(found, CaptureInput)
             assert sum(1 for _ in found.entries()) >= 2000
             assert found.damage == []
-            assert found.position == found.size == sum(f.stat().st_size for f in files)
     files[1].unlink()
     assert len(recorded(tmp_path, "1 parts of the run in front of it are not given")) < 2000
 

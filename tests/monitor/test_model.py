@@ -16,9 +16,8 @@ from kontronik_can_gw.desk.member import alarms_of
 from kontronik_can_gw.desk.monitor.model import HISTORY_S, Monitor
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
-from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
-from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.frames import CanFrame
 
 ONE = layout_of(["esc1"])
@@ -156,12 +155,6 @@ def test_errors_have_their_meaning_and_come_first() -> None:
     assert alarms[0].remedy == OperatingError.UNDERVOLTAGE.remedy
 
 
-def test_infinity_of_a_float_signal_is_no_value() -> None:
-    (esc,) = Monitor(ONE).escs
-    assert esc.converted("battery_voltage", float("inf")) is None
-    assert esc.converted("battery_voltage", 22.5) == 22.5
-
-
 USERS_DBC = """VERSION ""
 
 NS_ :
@@ -226,18 +219,3 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout)
     assert esc.number("motor_speed") is None
     assert esc.link is None
     assert monitor.document()["units"]["battery_voltage"] == "V"
-
-
-def test_the_document_names_sources_and_has_null_for_what_is_not_available() -> None:
-    escs = [EscOptions(device=Device.JIVEPRO), with_errors(OperatingError.UNDERVOLTAGE)]
-    monitor = watched(TWO, flight(TWO, 12, escs))
-    document = json.loads(json.dumps(monitor.document(), allow_nan=False))
-    left, right = document["escs"]
-    assert (left["name"], right["name"]) == ("left", "right")
-    assert left["values"]["bec_current"] is None, "a JIVEPro supplies none"
-    assert right["values"]["bec_current"] is not None
-    assert right["errors"] == ["undervoltage"]
-    assert left["device"].startswith("JIVEPro")
-    assert set(left["values"]) <= set(VALUES)
-    assert {"crc_errors", "dropped_bytes", "link_state"} <= set(left["values"])
-    assert all(VALUES[name].unit == unit for name, unit in document["units"].items())

@@ -102,18 +102,18 @@ def write_bytes(chance: random.Random, path: Path) -> Path:
 def read(recording: Input, chosen: Sequence[int]) -> list[Any]:
     """All of a recording."""
     rows = [(row.time_ns, row.values) for row in recording.samples(chosen)]
-    found = [rows, list(recording.damage), recording.position]
+    found = [rows, list(recording.damage)]
     frames = list(recording.frames())
-    return [*found, frames, list(recording.damage), recording.position]
+    return [*found, frames, list(recording.damage)]
 
 
 def converted(recording: Input, choice: Choice, form: str, path: Path) -> Any:
     """The file of a conversion, and what is said of it."""
-    with Output(path, form) as out:
+    with Output(path) as out:
         if form in TABLES:
-            said = to_table(recording, out, lambda _: None, form, choice)
+            said = to_table(recording, out, form, choice)
         else:
-            said = to_log(recording, out, lambda _: None, form, choice.start_ns, choice.end_ns)
+            said = to_log(recording, out, form, choice.start_ns, choice.end_ns)
     return said, path.read_bytes() if path.exists() else b""
 
 

@@ -8,8 +8,8 @@ import can
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.recordings.log_input import CanLogInput
 from kontronik_can_gw.frames import CanFrame
 
 Item = tuple[int, CanFrame, bool]
@@ -59,9 +59,9 @@ def _layout() -> BusLayout:
     return layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
 
 
-def opened(path: Path) -> CanLogInput:
+def opened(path: Path) -> Input:
     """By our reader."""
-    return CanLogInput(path, _layout())
+    return open_input(path, _layout())
 
 
 def read_log(path: Path) -> tuple[list[Item], list[str]]:

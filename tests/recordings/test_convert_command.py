@@ -138,36 +138,3 @@ def test_a_signal_leaves_no_half_file(tmp_path: Path, form: str, number: signal.
     assert process.returncode == 130
     assert said == "kontronik-can-gw convert: stopped: nothing is written\n"
     assert [path.name for path in tmp_path.iterdir()] == ["long.log"]
-
-
-# --- streams
-
-
-def _peak(source: Path, out: Path, *options: object) -> int:
-    """Peak memory in kB of a conversion."""
-    code = (
-        "import sys; from kontronik_can_gw.cli import main; code = main(['convert', *sys.argv[1:]]); "
-        "print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM'))); sys.exit(code)"
-    )
-    words = [sys.executable, "-c", code, str(source), str(out), "-q", *map(str, options)]
-    return int(
-        subprocess.run(words, capture_output=True, text=True, timeout=120, check=True).stdout
-    )
-
-
-@pytest.mark.extended
-@pytest.mark.parametrize("form", ["csv", "blf"])
-def test_memory_does_not_grow_with_the_file(tmp_path: Path, form: str) -> None:
-    lines = candump_lines(10_000)
-    small = write_candump(tmp_path / "small.log", lines)
-    large = tmp_path / "large.log"
-    step = lines[-1][0] - lines[0][0] + 10_000
-    text = small.read_text()
-    with large.open("w") as file:
-        for turn in range(8):
-            for line in text.splitlines(keepends=True):
-                us = int(line[1:11]) * 10**6 + int(line[12:18]) + turn * step
-                file.write(f"({us // 10**6}.{us % 10**6:06d}{line[18:]}")
-    before = _peak(small, tmp_path / "small.out", "--to", form)
-    after = _peak(large, tmp_path / "large.out", "--to", form)
-    assert after < before + 4_000

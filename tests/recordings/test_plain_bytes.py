@@ -84,7 +84,6 @@ def test_rows_are_the_frames_that_brute_force_finds(
     dropped = len(stream) - sum(len(frame.raw) for frame in found)
     told = [line.split()[0] for line in dump.damage if "belong to no frame" in line]
     assert told == ([str(dropped)] if dropped else [])
-    assert dump.position == len(stream)
 
 
 @pytest.mark.parametrize(

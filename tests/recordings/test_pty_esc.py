@@ -1,16 +1,12 @@
 """The ESC's pseudo terminal: bytes pass unchanged one way, and whatever comes back is noticed."""
 
 import os
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.desk.pty import PtyEsc, run
-from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik import Deframer
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Sent, SimulatedEsc
+from kontronik_can_gw.desk.pty import PtyEsc
 
 ALL_BYTES = bytes(range(256))
 
@@ -88,47 +84,3 @@ def test_a_link_is_replaced_leads_to_the_terminal_and_goes_with_it_unless_anothe
     assert str(link.readlink()) == second.path
     second.close()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_real_file_is_never_overwritten(tmp_path: Path) -> None:
-    link = tmp_path / "precious"
-    link.write_text("data")
-    with pytest.raises(RunError, match="precious: exists and is not a symbolic link"):
-        PtyEsc(link)
-    assert link.read_text() == "data"
-
-
-def test_several_escs_run_in_one_thread_and_every_frame_arrives() -> None:
-    options = EscOptions(period_ns=2_000_000, info_every=10)
-    terminals = [PtyEsc() for _ in range(4)]
-    sent: list[list[Sent]] = [[] for _ in terminals]
-    pairs = [(SimulatedEsc(options, seed=n), terminal) for n, terminal in enumerate(terminals)]
-
-    def record(index: int, one: Sent, taken: bool) -> None:
-        assert taken
-        sent[index].append(one)
-
-    run(pairs, seconds=0.1, on_sent=record)
-    for terminal, frames in zip(terminals, sent, strict=True):
-        assert len(frames) == 55
-        wire = b"".join(one.wire for one in frames)
-        found = Deframer().feed(read_exactly(terminal.path, len(wire)))
-        assert [frame.data for frame in found] == [one.data for one in frames]
-        assert terminal.dropped_bytes == terminal.received == 0
-        terminal.close()
-
-
-def test_the_run_ends_when_told_and_reports_what_a_gateway_sends(esc: PtyEsc) -> None:
-    over = threading.Event()
-    guilty: list[int] = []
-
-    def on_received(index: int) -> None:
-        guilty.append(index)
-        over.set()
-
-    fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
-    os.write(fd, b"+++")
-    run([(SimulatedEsc(), esc)], seconds=1e6, stop=over.is_set, on_received=on_received)
-    os.close(fd)
-    assert guilty == [0]
-    assert esc.received == 3

@@ -124,13 +124,6 @@ def test_rubbish_with_the_name_of_a_log_is_one_line(
     assert said == f"{path}: is no {NAMES[format_]}, whatever its name says, and no other recording"
 
 
-def test_a_huge_hole_is_refused_without_reading_it(tmp_path: Path) -> None:
-    path = tmp_path / "hole.log"
-    with path.open("wb") as file:
-        file.truncate(1 << 36)
-    assert "is no CAN log (candump)" in refused(2, "convert", path, tmp_path / "o.csv")
-
-
 def test_a_table_in_mf4_is_told_from_a_log(tmp_path: Path) -> None:
     table = tmp_path / "table.mf4"
     values = np.array([1.0, 2.0])
@@ -139,16 +132,3 @@ def test_a_table_in_mf4_is_told_from_a_log(tmp_path: Path) -> None:
         mdf.save(table)
     said = refused(2, "convert", table, tmp_path / "o.csv")
     assert "table.mf4: is a table of values (an MF4 measurement), no log of a CAN bus." in said
-
-
-@pytest.mark.parametrize(
-    ("words", "remedy"),
-    [
-        (["o.mf4"], "Type --to parquet (or csv) for a table, or --to mf4-log for the CAN frames"),
-        (["o.x", "--to", "mf4"], "Type --to parquet (or csv) for a table, or --to mf4-log"),
-        (["o.csv", "--frames"], "cantools decode"),
-        (["o.jsonl", "--units-line"], "Type --to csv or --to parquet, which have the units"),
-    ],
-)
-def test_what_was_removed_says_what_to_type(words: list[str], remedy: str) -> None:
-    assert remedy in refused(2, "convert", "flight.kcap", *words)

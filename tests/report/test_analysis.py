@@ -169,14 +169,6 @@ def test_losses_are_gaps_in_lines_and_events(
         assert all(v is None for v in inside[5:-5])
 
 
-def test_a_window_is_cut_out_with_the_times_of_the_whole(bus: BusLayout, rows: list[Row]) -> None:
-    part = analysed(analysis_of(bus, window=(10.0, 20.0)), rows)
-    assert part.origin_ns == rows[0][0]
-    assert 10 <= (part.start_ns - part.origin_ns) / S < 10.02
-    assert 19.98 < (part.end_ns - part.origin_ns) / S <= 20
-    assert part.rows == sum(10 * S <= t - rows[0][0] <= 20 * S for t, _ in rows)
-
-
 def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:
     bus = shipped_bus()
     top = int(SignalReader(bus.layout).columns[column(bus, "losses")].high)

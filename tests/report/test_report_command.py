@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from command_line import refused, run
+from command_line import run
 from report_flights import data_of
 
 from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults, SimulatedEsc
@@ -48,12 +48,3 @@ def test_the_page_can_go_to_standard_output_and_be_of_a_part(dump: Path) -> None
     assert "<h1>part &lt;1&gt;</h1>" in out
     assert "0:05.0 to 0:15.0 of the recording" in out
     assert not [event for event in data_of(out)["events"] if event["kind"] == "error"]
-
-
-def test_no_page_is_written_over_without_force(dump: Path, tmp_path: Path) -> None:
-    page = tmp_path / "flight.html"
-    page.write_text("mine")
-    assert refused(2, "report", dump, "-o", page) == f"{page}: exists. Give another -o, or --force."
-    assert page.read_text() == "mine"
-    assert report(dump, "-o", page, "--force")[0] == 0
-    assert page.read_text(encoding="utf-8").startswith("<!doctype html>")

@@ -210,12 +210,8 @@ def _can_lines(document: Document) -> Iterator[Text]:
 def _esc_rows(document: Document) -> Iterator[list[Part]]:
     yield [(head, "dim") for head in _WIDTHS]
     for esc in document["escs"]:
-        values, counters, link, age = (
-            esc["values"],
-            esc["counters"],
-            esc["link"],
-            esc["data_age_ms"],
-        )
+        values, counters, link = esc["values"], esc["counters"], esc["link"]
+        age = esc["data_age_ms"]
         yield [
             esc["name"][:12],
             (words(link)[:10], STATES.get(link, "bold red") if esc["fresh"] else "bold red"),

@@ -51,11 +51,7 @@ class BytesInput(PlayedInput):
         timeout_ns = max(layout.escs[0].timeout_ns, 3 * self._period_ns)
         escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
         setup = CaptureSetup(escs, (str(path),), None, DbcSettings(), False, False, None)
-        try:
-            size = path.stat().st_size
-        except OSError as error:
-            raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
-        super().__init__(str(path), layout, size, setup)
+        super().__init__(str(path), layout, setup)
         self.times_assumed = True
         self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
         if layout.config is None:
@@ -77,32 +73,19 @@ class BytesInput(PlayedInput):
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         if esc:
             raise UserError(f"{self.name}: holds the bytes of one ESC")
-        self.position = 0
         try:
             with self._path.open("rb") as file:
                 while data := file.read(CHUNK):
-                    self.position += len(data)
                     yield data
         except OSError as error:
-            raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
+            raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
 
     def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
         return None
 
-    def _play_frames(
-        self, gateway: Gateway, player: "Player | None", marked: bool
-    ) -> "Iterator[list[TimedFrame] | Frames]":
-        waiting = TransmitQueue()
-        for now in self._play(gateway, player, marked):
-            if player is not None:
-                yield player.take_frames()
-            else:
-                yield [TimedFrame(now, one) for one in in_order(gateway.take_frames(now), waiting)]
-
     def _play(
         self, gateway: Gateway, player: "Player | None" = None, marked: bool = False
-    ) -> Iterator[int]:
-        """Give all frames to a gateway; the times at which it may have something to send, of a player 0."""
+    ) -> "Iterator[list[TimedFrame] | Frames]":
         # it runs before the first byte
         gateway.port(0, True, 0)
         gateway.start(0)
@@ -111,19 +94,21 @@ class BytesInput(PlayedInput):
         if player is not None:
             yield from self._play_in_c(player)
             return
-        core, now = cast(PythonCore, gateway.core), 0
+        core, now, waiting = cast(PythonCore, gateway.core), 0, TransmitQueue()
+
+        def frames(now: int) -> list[TimedFrame]:
+            gateway.advance(now)
+            return [TimedFrame(now, one) for one in in_order(gateway.take_frames(now), waiting)]
+
         for now, reading in self._found(core.escs[0].decoder):
             while (due := gateway.next_deadline()) < now:
-                gateway.advance(due)
-                yield due
+                yield frames(due)
             core.accept(0, reading, now)
-            gateway.advance(now)
             gateway.take_link_changes()
-            yield now
-        gateway.advance(now)
-        yield now
+            yield frames(now)
+        yield frames(now)
 
-    def _play_in_c(self, player: "Player") -> Iterator[int]:
+    def _play_in_c(self, player: "Player") -> "Iterator[Frames]":
         """The same, and what ``_found`` does."""
         self.damage = []
         player.set_bytes(self._period_ns)
@@ -132,8 +117,8 @@ class BytesInput(PlayedInput):
             rest = rest[player.position - begin :] + (data or b"")
             begin = player.position
             while player.play_bytes(rest, begin, ended=data is None):
-                yield 0
-            yield 0
+                yield player.take_frames()
+            yield player.take_frames()
         self._describe_damage(player.counters)
 
     def _found(self, decoder: Any) -> Iterator[tuple[int, Reading]]:

@@ -49,7 +49,6 @@ class CaptureInput(PlayedInput):
         self._paths = list(paths)
         self._headerless: list[str] = []
         self._file: IO[bytes] | None = None
-        self.position = 0
         self.header = self._first_header()
         first = self._paths[0]
         try:
@@ -68,11 +67,7 @@ class CaptureInput(PlayedInput):
             layout = BusLayout(found[0], found[1], setup.escs)
         else:
             layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), setup.escs)
-        try:
-            size = sum(path.stat().st_size for path in self._paths)
-        except OSError as error:
-            raise RunError(f"{error.filename}: cannot be read: {error.strerror}.") from None
-        super().__init__(name, layout, size, setup)
+        super().__init__(name, layout, setup)
         self.sent_layout = NO_MESSAGES if found is None else found[1]
         self.created_ns = int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
         self._last_ns = self._impossible = 0
@@ -109,13 +104,8 @@ class CaptureInput(PlayedInput):
             if entry.kind == Kind.BYTES and entry.esc == esc:
                 yield entry.data
 
-    def _play(self, gateway: "Gateway", player: "Player | None" = None) -> Iterator[object]:
-        replay = Replay(gateway, self.header.get("state"))
-        yield from self._steps(replay, player)
-        self._add_losses(replay)
-
-    def _play_frames(
-        self, gateway: "Gateway", player: "Player | None", marked: bool
+    def _play(
+        self, gateway: "Gateway", player: "Player | None" = None, marked: bool = False
     ) -> "Iterator[list[TimedFrame] | Frames]":
         replay = Replay(gateway, self.header.get("state"), marked)
         for frames in self._steps(replay, player):
@@ -215,12 +205,10 @@ class CaptureInput(PlayedInput):
         """The header of the first part that has one; those before it are left out."""
         while True:
             path = self._paths[0]
-            for found in self._blocks(path):
+            for found in self._blocks(path, _LOOK_FOR_HEADER):
                 if isinstance(found, DataBlock) and found.kind == b"H":
                     with suppress(ValueError):
                         return read_json(found.payload)
-                if self.position > _LOOK_FOR_HEADER:
-                    break
             self.close()
             if len(self._paths) == 1:
                 raise UserError(
@@ -229,19 +217,18 @@ class CaptureInput(PlayedInput):
             self._headerless.append(f"{path.name}: has no header that could be read")
             del self._paths[0]
 
-    def _blocks(self, path: Path) -> Iterator[DataBlock | Damage]:
+    def _blocks(self, path: Path, limit: int = 1 << 62) -> Iterator[DataBlock | Damage]:
         scanner = Scanner()
         try:
             with path.open("rb") as self._file:
-                while data := self._file.read(CHUNK):
-                    self.position += len(data)
+                while self._file.tell() < limit and (data := self._file.read(CHUNK)):
                     yield from scanner.feed(data)
         except OSError as error:
             raise RunError(f"{path}: cannot be read: {error.strerror}.") from None
         yield from scanner.flush()
 
     def _data(self) -> Iterator[tuple[bytes, Damaged]]:
-        self.position = self._last_ns = self._impossible = 0
+        self._last_ns = self._impossible = 0
         self.damage = list(self._headerless)
         self._offsets = []
         for number, path in enumerate(self._paths):

@@ -67,20 +67,15 @@ def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
 
 def reader_of(value: EscValue) -> Read:
     """Gives a value, or its text."""
-    if value.names:
-        texts = value.names
+    names = value.names
+    is_whole = value.per_unit == 1 and value.divisor is Divisor.ONE
 
-        def text(esc: EscTelemetry, status: GatewayStatus, now: int) -> Value:
-            found = steps(value, esc, status, now)
-            return None if found is None else texts.get(found)
-
-        return text
-    per_unit = 1 if value.per_unit == 1 and value.divisor is Divisor.ONE else None
-
-    def number(esc: EscTelemetry, status: GatewayStatus, now: int) -> Value:
+    def read(esc: EscTelemetry, status: GatewayStatus, now: int) -> Value:
         found = steps(value, esc, status, now)
-        if found is None or per_unit is None:
-            return physical(value, esc, found)
-        return int(found)
+        if found is None:
+            return None
+        if names:
+            return names.get(found)
+        return int(found) if is_whole else physical(value, esc, found)
 
-    return number
+    return read

@@ -6,7 +6,7 @@ Each conversion returns what it wrote, in words; None where the recording has no
 import os
 import sys
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
@@ -101,13 +101,7 @@ class Output:
             self._part.unlink(missing_ok=True)
 
 
-Reached = Callable[[int], None]
-"""Is called with the bytes read so far."""
-
-
-def to_table(
-    recording: "Input", out: Output, reached: Reached, form: str, choice: "Choice"
-) -> str | None:
+def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> str | None:
     """To a table."""
     from kontronik_can_gw.desk.recordings.tables.rows import rows_of
 
@@ -121,7 +115,6 @@ def to_table(
             writer.write(block)
             count += len(block)
             last_ns = block.times[-1] - table.origin_ns
-            reached(recording.position)
         writer.close()
     except BaseException:
         writer.discard()
@@ -144,7 +137,6 @@ def _table_writer(file: IO[bytes], form: str, table: "Table") -> "ParquetTable |
 def to_log(
     recording: "Input",
     out: Output,
-    reached: Reached,
     form: str,
     start_ns: int | None = None,
     end_ns: int | None = None,
@@ -171,8 +163,6 @@ def to_log(
             writer.write_all(frames, origin_ns)
             count += len(frames)
             last_ns = _time_at(frames, -1)
-            reached(recording.position)
-        reached(recording.position)
         writer.close()
     except BaseException:
         writer.discard()
@@ -210,13 +200,12 @@ def _cut(
             yield found
 
 
-def to_bytes(recording: "Input", out: Output, reached: Reached, esc: int) -> str | None:
+def to_bytes(recording: "Input", out: Output, esc: int) -> str | None:
     """To the plain bytes of one ESC."""
     file, count = out.open(), 0
     for data in recording.esc_bytes(esc):
         file.write(data)
         count += len(data)
-        reached(recording.position)
     if not count:
         return None
     out.is_whole = True

@@ -42,8 +42,9 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
         raise UserError(f"{path}: is empty")
     if MAGIC in head or path.suffix == SUFFIX:
         return CaptureInput([path], layout)
-    if log_format(path) is not None:
-        return CanLogInput(path, layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc")))
+    if (found := log_format(head, path.suffix)) is not None:
+        layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+        return CanLogInput(path, layout, found)
     if UART_MAGIC in head:
         return BytesInput(path, layout, live_rate)
     if (called := SUFFIXES.get(path.suffix.lower())) is not None:

@@ -6,7 +6,7 @@ from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.can_logs.log import log_format, reader_of
+from kontronik_can_gw.desk.recordings.can_logs.log import reader_of
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS, Damage
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -22,13 +22,11 @@ _AHEAD_NS = 86_400 * SECOND_NS
 
 
 class CanLogInput(Input):
-    """A log of CAN frames. UserError where it is no log that is known, or a table; RunError where it cannot be read."""
+    """A log of CAN frames. UserError for a table in MF4, RunError where it cannot be read."""
 
-    def __init__(self, path: Path, layout: BusLayout) -> None:
-        self.format = log_format(path) or ""
-        if not self.format:
-            raise UserError(f"{path}: is no CAN log that is known (candump, ASC, BLF, TRC, MF4).")
-        super().__init__(str(path), layout, path.stat().st_size)
+    def __init__(self, path: Path, layout: BusLayout, format_: str) -> None:
+        self.format = format_
+        super().__init__(str(path), layout)
         self._path = path
         self._open()
 
@@ -52,12 +50,10 @@ class CanLogInput(Input):
         self.others = 0
         try:
             for item in self._in_time():
-                self.position = min(self._reader.position, self.size)
                 self.others += item.frame.key not in ours
                 yield item
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
-        self.position = self.size
         self.damage = self._damage.texts()
 
     def _in_time(self) -> Iterator[TimedFrame]:

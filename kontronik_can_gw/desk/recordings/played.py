@@ -30,8 +30,8 @@ class PlayedInput(Input):
     created_ns = 0
     """When the gateway was made: its cycles count from there."""
 
-    def __init__(self, name: str, bus: BusLayout, size: int, setup: CaptureSetup) -> None:
-        super().__init__(name, bus, size)
+    def __init__(self, name: str, bus: BusLayout, setup: CaptureSetup) -> None:
+        super().__init__(name, bus)
         self.setup = setup
         self.sent_layout = bus.layout
 
@@ -40,14 +40,10 @@ class PlayedInput(Input):
         """What was recorded, in its order; of plain bytes these at their times."""
 
     @abstractmethod
-    def _play(self, gateway: Gateway, player: "Player | None" = None) -> Iterator[object]:
-        """Give all that was recorded to a gateway, or to the player of its core; an item now and then."""
-
-    @abstractmethod
-    def _play_frames(
-        self, gateway: Gateway, player: "Player | None", marked: bool
+    def _play(
+        self, gateway: Gateway, player: "Player | None" = None, marked: bool = False
     ) -> "Iterator[list[TimedFrame] | Frames]":
-        """The same; the CAN frames that were sent and received."""
+        """Give all that was recorded to a gateway, or to the player of its core; the CAN frames that were sent and received."""
 
     def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
         for frames in self.batches(marked):
@@ -62,7 +58,7 @@ class PlayedInput(Input):
         has_frames_of_its_own = self.setup.canopen is not None or self.setup.outputs
         found = None if has_frames_of_its_own else self._player_of(make, None)
         player, gateway = found or (None, make())
-        return self._play_frames(gateway, player, marked)
+        return self._play(gateway, player, marked)
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         fields = [self.fields[index] for index in chosen]

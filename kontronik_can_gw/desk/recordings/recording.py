@@ -89,15 +89,12 @@ class PlayedBlock(Block):
 class Input(ABC):
     """A recording. Each of ``frames``, ``blocks``, ``esc_bytes`` reads it from its beginning.
 
-    ``position``: bytes read so far, of ``size``. ``damage`` (what was not intact) has a line each and is complete when it was read to
-    the end.
+    ``damage`` (what was not intact) has a line each and is complete when it was read to the end.
     """
 
-    def __init__(self, name: str, bus: BusLayout, size: int) -> None:
+    def __init__(self, name: str, bus: BusLayout) -> None:
         self.name = name
         self.bus = bus
-        self.size = size
-        self.position = 0
         self.provenance: dict[str, str] = {}
         """What is known of where it came from, in words."""
         self.damage: list[str] = []

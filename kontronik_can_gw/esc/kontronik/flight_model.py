@@ -1,9 +1,10 @@
 """The flight of a simulated ESC: battery, motor and heat, as live data and information."""
 
+from collections.abc import Sequence
 from random import Random
+from typing import NamedTuple
 
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant, rows
-from kontronik_can_gw.esc.kontronik.simulator_options import POWER_UP, EscOptions
 from kontronik_can_gw.esc.kontronik.states import (
     Device,
     OperatingError,
@@ -35,13 +36,47 @@ _LOGGED_FROM_ZERO = frozenset(
 """The log of their greatest values begins at 0."""
 
 
-class FlightModel:
-    """Battery, motor and heat of one ESC since its power-up, stepped once a period."""
+class Phase(NamedTuple):
+    """A part of the profile. The throttle moves evenly to ``throttle`` within ``ramp_s``, then stays."""
 
-    def __init__(self, options: EscOptions, device: Device, seed: int) -> None:
-        self._profile = options.profile
+    name: str
+    duration_s: float
+    throttle: int
+    """-100..100 %; the motor is driven above 0 and braked by regeneration below 0."""
+    state: OperatingState
+    ramp_s: float = 1.0
+
+
+POWER_UP = (
+    Phase("self-test", 0.2, 0, OperatingState.Selftest),
+    Phase("wait", 0.3, 0, OperatingState.WaitForMotorOff),
+    Phase("beep", 0.5, 0, OperatingState.AcousticSignal),
+)
+"""Played once after power-up."""
+
+FLIGHT = (
+    Phase("idle", 4, 0, OperatingState.MotorOff),
+    Phase("spool-up", 4, 60, OperatingState.SpoolUpFromStill, 4),
+    Phase("hover", 8, 65, OperatingState.RPMControl),
+    Phase("climb", 6, 95, OperatingState.RPMControl, 2),
+    Phase("regeneration", 2, -20, OperatingState.Brake, 0.5),
+    Phase("recover", 2, 60, OperatingState.SpoolUpFromTurn, 2),
+    Phase("cruise", 8, 55, OperatingState.Forward),
+    Phase("stop", 4, -30, OperatingState.Brake, 0.5),
+    Phase("cool-down", 12, 0, OperatingState.MotorOff, 0.5),
+)
+"""The profile, 50 s, repeated for ever."""
+
+
+class FlightModel:
+    """Battery, motor and heat of one ESC since its power-up, stepped each ``period_s``."""
+
+    def __init__(
+        self, profile: Sequence[Phase], period_s: float, device: Device, seed: int
+    ) -> None:
+        self._profile = profile
         self._device = device
-        self._dt = options.period_ns / 1e9
+        self._dt = period_s
         self._random = Random(f"model {seed}").random
         self._measures_battery_peak = device.peak_current_of == "battery"
         self._supplies_bec_current = device not in _SUPPLIES_NO_BEC_CURRENT

@@ -9,29 +9,82 @@ battery voltage of 0.00 V before the motor has run, the peak current as a held m
 """
 
 import math
+from dataclasses import dataclass, field
 from random import Random
 from typing import NamedTuple
 
 from kontronik_can_gw.esc.kontronik.codec import Layout as Layout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import Data
+from kontronik_can_gw.esc.kontronik.flight_model import FLIGHT as FLIGHT
 from kontronik_can_gw.esc.kontronik.flight_model import FlightModel
-from kontronik_can_gw.esc.kontronik.simulator_options import FLIGHT as FLIGHT
-from kontronik_can_gw.esc.kontronik.simulator_options import POWER_UP as POWER_UP
-from kontronik_can_gw.esc.kontronik.simulator_options import SECOND_NS as SECOND_NS
-from kontronik_can_gw.esc.kontronik.simulator_options import Dropout as Dropout
-from kontronik_can_gw.esc.kontronik.simulator_options import ErrorWindow as ErrorWindow
-from kontronik_can_gw.esc.kontronik.simulator_options import EscOptions as EscOptions
-from kontronik_can_gw.esc.kontronik.simulator_options import Faults as Faults
-from kontronik_can_gw.esc.kontronik.simulator_options import Phase as Phase
-from kontronik_can_gw.esc.kontronik.simulator_options import Swap as Swap
-from kontronik_can_gw.esc.kontronik.simulator_options import usual_layout as usual_layout
+from kontronik_can_gw.esc.kontronik.flight_model import Phase as Phase
 from kontronik_can_gw.esc.kontronik.states import Device as Device
 from kontronik_can_gw.esc.kontronik.states import OperatingError as OperatingError
 from kontronik_can_gw.esc.kontronik.states import SelfTestError as SelfTestError
 
+SECOND_NS = 1_000_000_000
 BYTE_NS = 11 * SECOND_NS // 115_200
 """Wire time of a byte: start, 8 data, parity, stop."""
+
+
+class Dropout(NamedTuple):
+    """The line is silent for the last ``duration_ns`` of every ``interval_ns``."""
+
+    duration_ns: int
+    interval_ns: int
+
+
+class ErrorWindow(NamedTuple):
+    """An error bit that is set from ``start_ns`` for ``duration_ns`` (None: for ever), counted from the simulation's start."""
+
+    bit: OperatingError | SelfTestError
+    start_ns: int
+    duration_ns: int | None = None
+
+
+class Swap(NamedTuple):
+    """Another device is plugged in ``time_ns`` after the simulation's start. Layout None: the device's usual one."""
+
+    time_ns: int
+    device: Device
+    layout: Layout | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Faults:
+    """What goes wrong."""
+
+    noise: float = 0.0
+    """Mean number of random bytes in front of a frame, 0..1000."""
+    lost_bytes: float = 0.0
+    """Share of the frames' bytes that get lost, 0..1."""
+    flipped_bits: float = 0.0
+    """Share of the frames' bits that are flipped, 0..1."""
+    dropout: Dropout | None = None
+    errors: tuple[ErrorWindow, ...] = ()
+    swaps: tuple[Swap, ...] = ()
+    """In order of time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EscOptions:
+    """What ESC it is, and how it sends."""
+
+    device: Device = Device.KOSMIK
+    layout: Layout | None = None
+    """None: the device's usual one."""
+    period_ns: int = 10_000_000
+    """From live frame to live frame, 100 µs..10 s."""
+    info_every: int = 100
+    """An info frame after every n-th live frame; 0: never."""
+    profile: tuple[Phase, ...] = FLIGHT
+    faults: Faults = field(default_factory=Faults)
+
+
+def usual_layout(device: Device) -> Layout:
+    """The layout in which the simulated device sends by default: legacy for the JIVEPro as recorded, else V4."""
+    return Layout.LEGACY if device is Device.JIVEPRO else Layout.V4
 
 
 class Sent(NamedTuple):
@@ -67,7 +120,7 @@ class SimulatedEsc:
         self._tick_ns = start_ns
         self._frame_number = 0
         self._info_due = False
-        self._model = FlightModel(options, options.device, seed)
+        self._model = self._powered_up(options.device, seed)
         self._swaps = list(reversed(faults.swaps))
         self._faults = faults
         self._random = Random(f"faults {seed}")
@@ -118,10 +171,12 @@ class SimulatedEsc:
     def _plug_in(self, swap: Swap) -> None:
         self.device = swap.device
         self.layout = swap.layout or usual_layout(swap.device)
-        self._model = FlightModel(
-            self._options, swap.device, self._seed + 1_000_003 * (1 + len(self._swaps))
-        )
+        self._model = self._powered_up(swap.device, self._seed + 1_000_003 * (1 + len(self._swaps)))
         self._frame_number = 0
+
+    def _powered_up(self, device: Device, seed: int) -> FlightModel:
+        options = self._options
+        return FlightModel(options.profile, options.period_ns / SECOND_NS, device, seed)
 
     def _word(self, kind: type[OperatingError] | type[SelfTestError], since_start: int) -> int:
         word = 0

@@ -46,16 +46,13 @@ class LibraryReader:
     def __init__(self, file: BinaryIO, damage: Damage) -> None:
         self._file = file
         self._damage = damage
-        self.position = 0
-        self._size = file.seek(0, 2)
-        file.seek(0)
 
     def __iter__(self) -> Iterator[TimedFrame]:
         done = wrong = 0
         try:
             with warnings.catch_warnings(action="ignore"):
-                for done, message in enumerate(self._reader or (), 1):
-                    self.position = self._position(done)
+                for message in self._reader or ():
+                    done += 1
                     try:
                         if (item := frame_of(message)) is not None:
                             yield item
@@ -65,9 +62,6 @@ class LibraryReader:
             self._damage.notes.append(f"damaged after {done} frames ({_short(error)})")
         if wrong:
             self._damage.notes.append(f"{wrong} damaged frame{'s' if wrong > 1 else ''} left out")
-
-    def _position(self, done: int) -> int:
-        raise NotImplementedError
 
     def close(self) -> None:
         """Release what the library holds."""
@@ -93,20 +87,18 @@ class BlfReader(LibraryReader):
 
     def __init__(self, file: BinaryIO, damage: Damage) -> None:
         super().__init__(file, damage)
+        size = os.fstat(file.fileno()).st_size
         try:
             self._reader = reader = _SoundObjects(file)
         except (BLFParseError, struct.error, ValueError, OverflowError):
             damage.notes.append("its header is damaged")
             return
-        if self._size < reader.file_size < 1 << 48:
-            sizes = f"{self._size} of its {reader.file_size} bytes are there"
+        if size < reader.file_size < 1 << 48:
+            sizes = f"{size} of its {reader.file_size} bytes are there"
             damage.notes.append(f"the file is cut off: {sizes}")
         if reader.start_timestamp >= OLDEST_WALL_S:
             self.wall_start_ns = round(reader.start_timestamp * 1000) * _MS
         reader.start_timestamp = 0.0
-
-    def _position(self, done: int) -> int:  # noqa: ARG002
-        return self._file.tell()
 
 
 class Mf4Reader(LibraryReader):
@@ -118,7 +110,6 @@ class Mf4Reader(LibraryReader):
         self._reader = reader = _opened(mf4_library().MF4Reader, path)
         start = reader._mdf.header.start_time.timestamp()
         groups = [group for group in reader._mdf.groups if group.channel_group.cycles_nr]
-        self._total = sum(group.channel_group.cycles_nr for group in groups)
         names = {channel.name for group in groups for channel in group.channels}
         if groups and not any(name.startswith("CAN_") for name in names):
             self.close()
@@ -130,9 +121,6 @@ class Mf4Reader(LibraryReader):
             fraction = int(reader._mdf.header.abs_time) % SECOND_NS
             self.wall_start_ns = round(start - fraction / SECOND_NS) * SECOND_NS + fraction
         reader._start_timestamp = 0.0
-
-    def _position(self, done: int) -> int:
-        return int(self._size * done // self._total)
 
     def close(self) -> None:
         """Close the file."""

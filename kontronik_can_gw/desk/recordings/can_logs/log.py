@@ -1,11 +1,9 @@
 """The format of a CAN log, by its content, and what reads it."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.desk.recordings.can_logs import text
-from kontronik_can_gw.errors import RunError
 
 SUFFIXES = {
     ".log": "candump",
@@ -24,7 +22,7 @@ NAMES = {
     "mf4": "MF4 file",
 }
 """What people call the formats."""
-_HEAD, _HEAD_LINES = 1 << 16, 2000
+_HEAD_LINES = 2000
 _LINES: dict[str, Callable[[bytes], object]] = {
     "candump": text.candump_line,
     "asc": text.asc_line,
@@ -33,13 +31,8 @@ _LINES: dict[str, Callable[[bytes], object]] = {
 _BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
 
 
-def log_format(path: Path) -> str | None:
-    """The format of a log by its content; None: no log. RunError where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
+def log_format(head: bytes, suffix: str) -> str | None:
+    """The format of a log by its first bytes; None: no log. an empty one has that of its ``suffix``."""
     for magic, found in _BEGINNINGS.items():
         if head.startswith(magic):
             return found
@@ -47,7 +40,7 @@ def log_format(path: Path) -> str | None:
         for found, is_line in _LINES.items():
             if is_line(line):
                 return found
-    return None if head.strip() else SUFFIXES.get(path.suffix.lower())
+    return None if head.strip() else SUFFIXES.get(suffix.lower())
 
 
 def reader_of(format_: str) -> Callable[..., Any]:

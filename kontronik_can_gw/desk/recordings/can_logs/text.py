@@ -88,11 +88,6 @@ class TextReader:
         self._read_head([file.readline(LONGEST_LINE) for _ in range(_HEAD_LINES)])
         file.seek(0)
 
-    @property
-    def position(self) -> int:
-        """Bytes read so far."""
-        return self._file.tell()
-
     def close(self) -> None:
         """Nothing is held."""
 
@@ -128,25 +123,21 @@ def _nanoseconds(text: bytes) -> int:
 
 _ID = rb"(?:(?P<none>[2367ABEFabef][0-9A-Fa-f]{7})|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))"
 """``none``: the id of an error frame."""
-_CANDUMP = rb"[ \t]*\((?P<time>\d+\.\d+)\)[ \t]+[\x21-\x7e]{1,64}[ \t]+"
 _LINE = re.compile(
-    _CANDUMP + _ID + rb"#(?:(?P<fd>#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2})*)(?:_[0-9A-Fa-f])?"
+    rb"[ \t]*\((?P<time>\d+\.\d+)\)[ \t]+[\x21-\x7e]{1,64}[ \t]+"
+    + _ID
+    + rb"#(?:(?P<fd>#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2})*)(?:_[0-9A-Fa-f])?"
     rb"|(?P<remote>[Rr][0-9A-Fa-f]{0,2}))(?:[ \t]+(?P<dir>[RTrt]))?\s*"
 )
-_SCREEN_LINE = re.compile(
-    _CANDUMP + rb"(?:(?P<dir>RX|TX) [B-] [E-][ \t]+)?" + _ID + rb"[ \t]+\[(?P<size>\d{1,2})\]"
-    rb"(?:(?P<data>(?:[ \t]+[0-9A-Fa-f]{2})*)(?:[ \t]+'.*'|[ \t]+ERRORFRAME)?|[ \t]+(?P<remote>remote request))\s*"
-)
-"""What ``candump -ta`` shows; a length of two digits is one of CAN FD."""
 
 
 def candump_line(line: bytes) -> "re.Match[bytes] | None":
-    """A line of ``candump -L`` (``(1700000000.123456) can0 681#0011223344556677 R``), or as ``candump -ta`` shows it."""
-    return _LINE.fullmatch(line) or _SCREEN_LINE.fullmatch(line)
+    """A line of ``candump -L``: ``(1700000000.123456) can0 681#0011223344556677 R``."""
+    return _LINE.fullmatch(line)
 
 
 class CandumpReader(TextReader):
-    """``candump -L`` and ``-l``, and ``candump -ta``."""
+    """``candump -L`` and ``-l``."""
 
     def _read_head(self, lines: list[bytes]) -> None:
         first = next(filter(None, map(candump_line, lines)), None)
@@ -161,11 +152,7 @@ class CandumpReader(TextReader):
         if found["none"] or found["remote"]:
             return None
         data = bytes.fromhex((found["data"] or b"").decode())
-        size = found.get("size")
-        if size is not None and int(size) != len(data):
-            raise ValueError
-        is_fd = found["fd"] is not None if size is None else len(size) == 2
-        frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, is_fd)
+        frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, found["fd"] is not None)
         received = (found["dir"] or b"")[:1] in (b"R", b"r")
         return TimedFrame(_nanoseconds(found["time"]), frame, received)
 
