@@ -152,18 +152,6 @@ def test_rubbish_instead_of_an_answer_ends_nothing(monkeypatch: pytest.MonkeyPat
             turning(lambda client=client: client.problem, client)  # type: ignore[misc]
 
 
-def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(mqtt_client, "KEEPALIVE_S", 1)
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        client = MqttClient(to(mute.getsockname()[1]), "test", ONLINE)
-        client.start()
-        text = "does not answer as an MQTT broker. Is the port right"
-        turning(lambda: text in (client.problem or ""), client)
-        client.stop(0.3)
-
-
 # --- TLS
 
 

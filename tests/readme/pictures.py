@@ -1,6 +1,6 @@
-"""Pictures of the live screen and of a report, for the pages: python tests/readme/pictures.py [FOLDER]
+"""Pictures of the live screen and of a report, which pages show: python tests/readme/pictures.py [FOLDER]
 
-Without FOLDER those that pages show, in docs/pictures; else all kinds, to look at. Run by `make pictures`, which has the path.
+Without FOLDER in docs/pictures. Run by `make pictures`, which has the path.
 """
 
 import base64
@@ -27,12 +27,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 )
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
-SIZES = ((80, 24), (120, 40))
-VIEWS = {
-    "desktop": (1280, 900, {}),
-    "dark": (1280, 900, {"dark": True}),
-    "phone": (390, 844, {"phone": True}),
-}
+SIZE = (80, 24)
 SHOWN = ("monitor_1_80.svg", "monitor_4_80.svg", "report_desktop.png")
 
 
@@ -52,27 +47,21 @@ def monitors(folder: Path) -> None:
         for now, frame in flight(bus, 31, [option(28)]):
             monitor.take(frame, now)
             monitor.advance(now)
-        for size in SIZES:
-            console = Console(
-                record=True,
-                file=io.StringIO(),
-                width=size[0],
-                force_terminal=True,
-                color_system="truecolor",
-            )
-            for line in screen(monitor, source, size, 0):
-                console.print(line, no_wrap=True)
-            picture = console.export_svg(title="kontronik-can-gw monitor", unique_id="m")
-            # letters of the reader's own machine, not from a server
-            picture = re.sub(r"@font-face \{.*?\}\s*", "", picture, flags=re.DOTALL)
-            picture = picture.replace(
-                "font-family: Fira Code", "font-family: Fira Code, DejaVu Sans Mono"
-            )
-            (folder / f"monitor_{count}_{size[0]}.svg").write_text(picture, encoding="utf-8")
+        console = Console(
+            record=True, file=io.StringIO(), width=SIZE[0], force_terminal=True, color_system="truecolor"
+        )  # fmt: skip
+        for line in screen(monitor, source, SIZE, 0):
+            console.print(line, no_wrap=True)
+        picture = console.export_svg(title="kontronik-can-gw monitor", unique_id="m")
+        # letters of the reader's own machine, not from a server
+        picture = re.sub(r"@font-face \{.*?\}\s*", "", picture, flags=re.DOTALL)
+        font = "font-family: Fira Code"
+        picture = picture.replace(font, f"{font}, DejaVu Sans Mono")
+        (folder / f"monitor_{count}_{SIZE[0]}.svg").write_text(picture, encoding="utf-8")
 
 
 def reports(folder: Path) -> None:
-    """Two ESCs, on a desktop, in the dark and on a phone."""
+    """Two ESCs, on a desktop."""
     with tempfile.TemporaryDirectory() as scratch:
         log, page = Path(scratch, "flight.log"), Path(scratch, "flight.html")
         toml = Path(scratch, "gateway.toml")
@@ -85,23 +74,17 @@ def reports(folder: Path) -> None:
         done = run("report", log, "-c", toml, "-o", page)
         assert done.code == 0, done.err
         with Browser(Path(scratch, "profile")) as browser:
-            for name, (width, height, how) in VIEWS.items():
-                browser.open(page, width, height, **how)
-                shot = browser.call("Page.captureScreenshot", format="png")["data"]
-                (folder / f"report_{name}.png").write_bytes(base64.b64decode(shot))
+            browser.open(page, 1280, 900)
+            shot = browser.call("Page.captureScreenshot", format="png")["data"]
+            (folder / "report_desktop.png").write_bytes(base64.b64decode(shot))
 
 
 def main(folder: Path) -> None:
     if PROGRAM is None:
         sys.exit(MISSING)
-    with tempfile.TemporaryDirectory() as scratch:
-        made = Path(scratch)
-        monitors(made)
-        reports(made)
-        folder.mkdir(parents=True, exist_ok=True)
-        for path in sorted(made.iterdir()):
-            if folder != FOLDER or path.name in SHOWN:
-                (folder / path.name).write_bytes(path.read_bytes())
+    folder.mkdir(parents=True, exist_ok=True)
+    monitors(folder)
+    reports(folder)
 
 
 if __name__ == "__main__":
