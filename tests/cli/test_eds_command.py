@@ -140,9 +140,9 @@ def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_maste
 def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
     """Byte for byte: encoded by the canopen library, and as an SDO upload gives it."""
     node = shipped_canopen([5]).nodes([EscSettings()]).nodes[0]
-    text = command("--node-id", 5)[1]
-    dictionary = imported(text)
-    assert "LSS_SerialNumber" not in text  # there is none to look for
+    written = command("--node-id", 5)[1]
+    dictionary = imported(written)
+    assert "LSS_SerialNumber" not in written  # there is none to look for
     assert (dictionary.node_id, dictionary.bitrate) == (5, 500_000)
     found = values(dictionary)
     assert len(found) > 100
