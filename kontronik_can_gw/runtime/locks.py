@@ -73,16 +73,6 @@ def file_name(name: str, namespace: int) -> str:
     return f"{namespace}.{text}"
 
 
-def lock_name(file: str, namespace: int) -> str | None:
-    """The lock that a file stands for; None for one of another network namespace."""
-    found, _, text = file.partition(".")
-    return (
-        text.replace("%2F", "/").replace("%25", "%").removeprefix(PREFIX)
-        if found == str(namespace)
-        else None
-    )
-
-
 def is_held(status: os.stat_result, lines: str) -> bool:
     """Whether somebody has a file locked, by the text of /proc/locks: so it need not be opened, which others may not."""
     place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"

@@ -80,14 +80,6 @@ def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
 # --- the DCF of the defaults
 
 
-def test_a_dcf_without_a_configuration_names_no_serial_number_to_look_for() -> None:
-    text = command("--node-id", 3)[1]
-    assert "LSS_SerialNumber" not in text
-    assert values(imported(text))[0x1018, 4] == 0
-    assert imported(text).node_id == 3
-    assert imported(text).bitrate == 500_000
-
-
 @pytest.mark.parametrize(
     ("output", "named"),
     [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf"), ("a;b.dcf", "mine_1.dcf")],
@@ -148,7 +140,10 @@ def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_maste
 def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
     """Byte for byte: encoded by the canopen library, and as an SDO upload gives it."""
     node = shipped_canopen([5]).nodes([EscSettings()]).nodes[0]
-    dictionary = imported(command("--node-id", 5)[1])
+    written = command("--node-id", 5)[1]
+    dictionary = imported(written)
+    assert "LSS_SerialNumber" not in written  # there is none to look for
+    assert (dictionary.node_id, dictionary.bitrate) == (5, 500_000)
     found = values(dictionary)
     assert len(found) > 100
     # a tool that writes all values must not store, restore or clear anything

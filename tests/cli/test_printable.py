@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from command_line import run
 
-from kontronik_can_gw.cli import main, say, show
+from kontronik_can_gw.cli import say, show
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
@@ -63,16 +63,6 @@ def test_a_log_line_is_one_line() -> None:
     handler.close()
     assert stream.getvalue().startswith(f"WARNING said {SHOWN}\nERROR b\nTraceback")
     assert is_clean(stream.getvalue())
-
-
-def test_what_a_library_logs(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    main(["schema"])
-    capsys.readouterr()
-    assert logging.lastResort is not None
-    logging.lastResort.handle(record("cantools", logging.WARNING, "overwriting %s", EVIL))
-    assert capsys.readouterr().err == f"kontronik-can-gw: overwriting {SHOWN}\n"
 
 
 # --- from end to end

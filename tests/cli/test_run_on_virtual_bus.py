@@ -1,9 +1,6 @@
 """The gateway at work on pseudo terminals and python-can's in-process bus."""
 
 import os
-import re
-import subprocess
-import sys
 import termios
 import threading
 import time
@@ -20,7 +17,6 @@ from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.loop import Loop
 
-PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIVE = LiveData(
     electrical_speed=12_345, battery_voltage=2442, battery_current=-17, operating_state=21
 )
@@ -114,13 +110,3 @@ def test_stopping_a_loop_that_has_ended_writes_to_nobody(esc: PtyEsc) -> None:
                 os.read(reader, 1)
             os.close(reader)
             os.close(writer)
-
-
-@pytest.mark.extended
-def test_the_demonstration_in_a_pipe_prints_plain_lines() -> None:
-    command = [*PROGRAM, "demo", "--seconds", "3"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"esc1 +\w+ +\d+ Hz ", done.stdout)
-    assert "\x1b" not in done.stdout
-    assert "CAN frames decoded" in done.stderr

@@ -47,14 +47,9 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        *(
-            (module, ["check", "-c", "gateway.toml"])
-            for module in (
-                *("kontronik_can_gw.cli", "argparse", "kontronik_can_gw.cli.check"),
-                *("kontronik_can_gw.config.keys", "cantools.database"),
-            )
-        ),
-        ("kontronik_can_gw.canopen.eds", ["eds"]),
+        ("kontronik_can_gw.cli", ["check", "-c", "gateway.toml"]),
+        ("argparse", ["check", "-c", "gateway.toml"]),
+        ("cantools.database", ["check", "-c", "gateway.toml"]),
         ("kontronik_can_gw.cli.run", ["run", "-c", "gateway.toml"]),
     ],
 )
@@ -76,7 +71,7 @@ def test_who_has_ctrl_c_ignored_is_not_ended_by_it(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["run --wait -c gateway.toml", "check -c gateway.toml", "status", "eds"],
+    ["run --wait -c gateway.toml", "check -c gateway.toml", "status"],
 )
 @pytest.mark.parametrize("limit", [5, 63])
 def test_too_few_open_files_are_one_line(limit: int, words: str, folder: Path) -> None:

@@ -10,7 +10,6 @@ from command_line import run, written
 
 from kontronik_can_gw.desk.doctor import ports
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.native.load import PURE, library
 
 
 @pytest.fixture
@@ -77,18 +76,6 @@ def test_an_error_has_its_exit_code_and_the_rest_is_looked_at_all_the_same(
     assert said in errors[0]["text"]
     assert "Machine" in {f["group"] for f in findings}
     assert ("Serial port of esc1" in {f["group"] for f in findings}) == ("cann" not in more)
-
-
-def test_the_core_that_would_run_is_named(
-    tmp_path: Path, esc: PtyEsc, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    library.cache_clear()
-    monkeypatch.setenv(PURE, "1")
-    findings, _ = document(configuration(tmp_path, esc.path), 0)
-    library.cache_clear()
-    (found,) = (each for each in findings if each["check"] == "config.core")
-    said = "core: Python (KONTRONIK_PURE is set): slower, with the same results"
-    assert (found["severity"], found["text"]) == ("note", said)
 
 
 def test_nothing_is_made_or_changed(tmp_path: Path, esc: PtyEsc) -> None:

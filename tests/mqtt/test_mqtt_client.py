@@ -53,6 +53,12 @@ def to(port: int) -> MqttConfig:
     return MqttConfig(broker=f"127.0.0.1:{port}")
 
 
+def waiting(client: MqttClient) -> int:
+    """Number of messages that are not sent yet."""
+    handed = sum(not mqtt_client._is_done(info) for info in client._handed.values())
+    return len(client._waiting) + handed
+
+
 def turning(condition: Callable[[], object], *clients: MqttClient) -> None:
     """Call ``turn`` as the command does, until something holds."""
 
@@ -74,10 +80,10 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
         client.offer(Message("k/test/other", b"%d" % number))
     client.offer(Message("k/test/known", b"1", lasting=True, retain=True))
     client.offer(Message("k/test/known", b"2", lasting=True, retain=True))
-    assert client.waiting == 3
+    assert waiting(client) == 3
     with Subscriber(broker.port, "k/test/#") as heard:
         client.start()
-        turning(lambda: client.problem == "" and not client.waiting, client)
+        turning(lambda: client.problem == "" and not waiting(client), client)
         heard.wait("k/test/other", b"999")
         client.stop(PATIENCE)
         wait_for(lambda: heard.heard[-1].payload == b"offline", heard.heard)
@@ -104,9 +110,9 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(own: Mosquitto) -> No
         own.freeze(True)
         for _ in range(100):
             offer()
-        assert client.waiting <= 3  # "online"; a state is with paho, and the newest waits
+        assert waiting(client) <= 3  # "online"; a state is with paho, and the newest waits
         own.freeze(False)
-        turning(lambda: not client.waiting, client)
+        turning(lambda: not waiting(client), client)
         heard.wait("k/test/state", sent[-1])
         numbers = [int(message.payload[:6]) for message in heard.heard]
         assert numbers == sorted(numbers)
@@ -150,18 +156,6 @@ def test_rubbish_instead_of_an_answer_ends_nothing(monkeypatch: pytest.MonkeyPat
         with listener, connecting(to(port)) as client:
             turning(lambda got=got: len(got) == 2, client)  # type: ignore[misc]  # it tries again
             turning(lambda client=client: client.problem, client)  # type: ignore[misc]
-
-
-def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(mqtt_client, "KEEPALIVE_S", 1)
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        client = MqttClient(to(mute.getsockname()[1]), "test", ONLINE)
-        client.start()
-        text = "does not answer as an MQTT broker. Is the port right"
-        turning(lambda: text in (client.problem or ""), client)
-        client.stop(0.3)
 
 
 # --- TLS
@@ -221,15 +215,15 @@ def test_tls_with_an_authority_of_ones_own(
         turning(lambda: client.problem == "", client)
         # more than a record of TLS, and than the kernel takes at once
         client.offer(Message("k/tls/big", b"x" * 300_000, lasting=True))
-        turning(lambda: not client.waiting, client)
+        turning(lambda: not waiting(client), client)
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"ca_file": "stranger"}, "its certificate is not accepted: "),
-        ({"ca_file": None}, "its certificate is not accepted: "),
-        ({"broker": "127.0.0.1"}, "and that the broker has the name in the certificate."),
+        ({"ca_file": "stranger"}, "CERTIFICATE_VERIFY_FAILED"),
+        ({"ca_file": None}, "CERTIFICATE_VERIFY_FAILED"),
+        ({"broker": "127.0.0.1"}, "not valid for '127.0.0.1'"),
         ({"cert_file": None, "key_file": None}, ""),
     ],
 )

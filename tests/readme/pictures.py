@@ -1,6 +1,6 @@
 """Pictures of the live screen and of a report, for the pages: python tests/readme/pictures.py [FOLDER]
 
-FOLDER: docs/pictures unless given. Run by `make pictures`, which has the path.
+Without FOLDER those that pages show, in docs/pictures; else all kinds, to look at. Run by `make pictures`, which has the path.
 """
 
 import base64
@@ -27,7 +27,12 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 )
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
-SIZE = 80, 24
+SIZES = ((80, 24), (120, 40))
+VIEWS = {
+    "desktop": (1280, 900, {}),
+    "dark": (1280, 900, {"dark": True}),
+    "phone": (390, 844, {"phone": True}),
+}
 SHOWN = ("monitor_1_80.svg", "monitor_4_80.svg", "report_desktop.png")
 
 
@@ -47,26 +52,27 @@ def monitors(folder: Path) -> None:
         for now, frame in flight(bus, 31, [option(28)]):
             monitor.take(frame, now)
             monitor.advance(now)
-        console = Console(
-            record=True,
-            file=io.StringIO(),
-            width=SIZE[0],
-            force_terminal=True,
-            color_system="truecolor",
-        )
-        for line in screen(monitor, source, SIZE, 0):
-            console.print(line, no_wrap=True)
-        picture = console.export_svg(title="kontronik-can-gw monitor", unique_id="m")
-        # letters of the reader's own machine, not from a server
-        picture = re.sub(r"@font-face \{.*?\}\s*", "", picture, flags=re.DOTALL)
-        picture = picture.replace(
-            "font-family: Fira Code", "font-family: Fira Code, DejaVu Sans Mono"
-        )
-        (folder / f"monitor_{count}_80.svg").write_text(picture, encoding="utf-8")
+        for size in SIZES:
+            console = Console(
+                record=True,
+                file=io.StringIO(),
+                width=size[0],
+                force_terminal=True,
+                color_system="truecolor",
+            )
+            for line in screen(monitor, source, size, 0):
+                console.print(line, no_wrap=True)
+            picture = console.export_svg(title="kontronik-can-gw monitor", unique_id="m")
+            # letters of the reader's own machine, not from a server
+            picture = re.sub(r"@font-face \{.*?\}\s*", "", picture, flags=re.DOTALL)
+            picture = picture.replace(
+                "font-family: Fira Code", "font-family: Fira Code, DejaVu Sans Mono"
+            )
+            (folder / f"monitor_{count}_{size[0]}.svg").write_text(picture, encoding="utf-8")
 
 
-def report(folder: Path) -> None:
-    """Two ESCs, on a desktop."""
+def reports(folder: Path) -> None:
+    """Two ESCs, on a desktop, in the dark and on a phone."""
     with tempfile.TemporaryDirectory() as scratch:
         log, page = Path(scratch, "flight.log"), Path(scratch, "flight.html")
         toml = Path(scratch, "gateway.toml")
@@ -79,17 +85,23 @@ def report(folder: Path) -> None:
         done = run("report", log, "-c", toml, "-o", page)
         assert done.code == 0, done.err
         with Browser(Path(scratch, "profile")) as browser:
-            browser.open(page, 1280, 900)
-            shot = browser.call("Page.captureScreenshot", format="png")["data"]
-            (folder / "report_desktop.png").write_bytes(base64.b64decode(shot))
+            for name, (width, height, how) in VIEWS.items():
+                browser.open(page, width, height, **how)
+                shot = browser.call("Page.captureScreenshot", format="png")["data"]
+                (folder / f"report_{name}.png").write_bytes(base64.b64decode(shot))
 
 
 def main(folder: Path) -> None:
     if PROGRAM is None:
         sys.exit(MISSING)
-    folder.mkdir(parents=True, exist_ok=True)
-    monitors(folder)
-    report(folder)
+    with tempfile.TemporaryDirectory() as scratch:
+        made = Path(scratch)
+        monitors(made)
+        reports(made)
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in sorted(made.iterdir()):
+            if folder != FOLDER or path.name in SHOWN:
+                (folder / path.name).write_bytes(path.read_bytes())
 
 
 if __name__ == "__main__":

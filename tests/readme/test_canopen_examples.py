@@ -3,7 +3,6 @@
 import contextlib
 import gc
 import io
-import queue
 import re
 import threading
 import time
@@ -14,7 +13,6 @@ from unittest.mock import patch
 
 import can
 import pytest
-from canopen.lss import LssError, LssMaster
 
 from kontronik_can_gw.canopen.storage import decode
 from kontronik_can_gw.config.assemble import assemble
@@ -112,10 +110,6 @@ def until(holds: object, seconds: float = 60) -> None:
     raise AssertionError("it did not come about in time")
 
 
-def test_there_are_five_examples() -> None:
-    assert len(EXAMPLES) == 5
-
-
 def test_poll(channel: str) -> None:
     said = run(POLL, channel)
     assert re.search(r"^voltage 2\d\.\d+ V$", said, re.MULTILINE)
@@ -154,32 +148,9 @@ def test_change_settings_and_a_pdo_and_keep_them(channel: str, tmp_path: Path) -
         until(lambda: bus.recv(1).arbitration_id == 0x1A1)  # type: ignore[union-attr]
 
 
-FASTSCAN, IDENTIFIED = 0x51, 0x4F
-IDENTIFY_NON_CONFIGURED = bytes((0x4C, *bytes(7)))
-
-
-class MarkingMaster(LssMaster):
-    """The library's, which learns from the answer to a further request that a fastscan's is not answered, and not from time."""
-
-    RESPONSE_TIMEOUT = 60.0
-
-    def _LssMaster__send_command(self, message: bytearray) -> bytes | None:
-        if message[0] != FASTSCAN:
-            return super()._LssMaster__send_command(message)  # type: ignore[misc, no-any-return]
-        self.responses: queue.Queue[bytes] = queue.Queue()
-        for request in (bytes(message), IDENTIFY_NON_CONFIGURED):
-            self.network.send_message(self.LSS_TX_COBID, request)
-        answer = self.responses.get(timeout=self.RESPONSE_TIMEOUT)
-        if answer[0] != IDENTIFIED:
-            raise LssError("not answered")
-        self.responses.get(timeout=self.RESPONSE_TIMEOUT)
-        return answer
-
-
-def test_give_a_waiting_node_its_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("canopen.network.LssMaster", MarkingMaster)
+def test_give_a_waiting_node_its_id(tmp_path: Path) -> None:
     with gateway("lss", tmp_path, 255), can.Bus(interface="virtual", channel="lss") as bus:
-        said = run(LSS, "lss")
-        assert said.startswith("found True")
+        # a fastscan learns from time that it is not answered: on a loaded machine it may have to be repeated
+        until(lambda: run(LSS, "lss").startswith("found True"))
         until(lambda: bus.recv(1).arbitration_id == 0x705)  # type: ignore[union-attr]
         assert decode((tmp_path / "esc1.params").read_bytes()).node_id == 5

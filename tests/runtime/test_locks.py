@@ -18,7 +18,6 @@ from kontronik_can_gw.runtime.locks import (
     Taken,
     file_name,
     lock_file,
-    lock_name,
     messages_lock,
     network_namespace,
     node_lock,
@@ -239,5 +238,3 @@ def test_a_file_name_stands_for_one_lock_in_one_network_namespace(name: str) -> 
     assert "/" not in file
     assert file != file_name(name + "0", 4026531840)
     assert file != file_name(name, 4026531841)
-    assert lock_name(file, 4026531841) is None
-    assert lock_name(file, 4026531840) == name

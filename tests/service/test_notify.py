@@ -77,24 +77,19 @@ def test_a_status_is_one_line_that_is_reported_when_it_changes(
     assert all(len(line.encode()) <= 4096 for line in found)
 
 
-def test_without_a_manager_nothing_happens() -> None:
-    for address in ("", "vsock:2:1", "@"):
-        notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"})
-        notifier.ready("x")
-        notifier.watchdog()
-        notifier.stopping()
-        notifier.close()
-    assert not Notifier({}).present
-    assert Notifier({"WATCHDOG_USEC": "1000"}).watchdog_ns is None
-
-
-@pytest.mark.parametrize("address", ["/no/such/folder/notify", "/" + "x" * 300, "/with\0null"])
-def test_a_socket_that_cannot_be_reached_does_no_harm(address: str) -> None:
+@pytest.mark.parametrize(
+    "address",
+    ["", "vsock:2:1", "@", "/no/such/folder/notify", "/" + "x" * 300, "/with\0null"],
+)
+def test_a_socket_that_is_none_or_cannot_be_reached_does_no_harm(address: str) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"})
     for _ in range(3):
         notifier.ready("x")
         notifier.watchdog()
-    assert notifier.present
+        notifier.stopping()
+    notifier.close()
+    assert notifier.present == (address[:1] in ("/", "@"))
+    assert Notifier({"WATCHDOG_USEC": "1000"}).watchdog_ns is None
 
 
 def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None:
@@ -143,10 +138,7 @@ def test_a_manager_that_comes_back_is_reported_again(tmp_path: Path) -> None:
         ({"WATCHDOG_USEC": "10000000"}, 5_000_000_000),
         ({"WATCHDOG_USEC": "3", "WATCHDOG_PID": str(os.getpid())}, 1_500),
         ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),
-        ({"WATCHDOG_PID": str(os.getpid())}, None),
-        ({"WATCHDOG_USEC": "0"}, None),
-        ({"WATCHDOG_USEC": "-5"}, None),
-        ({"WATCHDOG_USEC": "soon"}, None),
+        *(({"WATCHDOG_USEC": text}, None) for text in ("0", "-5", "soon")),
         ({"WATCHDOG_USEC": "5", "WATCHDOG_PID": "me"}, None),
     ],
 )

@@ -100,16 +100,6 @@ def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet
     assert not [name for name in unit if name.startswith(never)]
 
 
-def test_metrics_are_for_this_machine_only() -> None:
-    unit = settings(files()["kontronik-can-gw-metrics.service"])
-    own = settings(files()["kontronik-can-gw-metrics@.service"])
-    for shown, name in ((unit, "gateway"), (own, "%i")):
-        command = f"/bin/true metrics -c /etc/kontronik-can-gw/{name}.toml --listen ${{LISTEN}}"
-        assert shown["ExecStart"][-1] == command
-    assert unit["Environment"] == ["LISTEN=127.0.0.1:9123"]
-    assert (unit["IPAddressDeny"], unit["IPAddressAllow"]) == (["any"], ["localhost"])
-
-
 def test_it_may_open_serial_ports_and_nothing_else() -> None:
     unit = settings(files()[NAMES[0]])
     assert unit["DevicePolicy"] == ["closed"]
@@ -149,28 +139,24 @@ def test_an_instance_has_a_configuration_and_folders_of_its_own() -> None:
 # --- udev
 
 
-RULE = re.compile(
-    r"(ACTION|SUBSYSTEMS?|DRIVER|ENV\{\w+\}|ATTRS?\{\w+\})==\"[^\"]*\"|(ENV|ATTR)\{\w+\}=\"[^\"]*\"|SYMLINK\+=\"[^\"]+\"|(GOTO|LABEL)=\"\w+\""
-)
+def test_metrics_are_for_this_machine_only() -> None:
+    for name, config in zip(BESIDE[2:], ("gateway", "%i"), strict=True):
+        unit = settings(files()[name])
+        command = f"/bin/true metrics -c /etc/kontronik-can-gw/{config}.toml --listen ${{LISTEN}}"
+        assert unit["ExecStart"] == [command]
+        assert unit["Environment"] == ["LISTEN=127.0.0.1:9123"]
+        assert (unit["IPAddressDeny"], unit["IPAddressAllow"]) == (["any"], ["localhost"])
 
 
-def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
-    """By the grammar of the keys in use, and by udev itself where it can (udevadm verify, systemd 254)."""
+def test_udev_rules_keep_modem_manager_away(tmp_path: Path) -> None:
+    """And are well-formed by udev itself, where it can say (udevadm verify, systemd 254)."""
     text = files()["70-kontronik-can-gw.rules"]
-    lines = [line.strip("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)]
-    assert len(lines) == 6
-    assert all(RULE.fullmatch(part) for line in lines for part in line.split(", "))
-    for label in ('GOTO="kontronik_can_gw_end"', 'LABEL="kontronik_can_gw_end"'):
-        assert text.count(label) == 1
     ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
     assert [line.split(",")[0] for line in ignored] == ['SUBSYSTEM=="usb"', 'SUBSYSTEM=="tty"']
     assert all("0403" in line for line in ignored)
     udevadm = shutil.which("udevadm", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/bin")
     rules = tmp_path / "70-kontronik-can-gw.rules"
     rules.write_text(text)
-    if (
-        udevadm
-        and "verify" in subprocess.run([udevadm, "-h"], capture_output=True, text=True).stdout
-    ):
-        done = subprocess.run([udevadm, "verify", str(rules)], capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr + done.stdout
+    shown = subprocess.run([udevadm, "-h"], capture_output=True, text=True) if udevadm else None
+    if shown is not None and "verify" in shown.stdout:
+        subprocess.run([str(udevadm), "verify", str(rules)], check=True, capture_output=True)

@@ -9,7 +9,6 @@ import errno
 import logging
 import random
 import socket
-import ssl
 import sys
 import threading
 import time
@@ -29,14 +28,6 @@ KEEPALIVE_S = 15
 """The broker publishes the last will after 1.5 times this without a packet."""
 MIN_PAUSE_S, MAX_PAUSE_S = 1, 30
 """Time between two attempts to connect; paho doubles it each time."""
-_CERTIFICATE = "its certificate is not accepted: {}. Check mqtt.ca_file, and that the broker has the name in the certificate."
-_FAILURES: tuple[tuple[type[BaseException], str], ...] = (
-    (ssl.SSLCertVerificationError, _CERTIFICATE),
-    (ssl.SSLError, "TLS failed. Is this the port for TLS?"),
-    (socket.gaierror, "the host's name is not known. Check it and the network."),
-    (TimeoutError, "does not answer. Check its name, the network and firewalls."),
-    (ConnectionRefusedError, "connection refused. Does it run, and is the port right?"),
-)
 
 
 def password(file: str) -> str:
@@ -48,13 +39,6 @@ def password(file: str) -> str:
     if not line:
         raise OSError(f"{file}: has no password on its first line")
     return line
-
-
-def _failure(error: BaseException | None) -> str:
-    """Why connecting failed."""
-    detail = str(getattr(error, "verify_message", "")).rstrip(".")
-    texts = (text.format(detail) for kind, text in _FAILURES if isinstance(error, kind))
-    return next(texts, str(getattr(error, "strerror", None) or error))
 
 
 class _Client(paho.Client):
@@ -135,11 +119,6 @@ class MqttClient:
                 f"127.0.0.1: {error.strerror or error}. MQTT needs this machine's own network: sudo ip link set lo up"
             ) from None
 
-    @property
-    def waiting(self) -> int:
-        """Number of messages that are not sent yet."""
-        return len(self._waiting) + sum(not _is_done(info) for info in self._handed.values())
-
     def offer(self, message: Message) -> None:
         """Queue a message; a pending one of the same topic is replaced."""
         if message.lasting:
@@ -203,7 +182,8 @@ class MqttClient:
         self.problem = f"its answer is not MQTT: {error!r}"
 
     def _not_connected(self, *_: object) -> None:
-        self.problem = _failure(sys.exc_info()[1])
+        error = sys.exc_info()[1]
+        self.problem = f"cannot be reached: {getattr(error, 'strerror', None) or error}"
 
     def _disconnected(self, *_: object) -> None:
         if self.problem == "":
