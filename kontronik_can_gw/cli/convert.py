@@ -11,6 +11,7 @@ from pathlib import Path
 from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, number_from, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
+from kontronik_can_gw.cli.progress import watched
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
     FORMATS,
@@ -124,6 +125,8 @@ def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input
         conversion = _conversion(args, form, recording)
         try:
             with Output(target) as out:
+                name = f"{Path(args.input).name or recording.name} to {form}:"
+                out.watch = partial(watched, name=name, data_on_screen=target is None)
                 summary = conversion(recording, out)
         except BrokenPipeError:
             raise

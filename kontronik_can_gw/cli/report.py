@@ -7,6 +7,7 @@ from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.output import write_output
+from kontronik_can_gw.cli.progress import watched
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.report.analysis import Analysis, needed_columns
 from kontronik_can_gw.desk.report.flight import Flight
@@ -99,7 +100,8 @@ def _analysed(recording: Input, args: argparse.Namespace) -> Flight | None:
             f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
         )
     try:
-        for block in filter(len, recording.blocks(chosen)):
+        blocks = filter(len, recording.blocks(chosen))
+        for block in watched(blocks, f"{recording.name}: rows", args.output == "-"):
             if not analysis.take(block):
                 break
     except KeyboardInterrupt:

@@ -1,5 +1,7 @@
 """``kontronik-can-gw convert`` as people use it: what it makes, what it says, what it leaves behind when it cannot go on."""
 
+import io
+import re
 import resource
 import signal
 import subprocess
@@ -11,6 +13,8 @@ import pytest
 from command_line import refused, run
 from log_files import SUFFIX
 from recordings import candump_lines, convert, dump_bytes, write_candump
+
+from kontronik_can_gw.cli.progress import watched
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
@@ -138,3 +142,24 @@ def test_a_signal_leaves_no_half_file(tmp_path: Path, form: str, number: signal.
     assert process.returncode == 130
     assert said == "kontronik-can-gw convert: stopped: nothing is written\n"
     assert [path.name for path in tmp_path.iterdir()] == ["long.log"]
+
+
+class Terminal(io.StringIO):
+    """A standard error that is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_long_conversion_counts_what_is_done_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    screen = Terminal()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", screen)
+    blocks = [[1, 2], [3]]
+    assert [*watched(blocks, "flight.kcap to csv:", data_on_screen=False)] == blocks
+    assert re.search(r"flight\.kcap to csv: \D*3\b", screen.getvalue())
+    monkeypatch.setattr(sys, "stderr", silent := io.StringIO())
+    assert [*watched(blocks, "flight.kcap to csv:", data_on_screen=False)] == blocks
+    assert not silent.getvalue()

@@ -6,7 +6,7 @@ Each conversion returns what it wrote, in words; None where the recording has no
 import os
 import sys
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
@@ -55,6 +55,8 @@ class Output:
 
     def __init__(self, target: Path | None, what: str = "file") -> None:
         self.is_whole = False
+        self.watch: Callable[[Iterable[Any]], Iterable[Any]] = iter
+        """What is converted passes through this, block by block."""
         self.name = "" if target is None else target.name
         self._target, self._what = target, what
         self._part: Path | None = None
@@ -111,7 +113,7 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     count, last_ns = 0, 0
     writer = _table_writer(out.open(), form, table)
     try:
-        for block in blocks:
+        for block in out.watch(blocks):
             writer.write(block)
             count += len(block)
             last_ns = block.times[-1] - table.origin_ns
@@ -159,7 +161,7 @@ def to_log(
     )
     count = 0
     try:
-        for frames in batches:
+        for frames in out.watch(batches):
             writer.write_all(frames, origin_ns)
             count += len(frames)
             last_ns = _time_at(frames, -1)
@@ -203,7 +205,7 @@ def _cut(
 def to_bytes(recording: "Input", out: Output, esc: int) -> str | None:
     """To the plain bytes of one ESC."""
     file, count = out.open(), 0
-    for data in recording.esc_bytes(esc):
+    for data in out.watch(recording.esc_bytes(esc)):
         file.write(data)
         count += len(data)
     if not count:
