@@ -87,7 +87,7 @@ class Judge:
         self.more_ns = 0
         """Slack besides, for a while: what a bus or an adapter holds nobody can take back."""
         self.by_more = 0
-        """Values that were right only because of it."""
+        """Settled values that were right only because of it, and not because the machine stood still."""
         self.wrong: list[Wrong] = []
         """The newest ones, settled."""
         self.wrong_count = 0
@@ -107,6 +107,7 @@ class Judge:
         """The EscSpeed frames that were right."""
         self.last_ns = 0
         self._suspects: list[Wrong] = []
+        self._held: list[tuple[int, int, int]] = []  # sent, came, too old by: right because of it
         # CAN id -> number of the newest live frame that it has carried
         self._newest: dict[int, int] = {}
         self._bits: dict[str, tuple[Message, int]] = {}  # message name -> message, content
@@ -165,6 +166,8 @@ class Judge:
 
     def settle(self, stood_still: Callable[[int, int], int]) -> None:
         """Decide on what came too late so far: the time in which the machine as a whole stood still does not count."""
+        held, self._held = self._held, []
+        self.by_more += sum(5 * stood_still(sent, at) < 4 * excess for sent, at, excess in held)
         suspects, self._suspects = self._suspects, []
         for each in suspects:
             stood = 0 if each.since_ns is None else stood_still(each.since_ns, each.at_ns)
@@ -215,7 +218,8 @@ class Judge:
             return
         self._newest[can_id] = n
         self.values += 1
-        self.by_more += at_ns - fed.left(n) > limit_ns
+        if (excess := at_ns - fed.left(n) - limit_ns) > 0:
+            self._held.append((fed.sent[n], at_ns, excess))
         follows = _FOLLOWS.get(said.message.stem, 0)
         fed.seen[n] |= follows
         if follows == SPEED:
@@ -256,11 +260,12 @@ class Judge:
         newest = fed.newest(at_ns + MS)
         true_age = (at_ns - fed.left(newest)) / MS if newest >= 0 else 1e9
         excess = int((true_age - age - 5) * MS) - self.slack_ns
+        sent = fed.sent[newest] if newest >= 0 else None
         if excess > self.more_ns:
-            sent = fed.sent[newest] if newest >= 0 else None
             what = f"{message.name}: an age of {age} ms; the newest is {true_age:.0f} ms old"
             self._suspects.append(Wrong(at_ns, what, sent, excess))
-        self.by_more += 0 < excess <= self.more_ns
+        elif excess > 0 and sent is not None:
+            self._held.append((sent, at_ns, excess))
 
 
 def _both_clocks() -> tuple[int, int]:

@@ -105,10 +105,6 @@ class Gateway(LoggedProcess):
         self.started_ns = time.monotonic_ns()
         super().__init__([*AHEAD, *prefix, *program], environment)
 
-    @property
-    def alive(self) -> bool:
-        return self.process.poll() is None
-
     def figures(self) -> dict[str, int]:
         """Resident memory in KiB, open descriptors, threads."""
         folder = Path("/proc", str(self.process.pid))
@@ -179,39 +175,22 @@ class PtyPort(FedEsc):
         self.unplug()
 
 
-class Metronome:
+class Metronome(LoggedProcess):
     """A process that only wakes up, and notes when it could not: then nothing could run, the gateway neither."""
 
     def __init__(self, step_s: float) -> None:
-        self.stalls: list[tuple[int, int]] = []
-        command = ["chrt", "-f", "20", sys.executable, "-S", "-E", "-c", _METRONOME, str(step_s)]
-        self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self._process.stdout
-        for words in self._process.stdout:
-            begin, end = words.split()
-            self.stalls.append((int(begin), int(end)))
+        python = [sys.executable, "-S", "-E", "-c", _METRONOME, str(step_s)]
+        super().__init__(["chrt", "-f", "20", *python], keep_out=True)
 
     def stood_still(self, begin_ns: int, end_ns: int) -> int:
         """Nanoseconds of that time in which nothing ran."""
         total = 0
-        for begin, end in reversed(self.stalls):
+        for words in reversed(self.out):
+            begin, end = map(int, words.split())
             if end < begin_ns:
                 break
             total += max(0, min(end, end_ns) - max(begin, begin_ns))
         return total
-
-    def close(self) -> None:
-        self._process.terminate()
-        self._process.wait()
-        self._thread.join(2)
-        if self._process.stdout:
-            self._process.stdout.close()
 
 
 class Bench:
@@ -441,7 +420,7 @@ class Bench:
         self.feeder.close()
         self.kill()
         self.watch.close()
-        self.metronome.close()
+        self.metronome.kill()
         for esc in self.escs:
             esc.close()
 

@@ -184,7 +184,8 @@ def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> 
     row.figures |= {
         "right values": bench.watch.values,
         "values late because the machine stood still": bench.watch.late_count,
-        "s that the machine stood still": sum(e - b for b, e in bench.metronome.stalls) / SECOND,
+        "s that the machine stood still": bench.metronome.stood_still(0, time.monotonic_ns())
+        / SECOND,
         **bench.gateway.figures(),
     }
     print(row.line)

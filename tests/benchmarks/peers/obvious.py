@@ -93,7 +93,6 @@ class Esc:
         self.info_time = 0.0
         self.live_time = 0.0
         self.is_up = False
-        self.frames = 0
 
     def run(self) -> None:
         """Serve the port for ever."""
@@ -159,7 +158,6 @@ class Esc:
             supplied = bec_current != 0 and self.last_device != JIVEPRO
         self.live_time = time.monotonic()
         self.is_up = True
-        self.frames += 1
         for name, values in messages(frame, supplied):
             self.send(name, values)
 
