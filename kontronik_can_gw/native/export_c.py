@@ -36,7 +36,7 @@ def exported(
     for name, value in _options(layout, tables).items():
         core_h, count = re.subn(rf"(#define {name} +)\d+", rf"\g<1>{value}", core_h)
         assert count == 1, name
-    names = _names("KCG_MESSAGE_", tables.names)
+    names = _names("KCG_MESSAGE_", tables.names["message"])
     messages = [
         f"| {name.removeprefix('KCG_MESSAGE_')} | {_id(row)} | {row.length} |"
         for name, row in zip(names, tables.messages, strict=True)
@@ -105,7 +105,7 @@ def _tables(tables: Tables) -> Iterator[str]:
     """Lines of the tables' definitions."""
     yield '#include "tables.h"'
     for name, (kind, rows) in tables.arrays.items():
-        label = {"message": tables.names, "signal": tables.signal_names}.get(name)
+        label = tables.names.get(name)
         yield f"\nstatic const {_type(name, kind)} {name}[] = {{"
         yield from _rows(kind, rows or [kind()], label)
         yield "};"

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Sequence
 from ctypes import c_uint16, c_uint64
 from fractions import Fraction
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any
 
@@ -59,6 +60,8 @@ _M64 = (1 << 64) - 1
 END_OF_TIME = 1 << 61
 """ns: sums of times stay within int64."""
 _LIMIT = 1 << 63
+_piece = lru_cache(1024)(Piece)
+"""For signals at the same place one and the same row: with many ESCs they are garbage that nobody gives back."""
 
 
 class Tables:
@@ -67,8 +70,7 @@ class Tables:
     def __init__(
         self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False, longest: int = 64
     ) -> None:
-        self.names = [plan.name for plan in layout.messages]
-        self.signal_names: list[str] = []
+        self._plans = layout.messages
         self.signals: list[Any] = []
         self.messages: list[Any] = []
         self.pieces: list[Any] = []
@@ -103,6 +105,17 @@ class Tables:
                     self.listeners_of[esc].append(index)
         if max(len(self.signals), self.pages, len(self.listeners)) > MAX_ROWS:
             raise NotInCore(f"{len(self.signals)} signals, {self.pages} pages")
+
+    @property
+    def names(self) -> dict[str, list[str]]:
+        """Names of the rows of messages and signals."""
+        signals = [
+            f"{plan.name}.{signal.name}"
+            for plan in self._plans
+            for signal in plan.signals
+            if signal.role in (Role.SOURCE, Role.ALIVE)
+        ]
+        return {"message": [plan.name for plan in self._plans], "signal": signals}
 
     @property
     def listeners(self) -> list[int]:
@@ -169,10 +182,10 @@ class Tables:
         first_piece = len(self.pieces)
         for piece in signal.pieces:  # never across 64 bits
             width = min(piece.width, 64 - piece.at % 64)
-            self.pieces.append(Piece(piece.shift, width, piece.at))
+            self.pieces.append(_piece(piece.shift, width, piece.at))
             if width < piece.width:
                 self.pieces.append(
-                    Piece(piece.shift + width, piece.width - width, piece.at + width)
+                    _piece(piece.shift + width, piece.width - width, piece.at + width)
                 )
         row = Signal(first_piece=first_piece, pieces=len(self.pieces) - first_piece)
         row.page = ALL_PAGES if signal.page is None else plan.pages.index(signal.page)
@@ -193,7 +206,6 @@ class Tables:
             except NotInCore as error:
                 raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
         self.signals.append(row)
-        self.signal_names.append(f"{plan.name}.{signal.name}")
 
     def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
         flags = row.flags
