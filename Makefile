@@ -11,7 +11,7 @@ help:
 	@echo 'make release   by hand, on a quiet machine, for hours: faults on emulated hardware, random faults, a recorded hour'
 	@echo '                                        (ARGS="--only qemu|soak|hour|put-in|machines|fuzz|wheels|deb")'
 	@echo 'make soak      random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
-	@echo 'make hour      a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
+	@echo 'make hour      a recorded hour through every format, read back and compared   (ARGS="--minutes 6")'
 	@echo 'make bench     speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
 	@echo 'make golden    record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
 	@echo 'make docs      write docs/reference from the sources'

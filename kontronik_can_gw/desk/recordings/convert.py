@@ -60,6 +60,7 @@ class Output:
         self.name = "" if target is None else target.name
         self._target, self._what = target, what
         self._part: Path | None = None
+        self._made = False
         if target is not None and (not target.exists() or target.is_file()):
             self._part = Path(os.path.realpath(target)).with_name(f"{target.name}.part")
         self._file: IO[bytes] | None = None
@@ -73,6 +74,7 @@ class Output:
                 self._file = self._target.open("wb")
             else:
                 self._part.unlink(missing_ok=True)
+                self._made = True  # a signal may come before the file is known
                 self._file = self._part.open("xb")  # follows no link that somebody put there
         except OSError as error:
             raise RunError(
@@ -87,15 +89,14 @@ class Output:
         is_kept = kind is None and self.is_whole
         if kind is None and self._target is None:
             sys.stdout.flush()
-        if self._file is None:
-            return
-        # what is buffered of a file that is not kept may find no room
-        with suppress(*([] if is_kept else [OSError])):
-            self._file.flush()
-            if is_kept and self._part is not None:
-                os.fsync(self._file.fileno())
-            self._file.close()
-        if self._part is None or self._target is None:
+        if self._file is not None:
+            # what is buffered of a file that is not kept may find no room
+            with suppress(*([] if is_kept else [OSError])):
+                self._file.flush()
+                if is_kept and self._part is not None:
+                    os.fsync(self._file.fileno())
+                self._file.close()
+        if self._part is None or self._target is None or not self._made:
             return
         if is_kept:
             self._part.replace(os.path.realpath(self._target))
