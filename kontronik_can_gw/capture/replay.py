@@ -145,7 +145,7 @@ class Replay:
     def _take_up(self, state: Mapping[str, Any]) -> None:
         """Adopt the counters from before the recording began."""
         for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
-            esc.drawn.energy_mw_ns, esc.drawn.run_time, esc.losses = (
+            esc.energy_mw_ns, esc.run_time_ns, esc.losses = (
                 found[name] for name in ("energy", "run_time", "losses")
             )
         if "started_ns" in state:

@@ -15,30 +15,21 @@ Data = Any
 """The fields of a reading as whole steps: a Sequence[int], of a type that is the protocol's own."""
 
 
-class Form(Protocol):
-    """What a decoder knows of one form of its frames."""
+@dataclass(eq=False)
+class FrameForm:
+    """A form of a protocol's frames. ``layout_number``: of the frame layout, 1 ... as listed in EscProtocol.layouts."""
 
-    @property
-    def is_info(self) -> bool:
-        """True for a frame with information of the device, False for one with live data."""
-
-    @property
-    def length(self) -> int:
-        """In bytes."""
-
-    @property
-    def layout_number(self) -> int:
-        """Of the frame layout: 1 ... as listed in EscProtocol.layouts."""
-
-    @property
-    def partly_protected(self) -> bool:
-        """True where some of the data is outside the frame's checksum."""
+    length: int
+    """In bytes."""
+    is_info: bool = False
+    """True for a frame with information of the device, False for one with live data."""
+    layout_number: int = 1
 
 
 class Reading(NamedTuple):
     """An accepted frame: its form, the stream position of its first byte, its fields as whole steps."""
 
-    form: Form
+    form: FrameForm
     offset: int
     data: Data
 
@@ -49,24 +40,18 @@ class Reading(NamedTuple):
 
 
 class Counters(Protocol):
-    """What one stream held; all numbers only grow."""
+    """What one stream held; all numbers only grow. ``dropped_bytes`` are certain to belong to no frame."""
 
     @property
     def bytes(self) -> int: ...
     @property
-    def live(self) -> int:
-        """Frames with live data."""
-
+    def live(self) -> int: ...
     @property
-    def info(self) -> int:
-        """Frames with information of the device."""
-
+    def info(self) -> int: ...
     @property
     def crc_errors(self) -> int: ...
     @property
-    def dropped_bytes(self) -> int:
-        """Bytes that are certain to belong to no frame."""
-
+    def dropped_bytes(self) -> int: ...
     def copy(self) -> Self: ...
 
     def as_dict(self) -> dict[str, int]:
@@ -106,18 +91,16 @@ class ErrorBit(IntEnum):
     """The bits of an error word; a protocol derives one for each of its words.
 
     A member is written ``NAME = (bit, severity, meaning, remedy, code, is_summary, is_normal)``; the last three may be left out.
+    ``remedy``: what a person should do. ``code``: of a CANopen emergency, None for one of the manufacturer's. ``is_summary``: set with
+    any other bit of its severity, which explains it. ``is_normal``: set in normal operation, nothing to show.
     """
 
     severity: Severity
     meaning: str
     remedy: str
-    """What a person should do."""
     code: int | None
-    """Error code of a CANopen emergency; None for one of the manufacturer's."""
     is_summary: bool
-    """Set with any other bit of its severity, which explains it."""
     is_normal: bool
-    """Set in normal operation: nothing to show."""
 
     def __new__(
         cls,
@@ -152,54 +135,50 @@ def bit_texts(word: int, names: type[ErrorBit] | Sequence[ErrorBit]) -> list[str
 
 
 class State(NamedTuple):
-    """An operating state."""
+    """An operating state.
+
+    ``meaning``: its name in words. ``remedy``: what a person should do. ``kind``: ``idle``, ``start``, ``run``, ``brake`` or ``fault``.
+    ``phase``: what it is shown alike with, in words.
+    """
 
     text: str
-    """Its name."""
     meaning: str
-    """The name in words."""
     remedy: str
-    """What a person should do."""
     kind: str | None = None
-    """``idle``, ``start``, ``run``, ``brake`` or ``fault``."""
     phase: str = ""
-    """What it is shown alike with, in words."""
 
 
 class Field(NamedTuple):
-    """A value that readings supply, as ``data[word] >> shift & mask``; ``per_unit`` steps make one ``unit``."""
+    """A value that readings supply, as ``data[word] >> shift & mask``; ``per_unit`` steps make one ``unit``.
+
+    ``low``..``high``: possible values in steps, a signal that cannot hold them is checked. ``not_on``: numbers of the devices that do not
+    supply it. ``names``: of an enumeration.
+    """
 
     name: str
     unit: str
     word: int
-    is_info: bool = False
+    low: int
+    high: int
     per_unit: int = 1
-    low: int = 0
-    """Smallest and greatest possible value in steps: a signal that cannot hold them is checked."""
-    high: int = 0
+    is_info: bool = False
     shift: int = 0
     mask: int = -1
     not_on: frozenset[int] = frozenset()
-    """Numbers of the devices that do not supply it."""
     names: Mapping[int, str] = {}
-    """Of an enumeration."""
 
     def of(self, data: Sequence[int]) -> int:
         """The value in a reading, in steps."""
         return data[self.word] >> self.shift & self.mask
 
 
-_WHOLE_WORDS = frozenset({"electrical_speed", "battery_voltage", "battery_current"})
-"""Other values are derived of these."""
-
-
 @dataclass(frozen=True, eq=False)
 class EscProtocol:
     """An ESC protocol: how its line is set, its decoder, and what its readings hold.
 
-    Fields with a meaning of their own, by name: ``electrical_speed``, ``battery_voltage``, ``battery_current`` (live; run time and
-    energy come of them), ``operating_state_raw``, ``operating_errors``, ``selftest_errors``, ``cell_count``, ``device_raw``, ``variant``,
-    ``firmware_main``, ``firmware_sub``. Any may be missing.
+    Fields with a meaning of their own, by name: ``electrical_speed``, ``battery_voltage``, ``battery_current`` (live, whole words; run time
+    and energy come of them), ``operating_state_raw``, ``operating_errors``, ``selftest_errors``, ``cell_count``, ``device_raw``,
+    ``variant``, ``firmware_main``, ``firmware_sub``. Any may be missing.
     """
 
     name: str
@@ -222,16 +201,6 @@ class EscProtocol:
     """Number of a device to whose peak current it reports: ``motor`` or ``battery``."""
     wire: tuple[tuple[str, type[tuple[int, ...]]], ...] | None = None
     """struct codes, as they are sent, and type of live data and of information; None where the core in C does not decode it."""
-
-    def __post_init__(self) -> None:
-        """ValueError for a field without a range, and for one with bits where whole words are needed."""
-        for found in self.fields:
-            if found.low >= found.high:
-                raise ValueError(f"ESC protocol {self.name}: {found.name} has no range")
-            if found.name in _WHOLE_WORDS and (found.shift, found.mask) != (0, -1):
-                raise ValueError(
-                    f"ESC protocol {self.name}: {found.name} must be a word of its own"
-                )
 
     @cached_property
     def by_name(self) -> Mapping[str, Field]:

@@ -7,13 +7,13 @@ more than the link's usual interval after the bound: then from the bound, too. S
 one interval. An adapter that bundles bytes adds what it holds them back for (1 ms; 16 ms where that cannot be set).
 """
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from copy import copy
 from typing import Any, Self
 
 from kontronik_can_gw.esc.decoder import Counters, Data, Decoder, Reading
-from kontronik_can_gw.esc.drawn import Drawn
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
@@ -35,8 +35,13 @@ class EscStream(EscTelemetry):
     def __init__(self, settings: EscSettings, now: int) -> None:
         self.protocol = protocol_named(settings.protocol)
         self.decoder: Decoder = self.protocol.make()
-        errors = self.protocol.by_name.get("operating_errors")
-        self._errors_at = None if errors is None else errors.word
+        fields = self.protocol.by_name
+        words = {name: field.word for name, field in fields.items()}
+        self._errors_at = words.get("operating_errors")
+        self._speed_at = words.get("electrical_speed")
+        parts = [fields[name] for name in ("battery_voltage", "battery_current") if name in fields]
+        self._power_at = [part.word for part in parts] if len(parts) == 2 else None
+        self._per_watt = math.prod(part.per_unit for part in parts)
         self.live: Data | None = None
         self.info: Data | None = None
         self.last_live: Data | None = None
@@ -47,7 +52,7 @@ class EscStream(EscTelemetry):
         self.apply(settings)
         self.frame_rate: int | None = 0
         self.losses = 0
-        self.drawn = Drawn(self.protocol)
+        self.energy_mw_ns = self.run_time_ns = 0
         self.live_ns: int | None = None
         self.live_bound_ns = 0
         self.info_bound_ns: int | None = None
@@ -74,7 +79,7 @@ class EscStream(EscTelemetry):
         twin = copy(self)
         decoder: Any = copy(self.decoder)
         decoder.counters = self.counters.copy()
-        twin.drawn, twin.decoder = copy(self.drawn), decoder
+        twin.decoder = decoder
         return twin
 
     def apply(self, settings: EscSettings) -> None:
@@ -166,7 +171,7 @@ class EscStream(EscTelemetry):
             events = Event.INFO | Event.LINK
         if form.is_info:
             return events | self._accept_info(data, when, bound)
-        if form.partly_protected and reading.suspect:
+        if reading.suspect:
             self.suspect_frames += 1
         if (before := self.live_ns) is not None:
             if when < before:
@@ -174,7 +179,7 @@ class EscStream(EscTelemetry):
             if bound < self.live_bound_ns:
                 bound = self.live_bound_ns
             if self.live is not None:
-                self.drawn.add(self.live, when - before)
+                self._draw(self.live, when - before)
         at, live = self._errors_at, self.live
         if at is not None and (live is None or live[at] != data[at]):
             events |= Event.STATE
@@ -187,6 +192,16 @@ class EscStream(EscTelemetry):
             self._window_ns = when
             self._window_counters = self.counters.copy()
         return events | Event.LIVE
+
+    def _draw(self, live: Data, ns: int) -> None:
+        """Between two readings the power, and whether the motor turns, are those of the first. Regeneration does not count."""
+        if self._power_at is not None:
+            voltage, current = self._power_at
+            power = live[voltage] * live[current]
+            if power > 0:
+                self.energy_mw_ns += power * ns * 1000 // self._per_watt
+        if self._speed_at is not None and live[self._speed_at]:
+            self.run_time_ns += ns
 
     def _accept_info(self, data: Data, when: int, bound: int) -> int:
         value, old = self.protocol.value, self.info

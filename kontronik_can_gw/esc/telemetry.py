@@ -7,7 +7,7 @@ or not known of the device now on the line, is None.
 from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
-from typing import Any, Self
+from typing import Self
 
 from kontronik_can_gw.esc.decoder import Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -66,7 +66,8 @@ class EscTelemetry:
 
     ``live``, ``info`` (data of a reading, None where not available), ``link``, ``layout`` (0 unknown, else as the protocol lists them),
     ``cells`` (0 unknown), ``pole_pairs``, ``output_divisor`` / ``gear_denominator`` (pole pairs x gear), ``frame_rate`` (live frames of
-    the last full second in 0.1 Hz, None before it), ``losses``, ``drawn``, ``live_ns`` and ``last_info_ns`` (time of the newest live and
+    the last full second in 0.1 Hz, None before it), ``losses``, ``energy_mw_ns`` (drawn from the battery),
+    ``run_time_ns`` (the motor turned), ``live_ns`` and ``last_info_ns`` (time of the newest live and
     info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and ``info_bound_ns`` are the earliest that
     byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or not, of the layout now on the line,
     ``device`` is the number in the latter; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
@@ -89,7 +90,8 @@ class EscTelemetry:
     losses: int
     suspect_frames: int
     late_frames: int
-    drawn: Any
+    energy_mw_ns: int
+    run_time_ns: int
     live_ns: int | None
     last_info_ns: int | None
     live_bound_ns: int

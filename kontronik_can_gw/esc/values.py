@@ -13,7 +13,7 @@ from fractions import Fraction
 from functools import cache
 from typing import Any
 
-from kontronik_can_gw.esc.decoder import EscProtocol, Field
+from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry, LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
@@ -168,9 +168,7 @@ def _supplied(protocol: EscProtocol, group: Group) -> Iterator[Value]:
     for found in fields:
         yield Value(
             *(found.name, found.unit, group, Kind.WIRE if found.mask == -1 else Kind.BITS),
-            words=(found.word,),
-            shift=found.shift,
-            mask=found.mask,
+            *((found.word,), found.shift, found.mask),
             per_unit=found.per_unit,
             low=found.low,
             high=found.high,
@@ -184,138 +182,104 @@ def _supplied(protocol: EscProtocol, group: Group) -> Iterator[Value]:
             yield Value(*name, (found.word,), int(bit), 1, low=0, high=1)
 
 
-def _of_link(name: str, unit: str, kind: Kind, read: Read, per_unit: int = 1) -> Value:
-    pace = Group.LIVE if kind in (Kind.INTEGRAL, Kind.RUN_TIME) else None
-    return Value(
-        *(name, unit, Group.LINK, kind),
-        read=read,
-        per_unit=per_unit,
-        low=0,
-        optional=kind in (Kind.AGE, Kind.RATE),
-        rolls=kind is Kind.COUNT,
-        pace=pace,
-    )
+def _derived(live: Mapping[str, Value]) -> Iterator[Value]:
+    """Values that are made of those of live data; what a protocol does not supply leaves them out."""
+    speed, voltage = live.get("electrical_speed"), live.get("battery_voltage")
+    current = live.get("battery_current")
+    if speed is not None:
+        yield replace(speed, name="motor_speed", unit="1/min", divisor=Divisor.POLE_PAIRS)
+        yield replace(speed, name="output_speed", unit="1/min", divisor=Divisor.OUTPUT)
+    if voltage is not None and current is not None:
+        ends = [(value.low or 0, value.high or 0) for value in (voltage, current)]
+        products = [u * i for u in ends[0] for i in ends[1]]
+        yield Value(
+            *("battery_power", "W", Group.LIVE, Kind.PRODUCT, voltage.words + current.words),
+            per_unit=voltage.per_unit * current.per_unit,
+            low=min(products),
+            high=max(products),
+        )
+    if voltage is not None:
+        open_ended: dict[str, Any] = {"low": None, "high": None, "optional": True}
+        yield replace(voltage, name="mean_cell_voltage", divisor=Divisor.CELLS, **open_ended)
 
 
-def _of_gateway(name: str, read: Callable[[GatewayStatus], int], **more: Any) -> Value:
-    return Value(
-        *(name, "", Group.GATEWAY, Kind.GATEWAY),
-        read=lambda _esc, gateway, _now: read(gateway),
-        low=0,
-        **more,
-    )
+def _of_esc(attribute: str) -> Read:
+    found = operator.attrgetter(attribute)
+    return lambda esc, _gateway, _now: found(esc)
+
+
+_LINK: tuple[tuple[str, str, Kind, Read, int], ...] = (
+    ("energy_used", "Wh", Kind.INTEGRAL, lambda esc, _gw, _now: esc.energy_mw_ns // SECOND, MWS_PER_WH),
+    ("motor_run_time", "s", Kind.RUN_TIME, _of_esc("run_time_ns"), SECOND),
+    ("link_state", "", Kind.STATE, _of_esc("link"), 1),
+    ("layout", "", Kind.STATE, _of_esc("layout"), 1),
+    ("data_age", "ms", Kind.AGE, lambda esc, _gw, now: esc.age_ms(now), 1),
+    ("frame_rate", "Hz", Kind.RATE, _of_esc("frame_rate"), 10),
+    ("losses", "", Kind.COUNT, _of_esc("losses"), 1),
+    ("crc_errors", "", Kind.COUNT, _of_esc("counters.crc_errors"), 1),
+    ("dropped_bytes", "", Kind.COUNT, _of_esc("counters.dropped_bytes"), 1),
+    ("live_frames", "", Kind.COUNT, _of_esc("counters.live"), 1),
+    ("info_frames", "", Kind.COUNT, _of_esc("counters.info"), 1),
+    ("received_bytes", "", Kind.COUNT, _of_esc("counters.bytes"), 1),
+    ("suspect_frames", "", Kind.COUNT, _of_esc("suspect_frames"), 1),
+)  # fmt: skip
+"""Name, unit, kind, steps, steps to a unit."""
+_NEEDED = {"energy_used": {"battery_voltage", "battery_current"}}
+_NEEDED |= {"motor_run_time": {"electrical_speed"}}
 
 
 def _pascal(text: str) -> str:
     return "".join(part[:1].upper() + part[1:].lower() for part in text.split("_"))
 
 
-def _listed(protocol: EscProtocol) -> Iterator[Value]:
-    yield from _supplied(protocol, Group.LIVE)
-    yield from _supplied(protocol, Group.INFO)
-    yield from _derived(protocol.by_name)
-    yield from _link(protocol)
-    yield from _GATEWAY_VALUES
-
-
-def _derived(fields: Mapping[str, Field]) -> Iterator[Value]:
-    """Values that are made of fields; what a protocol does not supply leaves them out."""
-    speed, voltage = fields.get("electrical_speed"), fields.get("battery_voltage")
-    current = fields.get("battery_current")
-    wire = (Group.LIVE, Kind.WIRE)
-    if speed is not None:
-        of_speed: dict[str, Any] = {
-            "words": (speed.word,),
-            "per_unit": speed.per_unit,
-            "low": speed.low,
-            "high": speed.high,
-        }
-        yield Value("motor_speed", "1/min", *wire, **of_speed, divisor=Divisor.POLE_PAIRS)
-        yield Value("output_speed", "1/min", *wire, **of_speed, divisor=Divisor.OUTPUT)
-    if voltage is not None and current is not None:
-        products = [v * i for v in (voltage.low, voltage.high) for i in (current.low, current.high)]
-        yield Value(
-            *("battery_power", "W", Group.LIVE, Kind.PRODUCT, (voltage.word, current.word)),
-            per_unit=voltage.per_unit * current.per_unit,
-            low=min(products),
-            high=max(products),
-        )
-    if voltage is not None:
-        yield Value(
-            *("mean_cell_voltage", "V", *wire, (voltage.word,)),
-            per_unit=voltage.per_unit,
-            divisor=Divisor.CELLS,
-            optional=True,
-        )
-    if voltage is not None and current is not None:
-        energy: Read = lambda esc, _gateway, _now: esc.drawn.energy  # noqa: E731
-        yield _of_link("energy_used", "Wh", Kind.INTEGRAL, energy, MWS_PER_WH)
-    if speed is not None:
-        turning: Read = lambda esc, _gateway, _now: esc.drawn.run_time  # noqa: E731
-        yield _of_link("motor_run_time", "s", Kind.RUN_TIME, turning, SECOND)
-
-
 def _link(protocol: EscProtocol) -> Iterator[Value]:
-    yield Value(
-        *("link_state", "", Group.LINK, Kind.STATE),
-        read=lambda esc, _gateway, _now: esc.link,
-        low=0,
-        high=5,
-        names={state: _pascal(state.name) for state in LinkState},
-    )
-    yield Value(
-        *("layout", "", Group.LINK, Kind.STATE),
-        read=lambda esc, _gateway, _now: esc.layout,
-        low=0,
-        high=len(protocol.layouts),
-        names={0: "Unknown", **{n: _pascal(t) for n, t in enumerate(protocol.layouts, 1)}},
-    )
-    yield _of_link("data_age", "ms", Kind.AGE, lambda esc, _gateway, now: esc.age_ms(now))
-    yield _of_link("frame_rate", "Hz", Kind.RATE, lambda esc, _gateway, _now: esc.frame_rate, 10)
-    counts: tuple[tuple[str, Read], ...] = (
-        ("losses", lambda esc, _gateway, _now: esc.losses),
-        ("crc_errors", lambda esc, _gateway, _now: esc.counters.crc_errors),
-        ("dropped_bytes", lambda esc, _gateway, _now: esc.counters.dropped_bytes),
-        ("live_frames", lambda esc, _gateway, _now: esc.counters.live),
-        ("info_frames", lambda esc, _gateway, _now: esc.counters.info),
-        ("received_bytes", lambda esc, _gateway, _now: esc.counters.bytes),
-        ("suspect_frames", lambda esc, _gateway, _now: esc.suspect_frames),
-    )
-    for name, read in counts:
-        yield _of_link(name, "", Kind.COUNT, read)
+    layouts = {n: _pascal(text) for n, text in enumerate(("unknown", *protocol.layouts))}
+    named = {"link_state": {int(s): _pascal(s.name) for s in LinkState}, "layout": layouts}
+    for name, unit, kind, read, per_unit in _LINK:
+        if _NEEDED.get(name, set()) <= protocol.by_name.keys():
+            yield Value(
+                *(name, unit, Group.LINK, kind),
+                read=read,
+                per_unit=per_unit,
+                low=0,
+                high=max(named[name]) if name in named else None,
+                names=named.get(name, {}),
+                optional=kind in (Kind.AGE, Kind.RATE),
+                rolls=kind is Kind.COUNT,
+                pace=Group.LIVE if kind in (Kind.INTEGRAL, Kind.RUN_TIME) else None,
+            )
+
+
+def _of_gateway(name: str, **more: Any) -> Value:
+    found = operator.attrgetter(name.removeprefix("gateway_"))
+    of: dict[str, Any] = {"unit": "", "read": lambda _esc, gateway, _now: found(gateway)}
+    return Value(name, group=Group.GATEWAY, kind=Kind.GATEWAY, low=0, **of | more)
 
 
 def _gateway() -> Iterator[Value]:
-    yield _of_gateway(
-        "gateway_state",
-        lambda gateway: gateway.state,
-        names={state: _pascal(state.name) for state in GatewayState},
-    )
-    yield _of_gateway(
-        "can_state",
-        lambda gateway: gateway.can_state,
-        names={state: _pascal(state.name) for state in CanState},
-    )
-    yield _of_gateway("esc_count", lambda gateway: gateway.esc_count)
-    yield _of_gateway("escs_ok", lambda gateway: gateway.escs_ok)
-    yield Value(
-        *("uptime", "s", Group.GATEWAY, Kind.GATEWAY),
-        read=lambda _esc, gateway, now: (now - gateway.started_ns) // MS,
-        per_unit=1000,
-        low=0,
-    )
+    for name, states in (("gateway_state", GatewayState), ("can_state", CanState)):
+        yield _of_gateway(name, names={int(state): _pascal(state.name) for state in states})
+    yield _of_gateway("esc_count")
+    yield _of_gateway("escs_ok")
+    uptime: Read = lambda _esc, gateway, now: (now - gateway.started_ns) // MS  # noqa: E731
+    yield _of_gateway("uptime", unit="s", per_unit=1000, read=uptime)
     for name in (
         *("sent_frames", "replaced_frames", "send_failures"),
         *("received_frames", "bus_off_count", "dropped_frames", "id_conflicts"),
     ):
-        yield _of_gateway(name, operator.attrgetter(name), rolls=True)
+        yield _of_gateway(name, rolls=True)
 
 
 _GATEWAY_VALUES = tuple(_gateway())  # the same for all protocols
 
 
-def _never(_esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> None:
-    """Of a value that the ESC's protocol does not supply."""
+def _listed(protocol: EscProtocol) -> Iterator[Value]:
+    live = {value.name: value for value in _supplied(protocol, Group.LIVE)}
+    yield from live.values()
+    yield from _supplied(protocol, Group.INFO)
+    yield from _derived(live)
+    yield from _link(protocol)
+    yield from _GATEWAY_VALUES
 
 
 def _all_values(protocols: Sequence[EscProtocol]) -> Mapping[str, Value]:
@@ -347,4 +311,5 @@ def values_of_esc(settings: EscSettings) -> Mapping[str, Value]:
 
 
 def _missing(value: Value) -> Value:
-    return replace(value, words=(), read=_never, low=None, high=None, optional=True, supplied=False)
+    never: dict[str, Any] = {"words": (), "read": lambda _esc, _gateway, _now: None}
+    return replace(value, **never, low=None, high=None, optional=True, supplied=False)

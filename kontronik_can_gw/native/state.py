@@ -24,36 +24,6 @@ def _forms(protocol: EscProtocol) -> Sequence[tuple[struct.Struct, Any]]:
     return [(struct.Struct("<" + codes), kind) for codes, kind in protocol.wire]
 
 
-class NativeDrawn:
-    """As Drawn: ``energy`` in whole milliwatt seconds, ``run_time`` in ns."""
-
-    def __init__(self, state: Any) -> None:
-        self._state = state
-
-    @property
-    def energy(self) -> int:
-        found: int = self._state.energy
-        return found
-
-    @property
-    def run_time(self) -> int:
-        found: int = self._state.run_time
-        return found
-
-    @run_time.setter
-    def run_time(self, ns: int) -> None:
-        self._state.run_time = ns
-
-    @property
-    def energy_mw_ns(self) -> int:
-        """The energy in milliwatt nanoseconds, as a capture holds it."""
-        return self.energy * SECOND_NS + int(self._state.energy_rest)
-
-    @energy_mw_ns.setter
-    def energy_mw_ns(self, energy: int) -> None:
-        self._state.energy, self._state.energy_rest = divmod(energy, SECOND_NS)
-
-
 class NativeEsc(EscTelemetry):
     """The state of an ESC. What the core holds is read when somebody asks."""
 
@@ -64,7 +34,6 @@ class NativeEsc(EscTelemetry):
         self._generation = -1
         self._readings: dict[int, Data | None] = {}
         self._counters_of = type(self.protocol.make().counters)
-        self.drawn = NativeDrawn(state)
         self.line_errors = self.base_losses = self.base_line_errors = 0
         self.apply(settings)
         self.base = self.counters
@@ -72,7 +41,7 @@ class NativeEsc(EscTelemetry):
     def frozen(self) -> Self:
         twin = object.__new__(type(self))
         state = type(self._state).from_buffer_copy(self._state)
-        vars(twin).update(vars(self), _state=state, drawn=NativeDrawn(state), _readings={})
+        vars(twin).update(vars(self), _state=state, _readings={})
         return twin
 
     @property
@@ -119,18 +88,36 @@ for _name, _read in _READ.items():
     setattr(NativeEsc, _name, property(_read))
 
 
-def _count(place: int) -> property:
-    def read(self: NativeEsc) -> Any:
-        return self._state.count[place]
+def _energy(esc: NativeEsc) -> int:
+    return int(esc._state.energy) * SECOND_NS + int(esc._state.energy_rest)
 
-    def write(self: NativeEsc, value: int) -> None:
-        self._state.count[place] = value  # as a capture of a later part begins with
+
+def _set_energy(esc: NativeEsc, mw_ns: int) -> None:
+    esc._state.energy, esc._state.energy_rest = divmod(mw_ns, SECOND_NS)
+
+
+def _set_run_time(esc: NativeEsc, ns: int) -> None:
+    esc._state.run_time = ns
+
+
+def _count(place: int) -> property:
+    def read(esc: NativeEsc) -> Any:
+        return esc._state.count[place]
+
+    def write(esc: NativeEsc, value: int) -> None:
+        esc._state.count[place] = value
 
     return property(read, write)
 
 
-for _name in ("losses", "late_frames", "suspect_frames"):
-    setattr(NativeEsc, _name, _count(COUNTS.index(_name)))
+_COUNTS = ("losses", "late_frames", "suspect_frames")
+_WRITABLE = {name: _count(COUNTS.index(name)) for name in _COUNTS} | {
+    "energy_mw_ns": property(_energy, _set_energy),
+    "run_time_ns": property(lambda esc: esc._state.run_time, _set_run_time),
+}
+"""A capture of a later part begins with what was before."""
+for _name, _property in _WRITABLE.items():
+    setattr(NativeEsc, _name, _property)
 
 
 def _member(name: str, place: int, kind: Callable[[int], Any] | None) -> property:

@@ -281,7 +281,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
     """What a replay that begins now cannot know."""
     return {
         "escs": [
-            {"energy": e.drawn.energy_mw_ns, "run_time": e.drawn.run_time, "losses": e.losses}
+            {"energy": e.energy_mw_ns, "run_time": e.run_time_ns, "losses": e.losses}
             for e in gateway.escs
         ],
         "can_state": int(gateway.status.can_state),

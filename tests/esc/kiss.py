@@ -6,24 +6,14 @@ by a gap: what follows an error is dropped up to the next one.
 
 import struct
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-from kontronik_can_gw.esc.decoder import EscProtocol, Field, Reading
+from kontronik_can_gw.esc.decoder import EscProtocol, Field, FrameForm, Reading
 
 GAP_NS = 2_000_000
 _BODY = struct.Struct(">bHHHH")
 
 
-class Form(NamedTuple):
-    """The one form of a frame."""
-
-    is_info: bool = False
-    length: int = 10
-    layout_number: int = 1
-    partly_protected: bool = False
-
-
-FORM = Form()
+FORM = FrameForm(length=10)
 
 
 @dataclass
@@ -115,10 +105,10 @@ KISS = EscProtocol(
     name="kiss",
     make=Kiss,
     fields=(
-        Field("power_stage_temperature", "°C", 0, low=-128, high=127),
-        Field("battery_voltage", "V", 1, per_unit=100, high=0xFFFF),
-        Field("battery_current", "A", 2, per_unit=100, high=0xFFFF),
-        Field("consumed_charge", "mAh", 3, high=0xFFFF),
-        Field("electrical_speed", "1/min", 4, high=6_553_500),
+        Field("power_stage_temperature", "°C", 0, -128, 127),
+        Field("battery_voltage", "V", 1, 0, 0xFFFF, per_unit=100),
+        Field("battery_current", "A", 2, 0, 0xFFFF, per_unit=100),
+        Field("consumed_charge", "mAh", 3, 0, 0xFFFF),
+        Field("electrical_speed", "1/min", 4, 0, 6_553_500),
     ),
 )

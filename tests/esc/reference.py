@@ -35,16 +35,8 @@ def _shift_eight(remainder: int) -> int:
 _TABLE = [_shift_eight(byte) for byte in range(256)]
 
 
-def crc32_of_bits(data: bytes) -> int:
-    """CRC-32 (ISO-HDLC) bit by bit: reflected polynomial 0xEDB88320, start and final XOR all ones."""
-    remainder = 0xFFFFFFFF
-    for byte in data:
-        remainder = _shift_eight(remainder ^ byte)
-    return remainder ^ 0xFFFFFFFF
-
-
 def crc32(data: bytes) -> int:
-    """The same CRC, by a table."""
+    """CRC-32 (ISO-HDLC): reflected polynomial 0xEDB88320, start and final XOR all ones; by a table."""
     remainder = 0xFFFFFFFF
     for byte in data:
         remainder = remainder >> 8 ^ _TABLE[(remainder ^ byte) & 0xFF]

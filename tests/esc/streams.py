@@ -1,4 +1,4 @@
-"""Byte streams for the deframer's tests, all synthetic but the two recorded frames; and a model of a UART line."""
+"""Byte streams for the deframer's tests, all synthetic but the two recorded frames."""
 
 import random
 
@@ -17,7 +17,7 @@ FRAGMENTS = [*b"K KO KOD KODL KODI KODK KODX KOKO KKOD KODKODI \0 \xff".split(b"
 
 def form_of(row: FormRow) -> Form:
     """The package's form of a row of the sheet."""
-    return next(f for f in FORMS if (f.kind.value, f.layout.value) == (row.kind, row.layout))
+    return next(form for form in FORMS if form.name == f"{row.kind}_{row.layout}")
 
 
 def decoded(form: Form, buffer: bytes, at: int = 0) -> Data:
@@ -114,54 +114,3 @@ pieces = st.one_of(
     st.integers(0, 1 << 32).map(lambda seed: random_piece(random.Random(seed))),
 )
 streams = st.lists(pieces, max_size=12).map(b"".join)
-
-
-class Uart:
-    """A line in time steps of a quarter of a 115200 baud bit; idle is high."""
-
-    STEPS = 4
-
-    def __init__(self) -> None:
-        self.levels: list[int] = [1] * 100
-
-    def idle(self, steps: int) -> None:
-        self.levels += [1] * steps
-
-    def send(self, data: bytes, slower: int = 1, parity: bool = True) -> None:
-        """Start bit, eight data bits lowest first, even parity if asked for, stop bit; ``slower`` 12 is 9600 baud."""
-        for byte in data:
-            bits = [
-                0,
-                *(byte >> bit & 1 for bit in range(8)),
-                *([byte.bit_count() & 1] if parity else []),
-                1,
-            ]
-            for bit in bits:
-                self.levels += [bit] * (self.STEPS * slower)
-
-    def received(self, parity: bool, resume_at_low_stop: bool) -> bytes:
-        """What a receiver at 115200 baud reads; bytes with parity or framing errors are passed on as they are.
-
-        After a low stop bit it either waits for the line to become high, or takes that bit as the next start bit (as a 16550).
-        """
-        levels = [*self.levels, *([1] * 200)]
-        result = bytearray()
-        stop = 10 if parity else 9
-        at = 1
-        while at + (stop + 1) * self.STEPS < len(levels):
-            if levels[at] == 1 or levels[at - 1] == 0:
-                at += 1
-                continue
-            while True:  # at is where a start bit begins
-                middle = at + self.STEPS // 2
-                result.append(
-                    sum(levels[middle + (1 + bit) * self.STEPS] << bit for bit in range(8))
-                )
-                at += stop * self.STEPS
-                if levels[at + self.STEPS // 2] == 1 or not resume_at_low_stop:
-                    break
-                if at + (stop + 1) * self.STEPS >= len(levels):
-                    break
-            if levels[at + self.STEPS // 2] == 1:
-                at += self.STEPS // 2
-        return bytes(result)

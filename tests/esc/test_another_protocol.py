@@ -1,6 +1,7 @@
 """The recipe for another ESC protocol: kiss.py goes through the whole gateway, beside a KONTRONIK ESC, without a change of the package."""
 
 import json
+import re
 import termios
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -8,8 +9,6 @@ from typing import Any
 
 import cantools
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.capture.setup import CaptureSetup
@@ -17,24 +16,20 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.desk.metrics import families
-from kontronik_can_gw.desk.monitor.status import alarms as alarms_of
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.columns import fields_of_values, reader_of, values_of_fields
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
-from kontronik_can_gw.esc.decoder import Field
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group, _all_values, values_of
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, ProgramFacts, gateway_facts
-from kontronik_can_gw.runtime.process import ProcessFacts
+from kontronik_can_gw.runtime.facts import PortFacts
 from kontronik_can_gw.runtime.serial_port import SerialPort
-from kontronik_can_gw.runtime.snapshot import Moment, _esc, _words, snapshot
+from kontronik_can_gw.runtime.snapshot import _esc
 from kontronik_can_gw.signals.unpacker import SignalReader
 
-from .kiss import GAP_NS, KISS, Kiss, frame
+from .kiss import KISS, frame
 
 DBC = Path(__file__).with_name("kiss.dbc")
 PERIOD = SECOND // 10
@@ -125,22 +120,8 @@ def test_a_protocol_without_speed_or_current_has_no_run_time_and_no_energy() -> 
         assert values_of(KISS)[value].supplied
 
 
-def test_a_field_without_a_range_or_a_part_of_a_word_to_derive_from_is_refused() -> None:
-    for wrong in (
-        Field("consumed_charge", "mAh", 3),
-        Field("battery_voltage", "V", 1, high=255, shift=8, mask=255),
-    ):
-        with pytest.raises(ValueError, match=f"ESC protocol kiss: {wrong.name}"):
-            replace(KISS, fields=(wrong,))
-
-
 def test_the_first_protocol_gives_the_order_of_all_values() -> None:
     assert list(_all_values((*protocols.PROTOCOLS, KISS))) == list(VALUES)
-
-
-def test_error_words_without_named_bits_are_shown_by_number() -> None:
-    fields = (*KISS.fields, Field("operating_errors", "", 3, high=0xFFFF))
-    assert '"errors":["bit0","bit2"]' in _words(replace(KISS, fields=fields), None, 5, None)
 
 
 def test_lost_telemetry_is_not_available_and_the_other_esc_goes_on() -> None:
@@ -236,63 +217,13 @@ def test_its_line_is_set_without_parity() -> None:
             port.close()
 
 
-def test_a_device_of_another_protocol_is_refused() -> None:
-    esc = {"port": "/dev/null", "protocol": "kiss", "device": "KOSMIK"}
-    with pytest.raises(UserError, match="'KOSMIK' is no device of the protocol kiss"):
-        parse(MIXED | {"esc": [esc]}, "mixed.toml")
-
-
-def test_an_unknown_protocol_is_refused_with_the_nearest() -> None:
-    wrong = MIXED | {"esc": [{"port": "/dev/null", "protocol": "kis"}]}
-    with pytest.raises(
-        UserError, match=r"esc\[1\].protocol: 'kis' is none of kontronik, kiss. Did you mean kiss?"
-    ):
-        parse(wrong, "mixed.toml")
-
-
-@given(
-    frames=st.lists(st.tuples(*[st.integers(0, 100)] * 5), max_size=5),
-    damaged=st.binary(min_size=1, max_size=25).filter(lambda data: len(data) % 10),
-    cut=st.integers(1, 10),
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"protocol": "kiss", "device": "KOSMIK"}, "'KOSMIK' is no device of the protocol kiss"),
+        ({"protocol": "kis"}, "'kis' is none of kontronik, kiss. Did you mean kiss?"),
+    ],
 )
-def test_frames_are_found_however_cut_and_after_a_gap_whatever_came(
-    frames: list[tuple[int, ...]], damaged: bytes, cut: int
-) -> None:
-    decoder, now, found = Kiss(), 0, []
-    decoder.feed(damaged, now)
-    before = decoder.counters.live
-    for values in frames:
-        now += GAP_NS
-        wire = frame(*values)
-        for at in range(0, len(wire), cut):
-            found += [reading.data for reading in decoder.feed(wire[at : at + cut], now)]
-    assert found == [(t, u, i, q, 100 * n) for t, u, i, q, n in frames]
-    counters = decoder.counters
-    assert counters.bytes == 10 * counters.live + counters.dropped_bytes + decoder.pending
-    assert counters.live == before + len(frames)
-
-
-def test_metrics_and_screen_of_both_in_one_document() -> None:
-    flight = Flight()
-    undervoltage = LiveData(operating_errors=1)
-    flight.send(encode(undervoltage, Layout.V4), frame(20, 2_400, 1_234, 55, 210))
-    moment = Moment(
-        gateway_facts(flight.gateway),
-        now=flight.now,
-        wall=0,
-        program=ProgramFacts("mixed.toml"),
-        process=ProcessFacts(),
-        ports=[PortFacts(name, "/dev/null", open=True) for name in ("old", "kiss")],
-        can=CanFacts("virtual", "kiss", None, open=True),
-    )
-    document = json.loads(snapshot(moment))
-    counted = {
-        (sample.name, sample.labels["esc"]): sample.value
-        for family in families(document, 0)
-        for sample in family.samples
-        if sample.name.startswith("kontronik_esc_live")
-    }
-    assert counted["kontronik_esc_live_v4_total", "old"] == 1
-    assert ("kontronik_esc_live_v4_total", "kiss") not in counted
-    alarms = [(name, flag.meaning, flag.remedy[:9]) for name, flag in alarms_of(document)]
-    assert ("old ", "battery voltage too low", "Stop soon") in alarms
+def test_what_its_configuration_cannot_have_is_refused(wrong: dict[str, str], said: str) -> None:
+    with pytest.raises(UserError, match=re.escape(said)):
+        parse(MIXED | {"esc": [{"port": "/dev/null"} | wrong]}, "mixed.toml")

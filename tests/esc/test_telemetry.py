@@ -3,7 +3,7 @@
 import random
 from bisect import bisect_right
 from functools import reduce
-from itertools import accumulate, pairwise
+from itertools import accumulate, pairwise, permutations
 from operator import or_
 
 import pytest
@@ -108,32 +108,19 @@ def value(source: Value, telemetry: EscStream, now: int = 0) -> float:
 # --- link states
 
 
-def test_before_the_first_byte_nothing_was_ever_seen_and_nothing_is_available() -> None:
-    telemetry = esc()
-    assert (telemetry.link, telemetry.live, telemetry.info) == (LinkState.NEVER_SEEN, None, None)
-    assert (telemetry.layout, telemetry.cells, telemetry.losses, telemetry.age_ms(5 * SECOND)) == (
-        0,
-        0,
-        0,
-        None,
-    )
-    telemetry.advance(100 * SECOND)
-    assert link_of(telemetry) is LinkState.NEVER_SEEN
-    assert telemetry.frame_rate == 0
-
-
-@pytest.mark.parametrize("before", [b"", NOISE])
 @pytest.mark.parametrize("layout", list(Layout))
-def test_the_first_live_frame_makes_the_link_ok(before: bytes, layout: Layout) -> None:
+def test_the_first_live_frame_makes_the_link_ok(layout: Layout) -> None:
     telemetry = esc()
-    if before:
-        read(telemetry, before, 1)
-    events = read(telemetry, live(7, layout), 2 * MS)
-    assert link_of(telemetry) is LinkState.OK
-    assert events & Event.LINK
-    assert events & Event.LIVE
-    assert telemetry.live is not None
-    assert telemetry.live.electrical_speed == 7
+    telemetry.advance(SECOND)
+    assert link_of(telemetry) is LinkState.NEVER_SEEN
+    read(telemetry, NOISE, SECOND)
+    assert (telemetry.link, telemetry.live, telemetry.age_ms(SECOND)) == (
+        *(LinkState.SEARCHING, None, None),
+    )
+    events = read(telemetry, live(7, layout), SECOND)
+    assert events & Event.LINK and events & Event.LIVE
+    assert (telemetry.link, telemetry.age_ms(SECOND)) == (LinkState.OK, 0)
+    assert telemetry.live is not None and telemetry.live.electrical_speed == 7
     assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[layout]
 
 
@@ -174,11 +161,8 @@ def test_a_silent_line_is_lost_and_a_frame_brings_it_back() -> None:
 
 def test_a_loss_that_is_seen_by_the_next_frame_counts_too() -> None:
     telemetry = alive(SECOND)
-    events = read(telemetry, live(5), SECOND + TIMEOUT + 1)
-    assert telemetry.losses == 1
-    assert events & Event.LINK
-    assert link_of(telemetry) is LinkState.OK
-    assert telemetry.port_opened() == Event.NONE, "it was never lost"
+    assert read(telemetry, live(5), SECOND + TIMEOUT + 1) & Event.LINK
+    assert (telemetry.link, telemetry.losses) == (LinkState.OK, 1)
 
 
 @pytest.mark.parametrize("seen", [False, True])
@@ -244,8 +228,8 @@ def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire(
     assert telemetry.live is not None
     assert telemetry.live.electrical_speed == 3
     assert telemetry.live_ns == SECOND - 20 * NS_PER_BYTE
-    assert telemetry.drawn.run_time == 2 * 40 * NS_PER_BYTE
-    assert telemetry.drawn.energy_mw_ns == 2 * 40 * NS_PER_BYTE * 2400 * 100
+    assert telemetry.run_time_ns == 2 * 40 * NS_PER_BYTE
+    assert telemetry.energy_mw_ns == 2 * 40 * NS_PER_BYTE * 2400 * 100
 
 
 # --- arrival: what is known of when bytes came
@@ -291,17 +275,12 @@ def test_time_outs_count_from_when_bytes_can_have_come_and_ages_do_beyond_an_int
 
 def test_an_info_frame_is_late_by_its_own_time_out() -> None:
     telemetry = alive()
-    now = 30 * SECOND
-    read(telemetry, info(), now, now - INFO_TIMEOUT_NS)
-    assert telemetry.info is not None
-    assert (
-        telemetry.last_info_ns
-        == telemetry.info_bound_ns
-        == now - INFO_TIMEOUT_NS + WIRE + (len(info()) - 40) * NS_PER_BYTE
-    )
-    read(telemetry, info(), 2 * now, 2 * now - INFO_TIMEOUT_NS - SECOND)
-    assert info_of(telemetry) is None
-    assert telemetry.late_frames == 1
+    length = (len(info()) - 1) * NS_PER_BYTE
+    for now, waited in ((30 * SECOND, INFO_TIMEOUT_NS), (60 * SECOND, INFO_TIMEOUT_NS + SECOND)):
+        read(telemetry, info(), now, now - waited)
+        if waited == INFO_TIMEOUT_NS:
+            assert telemetry.info_bound_ns == telemetry.last_info_ns == now - waited + length
+    assert (info_of(telemetry), telemetry.late_frames) == (None, 1)
 
 
 # --- derived values
@@ -333,14 +312,14 @@ def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight()
 def test_energy_is_not_counted_over_a_gap_and_is_kept_over_a_loss() -> None:
     telemetry = alive(SECOND)
     read(telemetry, live(), SECOND + 100 * MS)
-    kept = telemetry.drawn.energy
-    assert kept == 2400 * 100 // 10
+    kept = telemetry.energy_mw_ns
+    assert kept == 2400 * 100 * 100 * MS
     read(telemetry, live(), 20 * SECOND)
-    assert (telemetry.drawn.energy, telemetry.drawn.run_time) == (kept, 100 * MS)
+    assert (telemetry.energy_mw_ns, telemetry.run_time_ns) == (kept, 100 * MS)
     telemetry.port_lost()
     telemetry.port_opened()
     read(telemetry, live(), 20 * SECOND + 10 * MS)
-    assert (telemetry.drawn.energy, telemetry.drawn.run_time) == (kept, 100 * MS)
+    assert (telemetry.energy_mw_ns, telemetry.run_time_ns) == (kept, 100 * MS)
 
 
 @pytest.mark.parametrize(
@@ -382,14 +361,9 @@ def test_the_frame_rate_is_known_after_a_second_in_tenths_of_hertz(rate: int) ->
 @pytest.mark.parametrize(
     ("device", "raw", "supplied"),
     [
-        (None, 0, False),
-        (None, 1, True),
-        (Device.JIVEPRO, 0, False),
-        (Device.JIVEPRO, 500, False),
-        (Device.KOSMIK, 0, True),
-        (Device.KOLIBRI, 0, True),
-        (Device.KONTROL_X, 0, True),
-        (63, 0, True),
+        *((None, 0, False), (None, 1, True)),
+        *((Device.JIVEPRO, 0, False), (Device.JIVEPRO, 500, False)),
+        *((Device.KOSMIK, 0, True), (63, 0, True)),
     ],
 )
 def test_bec_current_is_supplied_by_all_but_a_jivepro_and_at_0_only_by_a_known_device(
@@ -401,28 +375,21 @@ def test_bec_current_is_supplied_by_all_but_a_jivepro_and_at_0_only_by_a_known_d
     assert telemetry.supplies(VALUES["bec_current"].not_on, raw) is supplied
 
 
-@pytest.mark.parametrize(("old", "new"), [(Layout.V4, Layout.LEGACY), (Layout.LEGACY, Layout.V4)])
+@pytest.mark.parametrize(("old", "new"), list(permutations(Layout)))
 @pytest.mark.parametrize("kind", ["live", "info"])
 def test_another_layout_is_another_device_of_which_nothing_is_known(
     old: Layout, new: Layout, kind: str
 ) -> None:
     telemetry = esc()
     read(telemetry, live(1, old) + info(Device.KOSMIK, old), SECOND)
-    assert telemetry.info is not None
-    events = read(
-        telemetry,
-        live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3),
-        SECOND + 10 * MS,
-    )
-    assert events & Event.LINK
-    assert events & Event.INFO
+    frame = live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3)
+    events = read(telemetry, frame, SECOND + 10 * MS)
+    assert events & Event.LINK and events & Event.INFO
     assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[new]
     if kind == "live":
-        assert (info_of(telemetry), telemetry.cells) == (None, 0)
-        assert telemetry.live is not None
-        assert telemetry.live.electrical_speed == 2
+        assert (info_of(telemetry), telemetry.device, telemetry.cells) == (None, None, 0)
+        assert telemetry.live is not None and telemetry.live.electrical_speed == 2
     else:
-        assert telemetry.info is not None
         assert (telemetry.device, telemetry.cells) == (Device.JIVEPRO, 3)
     assert link_of(telemetry) is LinkState.OK
 
@@ -436,9 +403,6 @@ def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_devi
     assert read(telemetry, info(Device.KOLIBRI, variant=80), SECOND + 40 * MS) == another
     variant = telemetry.protocol.value("variant", telemetry.info)
     assert (telemetry.device, variant, telemetry.cells) == (Device.KOLIBRI, 80, 6)
-
-
-# --- counters
 
 
 # --- deadlines
@@ -541,21 +505,3 @@ def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_dead
         assert (seldom.live, seldom.info, seldom.link) == (often.live, often.info, often.link)
         if between > now:
             break  # from here on time would run backwards for one of them
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.integers(0, 2**32))
-def test_a_clean_stream_loses_nothing_however_it_is_cut(seed: int) -> None:
-    source = random.Random(seed)
-    layout = source.choice(list(Layout))
-    telemetry = esc()
-    for number in range(1, 30):
-        frame = live(number, layout)
-        cut = source.randrange(len(frame))
-        begin = number * 10 * MS
-        read(telemetry, frame[:cut], begin + cut * NS_PER_BYTE)
-        read(telemetry, frame[cut:], begin + len(frame) * NS_PER_BYTE)
-        assert telemetry.live is not None
-        assert telemetry.live.electrical_speed == number
-        assert telemetry.live_ns == begin + len(frame) * NS_PER_BYTE
-    assert telemetry.decoder.counters.dropped_bytes == 0

@@ -265,8 +265,8 @@ class Both:
         for esc, other in zip(self.python.escs, self.native.escs, strict=True):
             for name in STATE:
                 assert getattr(esc, name) == getattr(other, name), name
-            assert esc.drawn.energy_mw_ns == other.drawn.energy_mw_ns
-            assert esc.drawn.run_time == other.drawn.run_time
+            assert esc.energy_mw_ns == other.energy_mw_ns
+            assert esc.run_time_ns == other.run_time_ns
 
     def step(self) -> None:
         """Something happens, and time passes."""

@@ -198,8 +198,8 @@ KNOWN: dict[str, Known] = {
     "battery_power": Known("W", _calculated(lambda _e, v: Fraction(v.battery_voltage * v.battery_current, 1000))),
     "mean_cell_voltage": Known(
         "V", _calculated(lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None)),
-    "energy_used": Known("Wh", _of_esc(lambda e: Fraction(e.drawn.energy, 3600 * 1000))),
-    "motor_run_time": Known("s", _of_esc(lambda e: Fraction(e.drawn.run_time, 10**9))),
+    "energy_used": Known("Wh", _of_esc(lambda e: Fraction(e.energy_mw_ns // 10**9, 3600 * 1000))),
+    "motor_run_time": Known("s", _of_esc(lambda e: Fraction(e.run_time_ns, 10**9))),
     "link_state": Known("", _of_esc(lambda e: int(e.link)), LINKS),
     "layout": Known("", _of_esc(lambda e: e.layout), LAYOUTS),
     "data_age": Known("ms", _age),
@@ -679,8 +679,8 @@ def random_escs(
         esc.advance(now)
         if rng.random() < 0.3:
             energy = rng.choice((1, -1)) * rng.randrange(10 ** rng.choice((17, 19)))
-            esc.drawn.energy_mw_ns = energy * SECOND
-            esc.drawn.run_time = rng.randrange(10**14)
+            esc.energy_mw_ns = energy * SECOND
+            esc.run_time_ns = rng.randrange(10**14)
             esc.losses = rng.randrange(10**6)
             esc.frame_rate = rng.choice((None, 0, 5, 999, 1004))
     return escs, now

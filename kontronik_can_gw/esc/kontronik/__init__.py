@@ -1,6 +1,6 @@
 """KONTRONIK telemetry as it is on the wire: fields, states, codec, deframer. Standard library only, no I/O, no clock."""
 
-from kontronik_can_gw.esc.kontronik.codec import Form, Kind, Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import Form, Layout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, Row, rows
 from kontronik_can_gw.esc.kontronik.states import (
@@ -17,7 +17,6 @@ __all__ = [
     "Form",
     "Frame",
     "InfoData",
-    "Kind",
     "Layout",
     "LiveData",
     "OperatingError",

@@ -13,6 +13,7 @@ import struct
 from enum import Enum
 from zlib import crc32
 
+from kontronik_can_gw.esc.decoder import FrameForm
 from kontronik_can_gw.esc.kontronik.fields import (
     Data,
     DataType,
@@ -23,13 +24,6 @@ from kontronik_can_gw.esc.kontronik.fields import (
 )
 
 
-class Kind(Enum):
-    """Which of the two frames."""
-
-    LIVE = "live"
-    INFO = "info"
-
-
 class Layout(Enum):
     """Which of the two layouts."""
 
@@ -37,31 +31,24 @@ class Layout(Enum):
     LEGACY = "legacy"
 
 
-class Form:
+class Form(FrameForm):
     """One of the four frame forms: its length, what its CRC covers, and how its body is packed."""
 
-    def __init__(self, kind: Kind, layout: Layout) -> None:
-        self.kind = kind
+    def __init__(self, is_info: bool, layout: Layout) -> None:
         self.layout = layout
-        self.is_info = kind is Kind.INFO
-        self.layout_number = list(Layout).index(layout) + 1
-        self.partly_protected = layout is Layout.LEGACY
-        self.name = f"{kind.value}_{layout.value}"
-        self.header = b"KODI" if self.is_info else b"KODL"
-        self.data_type: DataType = InfoData if self.is_info else LiveData
+        self.name = f"{'info' if is_info else 'live'}_{layout.value}"
+        self.header = b"KODI" if is_info else b"KODL"
+        self.data_type: DataType = InfoData if is_info else LiveData
         body = body_format(self.data_type)
-        reserved = 0 if self.partly_protected else -struct.calcsize(f"<4s{body}") % 4
+        reserved = 0 if layout is Layout.LEGACY else -struct.calcsize(f"<4s{body}") % 4
         self._struct = struct.Struct(f"<4s{body}{reserved}xI")
-        self.length = self._struct.size
+        super().__init__(self._struct.size, is_info, list(Layout).index(layout) + 1)
         self.crc_at = self.length - 4
         self.covered = self.crc_at // 4 * 4
         self.crc_goes_on_over = slice(0, self.covered)
         """What its CRC covers; of the longer of two forms: beyond what that of the shorter covers."""
         self.crc_of = struct.Struct(f"<{self.crc_at}xI").unpack_from
         self.fields_of = struct.Struct(f"<4x{body}").unpack_from
-
-    def __repr__(self) -> str:
-        return f"Form({self.kind.value}, {self.layout.value}, {self.length} bytes)"
 
     def encode(self, data: Data) -> bytes:
         """The frame with reserved bytes 0 and its CRC. ValueError naming the field that does not fit its wire type."""
@@ -77,7 +64,7 @@ class Form:
         return frame[:-4] + crc32(frame[: self.covered]).to_bytes(4, "little")
 
 
-FORMS = tuple(Form(kind, layout) for kind in Kind for layout in (Layout.LEGACY, Layout.V4))
+FORMS = tuple(Form(info, layout) for info in (False, True) for layout in (Layout.LEGACY, Layout.V4))
 """All four; of one kind the shorter first, which is also the order in which they are tried."""
 
 FORMS_BY_HEADER = {
@@ -91,5 +78,5 @@ MAX_LENGTH = max(form.length for form in FORMS)
 
 def encode(data: Data, layout: Layout) -> bytes:
     """The frame bytes of a LiveData or InfoData in the given layout. ValueError if a value does not fit its wire type."""
-    kind = Kind.LIVE if isinstance(data, LiveData) else Kind.INFO
-    return next(form for form in FORMS if form.kind is kind and form.layout is layout).encode(data)
+    of = type(data), layout
+    return next(form for form in FORMS if (form.data_type, form.layout) == of).encode(data)

@@ -16,7 +16,6 @@ from kontronik_can_gw.esc.kontronik.codec import (
     FORMS_BY_HEADER,
     MAX_LENGTH,
     Form,
-    Kind,
     Layout,
 )
 from kontronik_can_gw.esc.kontronik.fields import Data, LiveData
@@ -36,10 +35,6 @@ class Frame(Reading):
     data: Data
 
     @property
-    def kind(self) -> Kind:
-        return self.form.kind
-
-    @property
     def layout(self) -> Layout:
         return self.form.layout
 
@@ -47,11 +42,9 @@ class Frame(Reading):
     def suspect(self) -> bool:
         """True where the bytes outside a legacy live frame's CRC are impossible (operating state above 26)."""
         data = self.data
-        return (
-            self.form.layout is Layout.LEGACY
-            and isinstance(data, LiveData)
-            and data.operating_state > LARGEST_STATE
-        )
+        if self.form.layout is Layout.V4 or not isinstance(data, LiveData):
+            return False
+        return data.operating_state > LARGEST_STATE
 
 
 @dataclass(slots=True)
@@ -138,17 +131,20 @@ _all_of = attrgetter(*_NAMES)
 class Deframer:
     """Finds the frames in one byte stream. Holds no mode: the layout is found from the CRC of each frame."""
 
-    __slots__ = ("_base", "_blame", "_blame_until", "_held", "_need", "counters", "pending")
+    __slots__ = ("_base", "_blame", "_blame_until", "_held", "_need", "counters")
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self.pending = 0
-        """How many bytes are held, undecided: 0..43."""
         self._held = b""
         self._base = 0  # stream position of _held[0]
         self._need = 1  # how many more bytes before anything can be decided
         self._blame = "dropped_crc"  # why bytes before _blame_until are dropped
         self._blame_until = 0
+
+    @property
+    def pending(self) -> int:
+        """How many bytes are held, undecided: 0..43."""
+        return len(self._held)
 
     def feed(self, data: bytes, now: int = 0) -> list[Frame]:  # noqa: ARG002  frames have headers
         """Take the next bytes; return the frames that are now certain, in stream order."""
@@ -157,7 +153,6 @@ class Deframer:
         if size < self._need:
             self._held += data
             self._need -= size
-            self.pending += size
             return []
         return self._scan(self._held + data, False)
 
@@ -206,7 +201,6 @@ class Deframer:
                 at += 4
         counters.headers += len(frames)
         self._held = buffer[at:]
-        self.pending = size - at
         self._need = missing or 1
         self._base += at
         return frames

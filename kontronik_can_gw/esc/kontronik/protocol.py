@@ -20,17 +20,14 @@ def _wire(data: DataType) -> list[Field]:
     found = []
     for word, (name, row) in enumerate(rows(data).items()):
         if name not in _PARTS:
-            is_info = data is InfoData
-            ends = row.type_range
-            found.append(
-                Field(name, row.unit, word, is_info, row.per_unit, *ends, not_on=row.not_on)
-            )
+            of = (name, row.unit, word, *row.type_range, row.per_unit, data is InfoData)
+            found.append(Field(*of, not_on=row.not_on))
     return found
 
 
 def _bits(name: str, row: str, shift: int, mask: int, names: dict[int, str] | None = None) -> Field:
     word = InfoData._fields.index(row)
-    return Field(name, "", word, True, 1, 0, mask, shift, mask, names=names or {})
+    return Field(name, "", word, 0, mask, 1, True, shift, mask, names=names or {})
 
 
 _STATE = LiveData._fields.index("operating_state")
@@ -40,12 +37,8 @@ KONTRONIK = EscProtocol(
     make=Deframer,
     fields=(
         *_wire(LiveData),
-        Field(
-            *("operating_state", "", _STATE),
-            high=255,
-            names={number: state.text for number, state in _STATES.items()},
-        ),
-        Field("operating_state_raw", "", _STATE, high=255),
+        Field("operating_state", "", _STATE, 0, 255, names={n: s.text for n, s in _STATES.items()}),
+        Field("operating_state_raw", "", _STATE, 0, 255),
         *_wire(InfoData),
         _bits("device", "device_and_variant", 10, 0x3F, _DEVICES),
         _bits("device_raw", "device_and_variant", 10, 0x3F),
