@@ -8,114 +8,26 @@ from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.native.header import functions, structure
 from kontronik_can_gw.native.objects import source_number
-from kontronik_can_gw.native.rows import (
-    GATEWAY,
-    STORED_COUNTS,
-    Message,
-    NotInCore,
-    Settings,
-    Signal,
-)
+from kontronik_can_gw.native.rows import NotInCore, Settings
 from kontronik_can_gw.native.settings import held_settings
 from kontronik_can_gw.native.tables import END_OF_TIME, Tables
 
-HELD, BODY, LONGEST = 43, 33, 44
 _MAX_FRAMES = 256
 _AGAIN = 1 << 30
 _MAX_READ = 16384
 """Bytes that the core is given at once: not more frames than it can keep."""
-_u8, _u16, _u32, _u64, _i64, _i32, _p = (
-    *(c.c_uint8, c.c_uint16, c.c_uint32, c.c_uint64, c.c_int64, c.c_int32, c.c_void_p),
-)
-
-
-class Frame(c.Structure):
-    """kcg_frame of a core with 64 data bytes: struct canfd_frame."""
-
-    _fields_ = (
-        ("id", _u32),
-        ("length", _u8),
-        ("flags", _u8),
-        ("page", _u8),
-        ("reserved", _u8),
-        ("data", _u8 * 64),
-    )
-
-
-class Plan(c.Structure):
-    """kcg_plan: as Tables.arrays and Tables.counts."""
-
-    _fields_ = (
-        *((name, _p) for name in ("message", "signal", "piece", "pair", "constant")),
-        *((name, _p) for name in ("esc_of", "listener", "first_listener")),
-        ("words", _u32),
-        *((name, _u16) for name in ("messages", "escs", "pages", "slots")),
-        ("watched", _p),
-    )
-
-
-class Esc(c.Structure):
-    """kcg_esc: the state of an ESC."""
-
-    _fields_ = (
-        *((name, _u8) for name in ("has_live", "has_info", "had_live", "had_info", "has_time")),
-        *((name, _u8) for name in ("turns", "cells", "held_count", "need", "arrivals")),
-        *((name, _u8) for name in ("blame", "reported", "link", "layout")),
-        *((name, _i32) for name in ("rate", "power")),
-        ("settings", Settings),
-        ("count", _u64 * STORED_COUNTS),
-        ("window", _u32 * 4),
-        *((name, _u32) for name in ("base", "blame_until")),
-        ("energy", _u64),
-        *((name, _i64) for name in ("energy_rest", "run_time", "live_ns", "live_bound")),
-        *((name, _i64) for name in ("info_bound", "last_info_ns", "window_ns", "interval")),
-        ("arrival_bound", _i64 * (HELD + 1)),
-        ("arrival_end", _u32 * (HELD + 1)),
-        ("generation", _u32),
-        ("live", _u8 * BODY),
-        ("info", _u8 * BODY),
-        ("held", _u8 * (HELD + LONGEST)),
-    )
-
-
+Frame, Plan, Esc = structure("kcg_frame"), structure("kcg_plan"), structure("kcg_esc")
+_Core = structure("kcg")
 _FRAME_SIZE = c.sizeof(Frame)
+_SIZED = (
+    *("signal", "message", "settings", "plan", "esc", "frame"),
+    *("offline", "column", "cell", "turns"),
+)
+"""In the order of kcg_sizes, kcg_offline_sizes and kcg_turns_size."""
 _head = struct.Struct("=IBBB").unpack_from
 _new = tuple.__new__
-_FUNCTIONS: dict[str, tuple[Any, ...]] = {
-    "kcg_sizes": (_u32, _u32),
-    "kcg_wire": (c.c_char_p,),
-    "kcg_size": (c.c_size_t, _p),
-    "kcg_init": (_p, _p, _p, _p, _i64),
-    "kcg_receive": (c.c_int, _p, c.c_int, c.c_char_p, c.c_size_t, _i64, _i64),
-    "kcg_expire": (c.c_int, _p, _i64),
-    "kcg_advance": (c.c_int, _p, _i64),
-    "kcg_port": (c.c_int, _p, c.c_int, c.c_int, _i64),
-    "kcg_next_event": (c.c_int, _p),
-    "kcg_next_deadline": (_i64, _p),
-    "kcg_apply": (None, _p, c.c_int, _p),
-    "kcg_gateway_changed": (None, _p, c.c_int, _i64),
-    "kcg_repeat": (None, _p, _i64),
-    "kcg_stop": (None, _p, _i64),
-    "kcg_take": (_u32, _p, _i64, _p, _u32),
-    "kcg_sent": (None, _p, _i64, _u32),
-    "kcg_escs": (_p, _p),
-    "kcg_gateway": (_p, _p),
-    "kcg_set_mask": (None, _p, _u32),
-    "kcg_pending": (_u32, _p),
-    "kcg_begin": (None, _p),
-    "kcg_turn": (c.c_int, _p),
-    "kcg_leave": (None, _p),
-    "kcg_watch": (c.c_int, _p),
-    "kcg_turns_size": (_u32,),
-    "kcg_slot_start": (None, _p, _u32, _i64),
-    "kcg_slot_changed": (None, _p, _u32, _i64),
-    "kcg_slot_stop": (None, _p, _u32),
-    "kcg_slot_news": (None, _p, _u32, _i64),
-    "kcg_slot_send": (None, _p, _u32, _i64),
-    "kcg_slot_is_news": (c.c_int, _p, _u32),
-    "kcg_slot_sent": (_u64, _p, _u32),
-}
 
 
 class WrongObject(RuntimeError):
@@ -127,14 +39,14 @@ def load(path: Path) -> Any:
     try:
         library: Any = c.PyDLL(str(path))  # other threads of Python run only while a turn waits
         library.kcg_turn = c.CDLL(str(path)).kcg_turn
-        for name, (result, *arguments) in _FUNCTIONS.items():
+        for name, (result, *arguments) in functions():
             function = getattr(library, name)
             function.restype, function.argtypes = result, arguments
     except (OSError, AttributeError) as error:
         raise WrongObject(f"{path.name}: {error}") from None
-    mine = (source_number(), *map(c.sizeof, (Signal, Message, Settings, Plan, Esc, Frame)))
-    its = tuple(library.kcg_sizes(number) for number in range(len(mine)))
-    if its != mine:
+    its = [library.kcg_sizes(number) for number in range(7)]
+    its += [*map(library.kcg_offline_sizes, range(3)), library.kcg_turns_size()]
+    if its != [source_number(), *(c.sizeof(structure(f"kcg_{name}")) for name in _SIZED)]:
         raise WrongObject(f"{path.name}: made of other sources than these")
     return library
 
@@ -158,19 +70,18 @@ class Handle:
         self.messages, self.signals, self.pieces = (
             arrays[name] for name in ("message", "signal", "piece")
         )
-        self.watched = self._array(_u64, tables.watched)
+        self.watched = self._array(c.c_uint64, tables.watched)
         self._kept = [*arrays.values(), self.watched]
         self._plan = Plan(
             *map(c.addressof, arrays.values()), *tables.counts.values(), c.addressof(self.watched)
         )
         size = library.kcg_size(c.byref(self._plan))
-        self._memory = (_u64 * (size // 8 + 1))()
+        self._memory = (c.c_uint64 * (size // 8 + 1))()
         settings = self._array(Settings, tables.settings)
         self.core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
-        begin = c.addressof(self._memory)
-        at = library.kcg_escs(self.core) - begin, library.kcg_gateway(self.core) - begin
-        self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, at[0])
-        self.gateway = (_i64 * len(GATEWAY)).from_buffer(self._memory, at[1])
+        self.state = _Core.from_buffer(self._memory)
+        begin = self.state.esc - c.addressof(self._memory)
+        self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, begin)
         self._frames = (Frame * _MAX_FRAMES)()
         self._raw = memoryview(self._frames).cast("B")
 
@@ -188,7 +99,7 @@ class Handle:
 
     def report_only(self, events: int) -> None:
         """Give ``on_event`` these alone: bits of telemetry.Event."""
-        self.library.kcg_set_mask(self.core, events)
+        self.state.mask = events
 
     def _check(self, esc: int, now: int) -> None:
         """What a damaged capture may hold never reaches the core."""
@@ -248,7 +159,7 @@ class Handle:
     @property
     def is_pending(self) -> bool:
         """As Core.is_pending."""
-        return bool(self.library.kcg_pending(self.core))
+        return bool(self.state.pendings)
 
     def take(self, now: int) -> list[CanFrame]:
         """As Core.take."""

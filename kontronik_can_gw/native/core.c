@@ -70,7 +70,7 @@ static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reaso
         return;
     for (size_t i = from; i < to; i++) {
         uint8_t run = (uint8_t)(0x100 - b[i]); /* 0, FF, FE, FC ... 80: long runs of equal bits */
-        e->count[KCG_N_LONG_RUN] += !(run & (run - 1));
+        e->count[KCG_N_LONG_RUN_BYTES] += !(run & (run - 1));
     }
     uint32_t size = (uint32_t)(to - from), blamed = e->blame_until - (e->base + (uint32_t)from);
     if ((int32_t)blamed < 0)
@@ -87,7 +87,7 @@ static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int r
     e->blame = (uint8_t)reason;
     if ((int32_t)(end - e->blame_until) > 0)
         e->blame_until = end;
-    drop(e, b, at, at + 4, KCG_N_NOISE);
+    drop(e, b, at, at + 4, KCG_N_DROPPED_NOISE);
 }
 
 static int accept_next(kcg *g);
@@ -96,7 +96,7 @@ static int accept_next(kcg *g);
 static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, uint32_t end)
 {
     if (!g) { /* of a flush: too late for use */
-        e->count[KCG_N_LATE]++;
+        e->count[KCG_N_LATE_FRAMES]++;
         return;
     }
     if (g->found_count == KCG_FOUND) {
@@ -133,18 +133,18 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
         size_t start = header_at(b, at, size);
         if (ended && size - start < 3)
             start = size;
-        drop(e, b, at, start, KCG_N_NOISE);
+        drop(e, b, at, start, KCG_N_DROPPED_NOISE);
         at = start;
         size_t have = size - at;
         if (have < 4) {
             if (ended && have)
-                drop(e, b, at, size, KCG_N_INCOMPLETE), at = size;
+                drop(e, b, at, size, KCG_N_DROPPED_INCOMPLETE), at = size;
             break;
         }
         const uint8_t *f = b + at;
         if (f[3] != 'L' && f[3] != 'I') {
             e->count[KCG_N_UNKNOWN_KINDS]++;
-            drop(e, b, at, at + 3, KCG_N_UNKNOWN_KIND);
+            drop(e, b, at, at + 3, KCG_N_DROPPED_UNKNOWN_KIND);
             at += 3;
             continue;
         }
@@ -164,7 +164,7 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
         }
         if (v4 == 2) {
             e->count[KCG_N_HEADERS]++, e->count[KCG_N_CRC_ERRORS]++;
-            reject(e, b, at, forms[is_info][1].length, KCG_N_BAD_CRC);
+            reject(e, b, at, forms[is_info][1].length, KCG_N_DROPPED_CRC);
             at += 4;
         } else if (!missing) {
             e->count[KCG_N_HEADERS]++;
@@ -175,7 +175,7 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
             found(g, e, is_info, v4, f + 4, end);
         } else if (ended) {
             e->count[KCG_N_HEADERS]++;
-            reject(e, b, at, have, KCG_N_INCOMPLETE);
+            reject(e, b, at, have, KCG_N_DROPPED_INCOMPLETE);
             at += 4;
         } else {
             e->need = (uint8_t)missing;
@@ -243,10 +243,10 @@ uint64_t kcg_count(const kcg_esc *e, int what)
 {
     const uint64_t *n = e->count;
     switch (what) {
-    case KCG_N_LIVE: return n[KCG_N_LIVE_V4] + n[KCG_N_LIVE_LEGACY];
-    case KCG_N_INFO: return n[KCG_N_INFO_V4] + n[KCG_N_INFO_LEGACY];
-    case KCG_N_DROPPED: return n[KCG_N_NOISE] + n[KCG_N_BAD_CRC] + n[KCG_N_UNKNOWN_KIND] + n[KCG_N_INCOMPLETE];
-    case KCG_N_LINK: return e->link;
+    case KCG_N_LIVE_FRAMES: return n[KCG_N_LIVE_V4] + n[KCG_N_LIVE_LEGACY];
+    case KCG_N_INFO_FRAMES: return n[KCG_N_INFO_V4] + n[KCG_N_INFO_LEGACY];
+    case KCG_N_DROPPED_BYTES: return n[KCG_N_DROPPED_NOISE] + n[KCG_N_DROPPED_CRC] + n[KCG_N_DROPPED_UNKNOWN_KIND] + n[KCG_N_DROPPED_INCOMPLETE];
+    case KCG_N_LINK_STATE: return e->link;
     case KCG_N_LAYOUT: return e->layout;
     default: return n[what];
     }
@@ -254,7 +254,7 @@ uint64_t kcg_count(const kcg_esc *e, int what)
 
 static void note_window(const kcg_esc *e, uint32_t *w)
 {
-    w[0] = (uint32_t)kcg_count(e, KCG_N_LIVE), w[1] = (uint32_t)kcg_count(e, KCG_N_DROPPED);
+    w[0] = (uint32_t)kcg_count(e, KCG_N_LIVE_FRAMES), w[1] = (uint32_t)kcg_count(e, KCG_N_DROPPED_BYTES);
     w[2] = (uint32_t)e->count[KCG_N_BYTES], w[3] = (uint32_t)e->count[KCG_N_CRC_ERRORS];
 }
 
@@ -362,7 +362,7 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
     }
     if (f->is_info)
         return events | accept_info(e, f->body, when, bound);
-    e->count[KCG_N_SUSPECT] += f->layout == 2 && f->body[STATE_AT] > LARGEST_STATE;
+    e->count[KCG_N_SUSPECT_FRAMES] += f->layout == 2 && f->body[STATE_AT] > LARGEST_STATE;
     if (e->has_time) {
         if (when < e->live_ns)
             when = e->live_ns;
@@ -453,7 +453,7 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
         return e->rate >= 0;
     case KCG_OF_GATEWAY: *x = g->gateway[s->place]; return 1;
     case KCG_OF_STATUS: *x = e->link | (g->gateway[KCG_GATEWAY_STATE] == s->place) << 6 | e->has_info << 7; return 1;
-    default: *x = floor_div(now - g->gateway[KCG_STARTED], 1000000); return 1; /* a row may be of just before */
+    default: *x = floor_div(now - g->gateway[KCG_STARTED_NS], 1000000); return 1; /* a row may be of just before */
     }
     return !s->not_on || supplied(e, s->not_on, *x);
 }
@@ -1172,7 +1172,7 @@ static int accept_next(kcg *g)
     kcg_esc *e = &g->esc[g->read_esc];
     int64_t after = (g->read_end - f->end) * KCG_BYTE_NS, limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
     if (g->read_now - g->read_bound + after > limit) /* the bytes after it in the same read make it old already */
-        e->count[KCG_N_LATE]++;
+        e->count[KCG_N_LATE_FRAMES]++;
     else
         report(g, g->read_esc, accept(e, f, g->read_shown - after, g->read_bound - after), g->read_now);
     return 1;
@@ -1261,9 +1261,9 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
 {
     kcg_esc *e = &g->esc[esc];
     if (!is_open) {
-        uint64_t late = e->count[KCG_N_LATE];
+        uint64_t late = e->count[KCG_N_LATE_FRAMES];
         flush(NULL, e);
-        e->count[KCG_N_LATE] = late; /* that it was dropped is said by the link */
+        e->count[KCG_N_LATE_FRAMES] = late; /* that it was dropped is said by the link */
         report(g, esc, lose(e, KCG_PORT_ERROR), now);
     } else if (e->link == KCG_PORT_ERROR) {
         report(g, esc, set_link(e, e->has_time ? KCG_LOST : KCG_NEVER_SEEN), now);
@@ -1304,13 +1304,13 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
     g->page = (uint8_t *)(g->pending + messages);
     g->report = g->page + plan->pages;
     g->plan = plan;
-    g->gateway[KCG_STARTED] = g->second = now;
+    g->gateway[KCG_STARTED_NS] = g->second = now;
     g->read_esc = -1;
     for (int i = 0; i < plan->escs; i++) {
         kcg_esc *e = &g->esc[i];
         e->settings = settings[i];
         e->need = 1;
-        e->blame = KCG_N_BAD_CRC;
+        e->blame = KCG_N_DROPPED_CRC;
         e->window_ns = now;
         e->cells = e->settings.cells;
     }
@@ -1337,25 +1337,5 @@ uint32_t kcg_sizes(uint32_t what)
 const char *kcg_wire(void)
 {
     return "IHhhhHHHHbBbbIBB HHIBIHHhhhHHbBbbbb";
-}
-
-kcg_esc *kcg_escs(kcg *g)
-{
-    return g->esc;
-}
-
-int64_t *kcg_gateway(kcg *g)
-{
-    return g->gateway;
-}
-
-void kcg_set_mask(kcg *g, uint32_t mask)
-{
-    g->mask = mask;
-}
-
-uint32_t kcg_pending(const kcg *g)
-{
-    return g->pendings;
 }
 #endif

@@ -62,21 +62,21 @@ enum {
     KCG_OF_AGE,
     KCG_OF_RATE,
     KCG_OF_GATEWAY, /* `place`: index into kcg.gateway */
-    KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED] */
+    KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED_NS] */
     KCG_OF_ALIVE,   /* the message's alive counter, up to `div` */
     KCG_OF_STATUS   /* link state, bit 6: the gateway's state is `place`, bit 7: info is fresh */
 };
-enum { /* of kcg.gateway; KCG_ESCS_OK is the core's, KCG_STARTED kcg_init's, the others are the owner's */
+enum { /* of kcg.gateway; KCG_ESCS_OK is the core's, KCG_STARTED_NS kcg_init's, the others are the owner's */
     KCG_ESCS_OK, KCG_GATEWAY_STATE, KCG_CAN_STATE, KCG_ESC_COUNT, KCG_SENT_FRAMES, KCG_REPLACED_FRAMES, KCG_SEND_FAILURES,
-    KCG_RECEIVED_FRAMES, KCG_BUS_OFF_COUNT, KCG_DROPPED_FRAMES, KCG_ID_CONFLICTS, KCG_STARTED, KCG_OF_GATEWAY_COUNT
+    KCG_RECEIVED_FRAMES, KCG_BUS_OFF_COUNT, KCG_DROPPED_FRAMES, KCG_ID_CONFLICTS, KCG_STARTED_NS, KCG_OF_GATEWAY_COUNT
 };
 enum { KCG_U8, KCG_I8, KCG_U16, KCG_I16, KCG_U32 };
 enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
 /* Counters of a stream, then what is counted like them. Twin: deframer.Counters. */
 enum {
     KCG_N_BYTES, KCG_N_LIVE_V4, KCG_N_LIVE_LEGACY, KCG_N_INFO_V4, KCG_N_INFO_LEGACY, KCG_N_HEADERS, KCG_N_CRC_ERRORS, KCG_N_UNKNOWN_KINDS,
-    KCG_N_NOISE, KCG_N_BAD_CRC, KCG_N_UNKNOWN_KIND, KCG_N_INCOMPLETE, KCG_N_LONG_RUN, KCG_N_LOSSES, KCG_N_LATE, KCG_N_SUSPECT, KCG_COUNTS,
-    KCG_N_LINK = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE, KCG_N_INFO, KCG_N_DROPPED /* states, sums */
+    KCG_N_DROPPED_NOISE, KCG_N_DROPPED_CRC, KCG_N_DROPPED_UNKNOWN_KIND, KCG_N_DROPPED_INCOMPLETE, KCG_N_LONG_RUN_BYTES, KCG_N_LOSSES, KCG_N_LATE_FRAMES, KCG_N_SUSPECT_FRAMES, KCG_COUNTS,
+    KCG_N_LINK_STATE = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE_FRAMES, KCG_N_INFO_FRAMES, KCG_N_DROPPED_BYTES /* states, sums */
 };
 enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16, KCG_DIRECT = 32 }; /* of a signal; DIRECT: of live data, with no divisor, from every device */
 enum { KCG_EVENT = 1, KCG_ON_CHANGE = 2, KCG_SILENT = 4, KCG_HAS_CRC = 8, KCG_OF_THE_GATEWAY = 16, KCG_FREE = 32 }; /* of a message */
@@ -199,8 +199,4 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
 /* For a caller that cannot see structures: 0 KCG_SOURCE, then the sizes of signal, message, settings, plan, ESC and frame. */
 uint32_t kcg_sizes(uint32_t what);
 const char *kcg_wire(void); /* the fields of live data and of info on the wire, as codes of Python's struct */
-kcg_esc *kcg_escs(kcg *g);
-int64_t *kcg_gateway(kcg *g);
-void kcg_set_mask(kcg *g, uint32_t mask);
-uint32_t kcg_pending(const kcg *g);
 #endif

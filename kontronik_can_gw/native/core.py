@@ -40,7 +40,7 @@ class NativeCore:
         tables = Tables(layout, escs, silent)
         self._places = reserve(tables, slots)
         self._handle = Handle(library, tables, now, self._follow)
-        self.status = cast(GatewayStatus, NativeStatus(self._handle.gateway))
+        self.status = cast(GatewayStatus, NativeStatus.from_buffer(self._handle.state.gateway))
         self.status.esc_count = len(escs)
         self.escs = [NativeEsc(*pair) for pair in zip(escs, self._handle.escs, strict=True)]
         self.own_ids: dict[int, Owner] = own_ids(layout)

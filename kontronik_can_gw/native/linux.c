@@ -49,9 +49,9 @@ static int fetch(kcg_turns *t, int fd, kcg_input *in)
         return 0;
     in->served = 1;
     t->size = (uint32_t)size;
-    t->since = in->undrained != KCG_DRAINED ? in->undrained : in->asked;
+    t->since = in->undrained_ns != KCG_DRAINED ? in->undrained_ns : in->asked_ns;
     int64_t passed = t->since + size * KCG_BYTE_NS;
-    in->undrained = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked at the turn's end */
+    in->undrained_ns = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked at the turn's end */
     note(t, KCG_NOTE_BYTES, in->esc, t->data, t->size, t->since);
     return 1;
 }
@@ -96,7 +96,7 @@ static int hand_over(kcg_turns *t)
             t->frames[sent + i].page = pages[i];
         sent += went > 0 ? (uint32_t)went : 0;
     }
-    kcg_gateway(t->core)[KCG_SENT_FRAMES] += sent;
+    t->core->gateway[KCG_SENT_FRAMES] += sent;
     t->unsent -= sent;
     t->spoken -= sent < t->spoken ? sent : t->spoken;
     memmove(t->frames, t->frames + sent, t->unsent * sizeof *t->frames);
@@ -118,7 +118,7 @@ static void put(kcg_turns *t, const kcg_frame *made)
     uint32_t i = t->spoken;
     while (i < t->unsent && (t->frames[i].id != made->id || t->frames[i].page != made->page))
         i++;
-    kcg_gateway(t->core)[KCG_REPLACED_FRAMES] += i < t->unsent;
+    t->core->gateway[KCG_REPLACED_FRAMES] += i < t->unsent;
     t->unsent += i == t->unsent;
     t->frames[i] = *made;
 }
@@ -145,11 +145,11 @@ static int transmit(kcg_turns *t)
                 t->full_since = t->now;
             if (t->unsent && (!is_full || t->records || t->spoken))
                 return 0;
-            kcg_gateway(t->core)[KCG_SEND_FAILURES] += is_full;
+            t->core->gateway[KCG_SEND_FAILURES] += is_full;
             watch_room(t, is_full);
         }
-    } while (kcg_pending(t->core) && !t->unsent);
-    return !kcg_pending(t->core) && (!t->unsent || t->now - t->full_since < MAX_FULL);
+    } while (t->core->pendings && !t->unsent);
+    return !t->core->pendings && (!t->unsent || t->now - t->full_since < MAX_FULL);
 }
 
 int kcg_watch(kcg_turns *t)
@@ -169,9 +169,9 @@ int kcg_watch(kcg_turns *t)
 static void note_answer(const struct pollfd *p, kcg_input *in, int64_t asked)
 {
     if (!p->revents)
-        in->undrained = KCG_DRAINED, in->asked = asked;
-    else if (in->undrained == KCG_DRAINED)
-        in->undrained = in->asked;
+        in->undrained_ns = KCG_DRAINED, in->asked_ns = asked;
+    else if (in->undrained_ns == KCG_DRAINED)
+        in->undrained_ns = in->asked_ns;
 }
 
 /* Ask which of all descriptors are ready. */
@@ -262,7 +262,7 @@ void kcg_begin(kcg_turns *t)
             t->bus_place = i, t->fds[i].revents = 0;
         } else if (t->input_of[i] >= 0) {
             kcg_input *in = &t->inputs[t->input_of[i]];
-            in->asked = in->empty > t->asked ? in->empty : t->asked;
+            in->asked_ns = in->empty_ns > t->asked ? in->empty_ns : t->asked;
         }
 }
 

@@ -11,10 +11,10 @@ enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 };     /* kinds of entries of a 
 #define KCG_OUTPUTS (1 << 29)          /* found: time is to pass for the outputs */
 #define KCG_DRAINED (INT64_C(1) << 62) /* output.NEVER */
 
-typedef struct {        /* of an ESC's port (twin: poller.PortInput) */
-    int64_t empty;      /* nothing had come by then */
-    int64_t asked;      /* nothing had come by then, either: asked last */
-    int64_t undrained;  /* the last read left something, which came after this; KCG_DRAINED: it left nothing */
+typedef struct {        /* of an ESC's port: as poller.PortInput */
+    int64_t empty_ns;     /* nothing had come by then */
+    int64_t asked_ns;     /* nothing had come by then, either: asked last */
+    int64_t undrained_ns; /* the last read left something, which came after this; KCG_DRAINED: it left nothing */
     uint8_t is_plain, served, esc, reserved[5];
 } kcg_input;
 

@@ -209,7 +209,7 @@ static int catch_up(kcg_offline *o, int64_t now)
 /* The next frame that was found, at its time: to the core as it is, with the counters of what found it. */
 static int give_frame(kcg_offline *o)
 {
-    static const uint8_t first_after = KCG_N_LONG_RUN + 1;
+    static const uint8_t first_after = KCG_N_LONG_RUN_BYTES + 1;
     const kcg_found *f = &o->found[o->found_at];
     kcg *g = o->core;
     if (!o->is_timed) {

@@ -8,55 +8,14 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.esc.values import Divisor, Value
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
-from kontronik_can_gw.native.rows import NotInCore
+from kontronik_can_gw.native.header import structure
 
 ROWS = 1 << 13
 _TEXT = 1 << 20
 _WHOLE, _DIVIDED, _ROUNDED = range(3)
-_u8, _u32, _u64, _i64, _p = c.c_uint8, c.c_uint32, c.c_uint64, c.c_int64, c.c_void_p
-_text, _size = c.c_char_p, c.c_size_t
-
-
-class _Word(c.Structure):
-    _fields_ = (("number", _i64), ("text", _text))
-
-
-class _Cell(c.Structure):
-    _fields_ = (
-        *(("values", _p), ("valid", _p), ("prefix", _text), ("word", c.POINTER(_Word))),
-        *(("words", _u32), ("is_real", _u32)),
-    )
-
-
-class Style(c.Structure):
-    """Of lines: what stands before the time, before and after the Unix time (None: none), at the end, for what is not available."""
-
-    _fields_ = tuple((name, _text) for name in ("head", "utc", "utc_end", "end", "nothing"))
-
-
-_FUNCTIONS: dict[str, tuple[Any, ...]] = {
-    "kcg_is_intact": (c.c_int, _text, _size),
-    "kcg_play": (c.c_int, _p, _text, _size),
-    "kcg_play_bytes": (c.c_int, _p, _text, _size, c.c_int),
-    "kcg_row_event": (None, _p, c.c_int, c.c_int, _i64),
-    "kcg_close_row": (None, _p),
-    "kcg_candump": (_size, _p, _p, _u32, _i64, _text, _p),
-    "kcg_lines": (
-        *(_size, _p, _u32, _p, _p, _u32, _u32, _i64, _i64, _p, _size, _size),
-        c.POINTER(_u32),
-    ),
-    "kcg_offline_sizes": (_u32, _u32),
-}
-
-
-def declare(library: Any, *structures: Any) -> None:
-    """Declare the functions. NotInCore where the structures are others."""
-    for name, (result, *arguments) in _FUNCTIONS.items():
-        function = getattr(library, name)
-        function.restype, function.argtypes = result, arguments
-    sizes = [library.kcg_offline_sizes(number) for number in range(3)]
-    if sizes != [*map(c.sizeof, (*structures, _Cell))]:
-        raise NotInCore("the shared object has other structures")
+_Word, _Cell = structure("kcg_word"), structure("kcg_cell")
+Style: Any = structure("kcg_style")
+"""Of lines: what stands before the time, before and after the Unix time (None: none), at the end, for what is not available."""
 
 
 def _address(memory: bytearray) -> int:
@@ -69,7 +28,7 @@ class FrameRoom:
 
     def __init__(self, library: Any, size: int) -> None:
         self.library, self.size = library, size
-        self.frames, self.times = (Frame * size)(), (_i64 * size)()
+        self.frames, self.times = (Frame * size)(), (c.c_int64 * size)()
         self._text: Any = None
 
     def move_to(self, other: "FrameRoom", begin: int, count: int) -> None:
@@ -184,15 +143,15 @@ class Lines:
         self._library, self._style = library, style
         self._cells = (_Cell * max(1, len(cells)))()
         self._longest = 128
+        self._kept: list[Any] = []
         self._out = c.create_string_buffer(_TEXT)
         for cell, (prefix, words) in zip(self._cells, cells, strict=False):
             cell.prefix = prefix
             self._longest += len(prefix) + 32
             if words is not None:
-                cell.word, cell.words = (
-                    (_Word * max(1, len(words)))(*starmap(_Word, words)),
-                    len(words),
-                )
+                table = (_Word * max(1, len(words)))(*starmap(_Word, words))
+                self._kept.append(table)
+                cell.word, cell.words = c.addressof(table), len(words)
                 self._longest += max((len(text) for _, text in words), default=0)
 
     def of(
@@ -205,7 +164,7 @@ class Lines:
             cell = self._cells[at]
             cell.values, cell.valid = addresses[at], addresses[count + at]
             cell.is_real = rows.is_real[at]
-        done = _u32(begin)
+        done = c.c_uint32(begin)
         while done.value < end:
             length = self._library.kcg_lines(
                 *(self._cells, count, c.byref(self._style), times, done.value, end),

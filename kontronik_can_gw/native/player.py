@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.core import NativeCore
-from kontronik_can_gw.native.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows, declare
-from kontronik_can_gw.native.rows import Signal
+from kontronik_can_gw.native.header import structure
+from kontronik_can_gw.native.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows
 from kontronik_can_gw.native.state import NativeEsc
 from kontronik_can_gw.native.tables import OF_AGE, Tables, bind, places_of
 from kontronik_can_gw.output import Output
@@ -22,33 +22,10 @@ _DONE, _FULL, _OTHER_ENTRY = range(3)
 _MAX_ROWS = 1024
 """That one call of the core can make."""
 _FRAMES = 1 << 12
-_u8, _u32, _u64, _i64, _p = c.c_uint8, c.c_uint32, c.c_uint64, c.c_int64, c.c_void_p
+_u32 = c.c_uint32
 
 
-class _Column(c.Structure):
-    _fields_ = (
-        *(("of", Signal), ("per_unit", _i64), ("values", _p), ("valid", _p), ("now", _i64)),
-        *(("form", _u8), ("has", _u8), ("reserved", _u8 * 6)),
-    )
-
-
-class _Found(c.Structure):
-    _fields_ = (("end", _u32), ("bytes", _u8 * 36))
-
-
-class _Offline(c.Structure):
-    _fields_ = (
-        *((name, _p) for name in ("core", "finder", "frame", "frame_time", "column", "first")),
-        *((name, _p) for name in ("age", "row_time")),
-        *((name, _u32) for name in ("room", "count", "sure", "ages", "rows", "index")),
-        *((name, _u8) for name in ("is_open", "is_timed", "has_ended", "found_count", "found_at")),
-        ("reserved", _u8 * 3),
-        *((name, _i64) for name in ("last", "row_ns", "last_row_ns", "gateway_ns", "now")),
-        *((name, _i64) for name in ("lives", "period")),
-        *((name, _u64) for name in ("base", "fed", "data_at")),
-        ("in_row", _u8 * 256),
-        ("found", _Found * 16),
-    )
+_Offline, _Column = structure("kcg_offline"), structure("kcg_column")
 
 
 class Player(Output):
@@ -65,7 +42,6 @@ class Player(Output):
         """Take the core that is to be played. NotInCore where it does not have one of the values."""
         self._handle = handle = core.handle
         self._library = library = handle.library
-        declare(library, _Offline, _Column)
         self._settings = core.escs[0].settings
         self._state.core = handle.core
         if self._columns is None:

@@ -1,5 +1,6 @@
 """What others read of the core in C: the state of an ESC and of the gateway, straight from its memory."""
 
+import ctypes as c
 import struct
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -120,30 +121,28 @@ for _name, _property in _WRITABLE.items():
     setattr(NativeEsc, _name, _property)
 
 
-def _member(name: str, place: int, kind: Callable[[int], Any] | None) -> property:
-    def read(self: "NativeStatus") -> Any:
-        found = self._gateway[place]
-        return found if kind is None else kind(found)
+class NativeStatus(c.Structure):
+    """As GatewayStatus, in the core's memory: kcg.gateway."""
 
-    def write(self: "NativeStatus", value: int) -> None:
-        self._gateway[place] = value
+    _fields_ = tuple(
+        (f"{name}_number" if name == "can_state" else name, c.c_int64) for name in GATEWAY
+    )
 
-    return property(read, write, doc=f"GatewayStatus.{name}")
+    @property
+    def state(self) -> GatewayState:
+        return GatewayState(self.gateway_state)
 
+    @state.setter
+    def state(self, state: GatewayState) -> None:
+        self.gateway_state = state
 
-class NativeStatus:
-    """As GatewayStatus, in the core's memory: its attributes are those of GATEWAY."""
+    @property
+    def can_state(self) -> CanState:
+        return CanState(self.can_state_number)
 
-    __slots__ = ("_gateway",)
-
-    def __init__(self, gateway: Any) -> None:
-        self._gateway = gateway
+    @can_state.setter
+    def can_state(self, state: CanState) -> None:
+        self.can_state_number = state
 
     def __copy__(self) -> "NativeStatus":
-        return NativeStatus(tuple(self._gateway))
-
-
-_KINDS: dict[str, Callable[[int], Any]] = {"state": GatewayState, "can_state": CanState}
-for _place, _name in enumerate(GATEWAY):
-    _name = _name.removeprefix("gateway_")
-    setattr(NativeStatus, _name, _member(_name, _place, _KINDS.get(_name)))
+        return NativeStatus.from_buffer_copy(self)

@@ -8,58 +8,19 @@ from typing import Any
 
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
+from kontronik_can_gw.native.header import CONSTANTS, structure
 from kontronik_can_gw.output import NEVER
 
 OUTPUTS = 1 << 29
 """Found: time is to pass for the outputs."""
-_OUT, _MADE, _READ, _RING, _MAX_FDS, _AT_ONCE = 512, 256, 1 << 12, 1 << 18, 1024, 64
+_MADE, _MAX_FDS = CONSTANTS["KCG_MADE"], CONSTANTS["KCG_FDS"]
 _ENTRY = struct.Struct("=qqIBBxx")
 _CLASSIC = struct.Struct("=IB3x8s")
 _FRAME_SIZE = c.sizeof(Frame)
-_u8, _u32, _i16, _i32, _i64 = c.c_uint8, c.c_uint32, c.c_int16, c.c_int32, c.c_int64
 
 
-class Input(c.Structure):
-    """kcg_input: as poller.PortInput."""
-
-    _fields_ = (
-        *((name, _i64) for name in ("empty_ns", "asked_ns", "undrained_ns")),
-        *((name, _u8) for name in ("is_plain", "served", "esc")),
-        ("reserved", _u8 * 5),
-    )
-
-
-class _PollFd(c.Structure):
-    _fields_ = (("fd", c.c_int), ("events", c.c_short), ("revents", c.c_short))
-
-
-class _Turns(c.Structure):
-    """kcg_turns."""
-
-    _fields_ = (
-        *((name, c.c_void_p) for name in ("core", "inputs")),
-        *((name, _i64) for name in ("now", "asked", "before", "late")),
-        *((name, _i64) for name in ("due", "outputs_due")),
-        *((name, _i64) for name in ("leave", "period", "max_late", "max_turn")),
-        *((name, _i64) for name in ("full_since", "since")),
-        *((name, _i32) for name in ("epoll", "bus", "found", "happened")),
-        *(
-            (name, _u32)
-            for name in (
-                *("count", "ready", "unsent", "taken", "turns", "records", "recorded"),
-                *("bus_place", "is_full", "spoken", "is_over", "at", "size", "advanced"),
-            )
-        ),
-        ("fds", _PollFd * _MAX_FDS),
-        ("input_of", _i16 * _MAX_FDS),
-        ("place", c.c_uint16 * _AT_ONCE),
-        ("frames", Frame * _OUT),
-        ("made", Frame * _MADE),
-        ("data", _u8 * _READ),
-        ("ring", _u8 * _RING),
-    )
-
-
+Input, _PollFd = structure("kcg_input"), structure("pollfd")
+_Turns = structure("kcg_turns")
 _FRAMES, _ENTRIES = _Turns.frames.offset, _Turns.ring.offset
 
 

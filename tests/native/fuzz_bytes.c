@@ -109,7 +109,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         case 1: settle(g, esc); break;
         case 2: kcg_repeat(g, now); break;
         case 3:
-            for (int i = KCG_GATEWAY_STATE; i < KCG_STARTED; i++)
+            for (int i = KCG_GATEWAY_STATE; i < KCG_STARTED_NS; i++)
                 g->gateway[i] = next(i == KCG_SENT_FRAMES ? 4 : 1);
             kcg_gateway_changed(g, 0, now);
             break;
