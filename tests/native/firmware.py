@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import equality
+from built import STRICT
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core import PythonCore
@@ -17,10 +18,6 @@ from kontronik_can_gw.signals.plan import Layout
 
 BYTE_NS = 11 * SECOND // 115200
 SILENCE = 3 * SECOND
-STRICT = (
-    *("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion"),
-    *("-Wshadow", "-Werror"),
-)
 SOURCES = ("core.c", "tables.c", "example_main.c")
 
 
@@ -59,8 +56,8 @@ class Case:
 
     def build(self, compiler: str, *options: str) -> Path:
         """The example, compiled in the folder. AssertionError with what the compiler said."""
-        target = self.folder / f"example-{compiler}"
-        command = [compiler, *STRICT, *options, "-o", str(target), *SOURCES]
+        target = self.folder / f"example-{Path(compiler).name}"
+        command = [compiler, "-std=c99", *STRICT, *options, "-o", str(target), *SOURCES]
         done = subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr[:3000]
         return target

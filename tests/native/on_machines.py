@@ -9,7 +9,8 @@ import zlib
 from pathlib import Path
 
 import pytest
-from firmware import SOURCES, STRICT, Case
+from built import STRICT
+from firmware import SOURCES, Case
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
@@ -85,7 +86,7 @@ def five(tmp_path: Path) -> Case:
 
 def objects(case: Case, *options: str) -> dict[str, tuple[int, int, int]]:
     """Bytes of text, data and bss of each object for a Cortex-M4."""
-    command = ["arm-none-eabi-gcc", *STRICT, *CORTEX_M4, *options, "-c", *SOURCES]
+    command = ["arm-none-eabi-gcc", "-std=c99", *STRICT, *CORTEX_M4, *options, "-c", *SOURCES]
     subprocess.run(command, cwd=case.folder, check=True)
     found = {}
     for source in SOURCES:

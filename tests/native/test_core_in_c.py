@@ -1,16 +1,15 @@
 """The core in C gives what the core in Python gives; gcc and clang build it without a warning, for a small machine too."""
 
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import equality
 import pytest
-from built import COMPILERS, STRICT, built, there
+from built import COMPILERS, STRICT, built
 from sanitized import run_sanitized
 
 from kontronik_can_gw.native.binding import WrongObject, load
-from kontronik_can_gw.native.objects import FOLDER, OPTIONS
+from kontronik_can_gw.native.objects import OPTIONS
 
 SEEDS = 16
 
@@ -35,19 +34,6 @@ def test_both_cores_are_equal_over_a_million_frames(native_library: Any, group: 
 @pytest.mark.parametrize("program", COMPILERS)
 def test_every_source_builds_without_a_warning(tmp_path: Path, program: str) -> None:
     built(tmp_path / "core.so", *STRICT, "-O2", *OPTIONS, program=program)
-
-
-@pytest.mark.parametrize("program", COMPILERS)
-@pytest.mark.parametrize(
-    "options", ["", "-DKCG_SLICES=0 -DKCG_LEGACY=0", "-DKCG_SLICES=1 -DKCG_FOUND=1 -DKCG_SLOTS=1"]
-)
-def test_the_core_builds_for_a_small_machine(tmp_path: Path, program: str, options: str) -> None:
-    found = there(program)
-    command = [found, "-std=c99", *STRICT, "-Os", *options.split(), "-c", str(FOLDER / "core.c")]
-    done = subprocess.run(
-        [*command, "-o", str(tmp_path / "core.o")], capture_output=True, text=True
-    )
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.extended

@@ -1,12 +1,12 @@
 """What `export c` writes compiles by itself, without a warning, and sends what the core in Python sends."""
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from firmware import STRICT, Case
+from built import COMPILERS, there
+from firmware import Case
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
@@ -15,25 +15,26 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.export_c import exported
 
 
-def compiler(name: str) -> str:
-    if shutil.which(name) is None:
-        pytest.skip(f"no {name}: sudo apt-get install {name}")
-    return name
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_its_frames_are_those_of_the_core_in_python(tmp_path: Path, seed: int) -> None:
     case = Case(tmp_path, seed)
-    sent = case.run(str(case.build(compiler("gcc"), "-O1")))
+    sent = case.run(str(case.build(there("gcc"), "-O1")))
     assert sent.count("\n") > 100
     assert sent == case.expected()
 
 
-@pytest.mark.parametrize("options", ["-DKCG_LEGACY=0", "-DKCG_DATA=64 -DKCG_FLOATS=1"])
-def test_macros_build_without_a_warning(tmp_path: Path, options: str) -> None:
+@pytest.mark.parametrize("program", COMPILERS)
+@pytest.mark.parametrize(
+    "options",
+    [
+        "-DKCG_SLICES=0 -DKCG_LEGACY=0",
+        "-DKCG_SLICES=1 -DKCG_FOUND=1 -DKCG_SLOTS=1",
+        "-DKCG_DATA=64 -DKCG_FLOATS=1",
+    ],
+)
+def test_macros_build_without_a_warning(tmp_path: Path, program: str, options: str) -> None:
     bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    Case(tmp_path, 1, bus.layout, bus.escs).build(compiler("gcc"), "-Os", *options.split())
-    assert "-Werror" in STRICT
+    Case(tmp_path, 1, bus.layout, bus.escs).build(there(program), "-Os", *options.split())
 
 
 def test_the_command_writes_what_a_configuration_sends(

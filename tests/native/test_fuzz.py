@@ -2,12 +2,12 @@
 
 import os
 import random
-import shutil
 import subprocess
 from pathlib import Path
 
 import equality
 import pytest
+from built import there
 from firmware import Case
 from sanitized import run_sanitized
 
@@ -18,12 +18,6 @@ HERE = Path(__file__).parent
 FUZZED = (1, 2, 5)
 """Seeds of layouts."""
 pytestmark = pytest.mark.extended
-
-
-def clang() -> str:
-    if shutil.which("clang") is None:
-        pytest.skip("no clang: sudo apt-get install clang")
-    return "clang"
 
 
 @pytest.mark.parametrize("layout", FUZZED)
@@ -44,7 +38,7 @@ def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
         (corpus / str(number)).write_bytes(b"".join(calls))
     program = tmp_path / "fuzz"
     sanitizers = "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"
-    command = [clang(), "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
+    command = [there("clang"), "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
     sources = [
         str(case.folder / "core.c"),
         str(case.folder / "tables.c"),
@@ -67,12 +61,3 @@ def test_dbc_text(tmp_path: Path) -> None:
     """Changed DBC text: refused in words, or both cores agree."""
     printed = run_sanitized(tmp_path, str(HERE / "fuzz_dbc.py"), str(SECONDS), str(SEED))
     print(printed.splitlines()[-1])
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_clang_finds_nothing_wrong_with_it_nor_do_its_sanitizers(tmp_path: Path, seed: int) -> None:
-    case = Case(tmp_path, 100 + seed)
-    sanitizers = "-fsanitize=address,undefined,integer", "-fno-sanitize-recover=all"
-    quiet = "-fno-sanitize=unsigned-integer-overflow,implicit-conversion,unsigned-shift-base"
-    sent = case.run(str(case.build(clang(), "-g", "-O1", *sanitizers, quiet)))
-    assert sent == case.expected()

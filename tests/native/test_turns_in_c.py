@@ -8,7 +8,7 @@ import struct
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -166,67 +166,57 @@ def on_the_wire(frames: Sequence[CanFrame]) -> list[tuple[int, bytes]]:
     return [(f.can_id | (EXTENDED if f.extended else 0), f.data) for f in frames]
 
 
+@pytest.mark.parametrize("has_nodes", [False, True])
 @pytest.mark.parametrize("seed", range(6))
 def test_what_is_sent_is_what_a_replay_in_python_sends(
-    seed: int, monkeypatch: pytest.MonkeyPatch
+    seed: int, has_nodes: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    world = World(seed, False, monkeypatch)
-    world.run(200)
-    assert world.poller.count >= 200
-    assert world.received == on_the_wire(world.replayed(monkeypatch))
-    assert len(world.received) == world.gateway.status.sent_frames > 0
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_with_nodes_too_what_is_sent_is_what_a_replay_in_python_sends(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nearly each live frame has other error bits. Order within an id: queue and slots take turns in Python's transmit queue."""
-    world = World(seed, False, monkeypatch, has_nodes=True)
+    """With nodes, order within an id: queue and slots take turns in Python's transmit queue. Nearly each frame has other error bits."""
+    world = World(seed, False, monkeypatch, has_nodes)
     world.run(300)
     replayed = on_the_wire(world.replayed(monkeypatch))
+    if not has_nodes:
+        assert world.received == replayed
     for can_id in {number for number, _ in replayed}:
         received = [data for number, data in world.received if number == can_id]
         assert received == [data for number, data in replayed if number == can_id]
-    assert len(world.received) == len(replayed) == world.gateway.status.sent_frames
-    assert sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed) > 500
+    assert len(world.received) == len(replayed) == world.gateway.status.sent_frames > 0
+    emergencies = sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed)
+    assert (emergencies > 500) == has_nodes
 
 
-@pytest.mark.parametrize("has_nodes", [True, False])
-def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebody_wants_it(
-    has_nodes: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The loop comes round for housekeeping, and heartbeats; an emergency goes in front of what the core sends in its turn."""
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    escs = (EscSettings("esc1"),)
-    loop = wire_world.loop_in(world, monkeypatch, escs, canopen=_nodes(escs, has_nodes))
-    events: list[int] = []
-    turns: list[int] = []
-    _count(monkeypatch, loop._poller, "_follow", lambda: events.append(_found(loop)))
-    _count(monkeypatch, loop, "_serve", lambda: turns.append(world.now))
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    for n in range(400):
-        frame = encode(LiveData(operating_errors=n // 2 % 2 << 20), WireLayout.V4)
-        wire.put(frame, [begun + n * 10 * MS] * len(frame))
-    wire_world.run(loop, world, begun + 4 * SECOND)
-    assert len(turns) < 4 * 4
-    states = [found for found in events if found & Event.STATE]
-    emergencies = [(at, f) for at, f in world.bus.sent if f.can_id == EMERGENCY + 1]
-    assert len(emergencies) == (199 if has_nodes else 0)
-    assert (len(states) > 150) if has_nodes else not states
-    for at, _ in emergencies:
-        together = [frame.can_id for when, frame in world.bus.sent if when == at]
-        assert together[0] in (EMERGENCY + 1, HEARTBEAT + 1)
-        assert len(together) > 1
-    loop.close()
+class InC:
+    """A loop with one ESC that turns in C, in a played world. ``turns``: when the loop itself turned."""
+
+    def __init__(
+        self, patch: pytest.MonkeyPatch, layout: Layout | None = None, **more: Any
+    ) -> None:
+        patch.setenv(load.PURE, "0")
+        self.world = world = wire_world.World()
+        self.loop = wire_world.loop_in(world, patch, ESCS, layout, **more)
+        self.bus, self.begun = world.bus, world.now
+        self.turns: list[int] = []
+        _count(patch, self.loop, "_serve", lambda: self.turns.append(world.now))
+        self.loop.open()
+        self.loop.begin()
+
+    def feed(self, frames: Iterable[LiveData]) -> None:
+        """Each 10 ms one, from the beginning on."""
+        for n, data in enumerate(frames):
+            wire = encode(data, WireLayout.V4)
+            self.world.wires[0].put(wire, [self.begun + n * 10 * MS] * len(wire))
+
+    def run(self, seconds: float) -> None:
+        """Until so long after the beginning."""
+        wire_world.run(self.loop, self.world, self.begun + round(seconds * SECOND))
+
+    def fill_bus(self, frame_ns: int) -> None:
+        self.bus.frame_ns = frame_ns
+        while self.bus.send(CanFrame(0x100, b"")) is Sent.OK:
+            pass
 
 
-def _found(loop: Loop) -> int:
-    found: int = loop._poller._turns.state.found  # type: ignore[attr-defined]
-    return found & 0xFF
+ESCS = (EscSettings("esc1"),)
 
 
 def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], None]) -> None:
@@ -240,6 +230,29 @@ def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], 
     patch.setattr(of, name, noted)
 
 
+@pytest.mark.parametrize("has_nodes", [True, False])
+def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebody_wants_it(
+    has_nodes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop comes round for housekeeping, and heartbeats; an emergency goes in front of what the core sends in its turn."""
+    it = InC(monkeypatch, canopen=_nodes(ESCS, has_nodes))
+    poller: Any = it.loop._poller
+    events: list[int] = []
+    _count(monkeypatch, poller, "_follow", lambda: events.append(poller._turns.state.found))
+    it.feed(LiveData(operating_errors=n // 2 % 2 << 20) for n in range(400))
+    it.run(4)
+    assert len(it.turns) < 4 * 4
+    states = [found for found in events if found & Event.STATE]
+    emergencies = [(at, f) for at, f in it.bus.sent if f.can_id == EMERGENCY + 1]
+    assert len(emergencies) == (199 if has_nodes else 0)
+    assert (len(states) > 150) if has_nodes else not states
+    for at, _ in emergencies:
+        together = [frame.can_id for when, frame in it.bus.sent if when == at]
+        assert together[0] in (EMERGENCY + 1, HEARTBEAT + 1)
+        assert len(together) > 1
+    it.loop.close()
+
+
 class Beacon(Output):
     """A measurement of its own each 20 ms: the newest wins, unless it is ``queued``."""
 
@@ -247,8 +260,7 @@ class Beacon(Output):
 
     def __init__(self, queued: bool) -> None:
         super().__init__()
-        self.due = 0
-        self.count = 0
+        self.due = self.count = 0
         self._queued = queued
 
     def next_deadline(self) -> int:
@@ -266,33 +278,20 @@ def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
     queued: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With telemetry and without; on a full bus what is queued waits, of what is not the newest alone."""
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    escs = (EscSettings("esc1"),)
     beacon = Beacon(queued)
-    loop = wire_world.loop_in(world, monkeypatch, escs, further=[lambda *_: beacon])
-    turns: list[int] = []
-    _count(monkeypatch, loop, "_serve", lambda: turns.append(world.now))
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    for n in range(300):
-        frame = encode(LiveData(consumed_charge=n), WireLayout.V4)
-        wire.put(frame, [begun + n * 10 * MS] * len(frame))
-    wire_world.run(loop, world, begun + 5 * SECOND)
-    sent = [(at, f) for at, f in world.bus.sent if f.can_id == 0x700]
-    assert [f.data for _, f in sent] == [struct.pack("<I", 1 + n) for n in range(len(sent))]
+    it = InC(monkeypatch, further=[lambda *_: beacon])
+    it.feed(LiveData(consumed_charge=n) for n in range(300))
+    it.run(5)
+    sent = [f.data for _, f in it.bus.sent if f.can_id == 0x700]
+    assert sent == [struct.pack("<I", 1 + n) for n in range(len(sent))]
     assert 200 < len(sent) == beacon.count <= 251
-    assert len(turns) < 5 * 4
-    world.bus.frame_ns = 300 * MS
-    while world.bus.send(CanFrame(0x100, b"")) is Sent.OK:
-        pass
-    wire_world.run(loop, world, begun + 5500 * MS)
-    waiting = [f for f in loop.can.transmitter.queue.in_order() if f.can_id == 0x700]
+    assert len(it.turns) < 5 * 4
+    it.fill_bus(300 * MS)
+    it.run(5.5)
+    waiting = [f for f in it.loop.can.transmitter.queue.in_order() if f.can_id == 0x700]
     assert waiting[-1].data == struct.pack("<I", beacon.count)
-    assert (len(waiting) > 10) == queued
-    assert len(waiting) == 1 or queued
-    loop.close()
+    assert len(waiting) > 10 if queued else len(waiting) == 1
+    it.loop.close()
 
 
 def test_a_foreign_frame_with_our_id_is_over_after_ten_seconds_between_turns_in_c(
@@ -300,85 +299,60 @@ def test_a_foreign_frame_with_our_id_is_over_after_ten_seconds_between_turns_in_
 ) -> None:
     """No output has a deadline of its own; the next one is a new one, which is said."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    loop = wire_world.loop_in(world, monkeypatch)
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    wire.stream(begun, begun + 40 * SECOND, 10 * MS)
-    conflicts = loop.gateway.conflicts
+    it = InC(monkeypatch)
+    it.world.wires[0].stream(it.begun, it.begun + 40 * SECOND, 10 * MS)
+    conflicts = it.loop.gateway.conflicts
     for came in (1, 25):
-        world.bus.came(0x100, bytes(8), begun + came * SECOND)
-        wire_world.run(loop, world, begun + (came + 9) * SECOND)
+        it.bus.came(0x100, bytes(8), it.begun + came * SECOND)
+        it.run(came + 9)
         assert conflicts.next_deadline() < NEVER
-        wire_world.run(loop, world, begun + (came + 11) * SECOND)
+        it.run(came + 11)
         assert conflicts.next_deadline() == NEVER
-    wire_world.run(loop, world, begun + 39 * SECOND)
-    said = [
-        r.getMessage().split(": ")[2].split()[0]
-        for r in caplog.records
-        if "else sends" in r.getMessage()
-    ]
+    it.run(39)
+    texts = [record.getMessage() for record in caplog.records]
+    said = [text.split(": ")[2].split()[0] for text in texts if "else sends" in text]
     assert said == ["somebody", "nobody", "somebody", "nobody"]
-    loop.close()
+    it.loop.close()
 
 
 def test_the_kernel_is_asked_for_the_interface_each_second_between_turns_in_c(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    loop = wire_world.loop_in(world, monkeypatch)
-    loop.open()
-    loop.begin()
+    it = InC(monkeypatch)
     asked: list[int] = []
 
     def ask(now: int) -> None:
         asked.append(now)
-        loop.can.controller.due = now + SECOND
+        it.loop.can.controller.due = now + SECOND
 
-    monkeypatch.setattr(loop.can, "ask", ask)
-    loop.can.controller.due = world.now
-    begun = world.now
-    world.wires[0].stream(begun, begun + 10 * SECOND, 10 * MS)
-    wire_world.run(loop, world, begun + 10 * SECOND)
-    gaps = [later - at for at, later in pairwise([begun, *asked, world.now])]
+    monkeypatch.setattr(it.loop.can, "ask", ask)
+    it.loop.can.controller.due = it.begun
+    it.world.wires[0].stream(it.begun, it.begun + 10 * SECOND, 10 * MS)
+    it.run(10)
+    gaps = [later - at for at, later in pairwise([it.begun, *asked, it.world.now])]
     assert max(gaps) <= 1600 * MS
     assert len(asked) < 12
-    loop.close()
+    it.loop.close()
 
 
 def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_is_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """That the bus took nothing counts from then on: it is no stall, and nothing is lost."""
-    monkeypatch.setenv(load.PURE, "0")
-    world = wire_world.World()
-    escs = (EscSettings("esc1"),)
-    nothing = Layout("", "", ())
-    loop = wire_world.loop_in(world, monkeypatch, escs, nothing, canopen=_nodes(escs, True))
-    loop.open()
-    loop.begin()
-    wire, begun = world.wires[0], world.now
-    for n in range(600):
-        frame = encode(LiveData(operating_errors=(n >= 530) << 20), WireLayout.V4)
-        wire.put(frame, [begun + n * 10 * MS] * len(frame))
-    wire_world.run(loop, world, begun + SECOND)
-    assert 0x181 in dict(world.bus.take())
-    world.bus.came(0, b"\x80\x01")  # pre-operational: heartbeats and emergencies remain
-    wire_world.run(loop, world, begun + 5295 * MS)  # between two heartbeats
-    world.bus.frame_ns = 30 * MS
-    while world.bus.send(CanFrame(0x700, b"")) is Sent.OK:
-        pass
-    wire_world.run(loop, world, begun + 6 * SECOND)
-    status, transmitter = loop.can._gateway.status, loop.can.transmitter
+    it = InC(monkeypatch, Layout("", "", ()), canopen=_nodes(ESCS, True))
+    it.feed(LiveData(operating_errors=(n >= 530) << 20) for n in range(600))
+    it.run(1)
+    assert 0x181 in dict(it.bus.take())
+    it.bus.came(0, b"\x80\x01")  # pre-operational: heartbeats and emergencies remain
+    it.run(5.295)  # between two heartbeats
+    it.fill_bus(30 * MS)
+    it.run(6)
+    status, transmitter = it.loop.gateway.status, it.loop.can.transmitter
     assert (transmitter.is_stalled, status.dropped_frames) == (False, 0)
-    (at,) = [
-        at for at, f in world.bus.sent if f.can_id == EMERGENCY + 1 and at > begun + 4 * SECOND
-    ]
-    assert at < begun + 5600 * MS
-    loop.close()
+    sent = [at - it.begun for at, f in it.bus.sent if f.can_id == EMERGENCY + 1]
+    (at,) = [at for at in sent if at > 4 * SECOND]
+    assert at < 5600 * MS
+    it.loop.close()
 
 
 @pytest.mark.parametrize("seed", range(2))
