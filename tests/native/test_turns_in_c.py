@@ -1,14 +1,10 @@
-"""A loop that turns in C, with pseudo terminals and a local socket: what it records, replayed by the core in Python, gives what it sent."""
+"""A loop that turns in C, with a kernel that is played: what it records, replayed by the core in Python, gives what it sent."""
 
 import logging
-import os
 import random
-import socket
 import struct
-import threading
-import time
-import tty
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,7 +21,6 @@ from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import Replay
-from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -34,22 +29,9 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
 from kontronik_can_gw.output import NEVER, Output
-from kontronik_can_gw.runtime import can_link
-from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.native_poller import NativePoller
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
-
-_HEAD = struct.Struct("=IBBBB")
-
-
-class LocalBus(socket.socket):
-    """One end of a local socket pair, which has no options of CAN."""
-
-    def setsockopt(self, *_: object) -> None:
-        pass
 
 
 def _nodes(escs: Sequence[EscSettings], wanted: bool) -> CanopenSetup | None:
@@ -61,139 +43,22 @@ def _nodes(escs: Sequence[EscSettings], wanted: bool) -> CanopenSetup | None:
     return CanopenSetup(shipped_eds(), settings, (Stored(),) * count, tuple(escs))
 
 
-class World:
-    """A loop with recorder, its ESCs' wires, and what comes out.
-
-    ``is_slow``: the bus takes what is sent only now and then. ``has_nodes``: each ESC has a CANopen node.
-    """
-
-    def __init__(
-        self, seed: int, is_slow: bool, monkeypatch: pytest.MonkeyPatch, has_nodes: bool = False
-    ) -> None:
-        self.chance = chance = random.Random(seed)
-        self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
-        self.layout = layout(chance, self.escs)
-        self.is_slow = is_slow
-        pairs = [os.openpty() for _ in self.escs]
-        for _, terminal in pairs:
-            tty.setraw(terminal)
-        self.wires = [wire for wire, _ in pairs]
-        self.entries: list[Entry] = []
-        ours, self.bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 if is_slow else 1 << 20)
-        port = LocalBus(fileno=ours.detach())
-        monkeypatch.setattr(can_link, "open_can", lambda _: SocketCanPort(port, port.close))
-        self.canopen = _nodes(self.escs, has_nodes)
-        begun = time.monotonic_ns()
-        arguments = (self.escs, self.layout, begun)
-        self.gateway = RecordedGateway(self.put, *arguments, canopen=self.canopen)
-        self.begun = self.gateway.status.started_ns
-        self.poller = NativePoller(self.gateway)
-        ports = [os.ttyname(terminal) for _, terminal in pairs]
-        self.loop = Loop(self.gateway, ports, CanConfig(channel="lo", fd=True), poller=self.poller)
-        if not is_slow:  # then nothing is dropped, however slow the machine is
-            monkeypatch.setattr(self.loop.can.transmitter, "max_turn_ns", lambda: 3600 * SECOND)
-        for _, terminal in pairs:
-            os.close(terminal)
-        self.received: list[tuple[int, bytes]] = []
-
-    def put(
-        self, now: int, kind: int, esc: int, data: bytes, flags: int, came: int | None = None
-    ) -> None:
-        self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
-
-    def feed(self, turns: int) -> None:
-        """Bytes of all ESCs in pieces of any size, at any time, until there were ``turns`` turns in C; then the wires are cut."""
-        chance = self.chance
-        data = dict.fromkeys(self.wires, b"")
-        for _ in range(100_000):
-            if self.poller.count >= turns:
-                break
-            for wire, rest in data.items():
-                size = chance.choice((1, 10, 40, 40, 44, 80, 400))
-                rest = rest or stream(chance)
-                os.write(wire, rest[:size])
-                data[wire] = rest[size:]
-            time.sleep(chance.choice((0, 0, 0.0003, 0.002)))
-        for wire in self.wires:
-            os.close(wire)
-        self.loop.stop()
-
-    def receive(self) -> None:
-        while data := self.bus.recv(72):
-            can_id, length, *_ = _HEAD.unpack_from(data)
-            assert len(data) in (16, 72)
-            self.received.append((can_id, data[8 : 8 + length]))
-            if self.is_slow and self.chance.random() < 0.02:
-                time.sleep(0.01)
-
-    def run(self, turns: int) -> None:
-        threads = [
-            threading.Thread(target=self.receive),
-            threading.Thread(target=self.feed, args=(turns,)),
-        ]
-        self.loop.open()
-        for thread in threads:
-            thread.start()
-        self.loop.run()
-        for thread in threads:
-            thread.join()
-        self.bus.close()
-
-    def replayed(self, monkeypatch: pytest.MonkeyPatch) -> list[CanFrame]:
-        monkeypatch.setenv(load.PURE, "1")
-        load.library.cache_clear()
-        gateway = Gateway(self.escs, self.layout, self.begun, canopen=self.canopen)
-        assert gateway.core.language == "Python"
-        replay = Replay(gateway)
-        frames = [timed.frame for timed in replay.follow(self.entries)]
-        assert replay.rejected == 0
-        return frames
-
-
-@pytest.fixture(autouse=True)
-def _core_in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.delenv(load.PURE, raising=False)
-    library = load.library
-    library.cache_clear()
-    if library()[0] is None:
-        pytest.skip(f"the core in C: {library()[1]}")
-    yield
-    library.cache_clear()
-
-
-def on_the_wire(frames: Sequence[CanFrame]) -> list[tuple[int, bytes]]:
-    return [(f.can_id | (EXTENDED if f.extended else 0), f.data) for f in frames]
-
-
-@pytest.mark.parametrize("has_nodes", [False, True])
-@pytest.mark.parametrize("seed", range(6))
-def test_what_is_sent_is_what_a_replay_in_python_sends(
-    seed: int, has_nodes: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With nodes, order within an id: queue and slots take turns in Python's transmit queue. Nearly each frame has other error bits."""
-    world = World(seed, False, monkeypatch, has_nodes)
-    world.run(300)
-    replayed = on_the_wire(world.replayed(monkeypatch))
-    if not has_nodes:
-        assert world.received == replayed
-    for can_id in {number for number, _ in replayed}:
-        received = [data for number, data in world.received if number == can_id]
-        assert received == [data for number, data in replayed if number == can_id]
-    assert len(world.received) == len(replayed) == world.gateway.status.sent_frames > 0
-    emergencies = sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed)
-    assert (emergencies > 500) == has_nodes
+ESCS = (EscSettings("esc1"),)
 
 
 class InC:
-    """A loop with one ESC that turns in C, in a played world. ``turns``: when the loop itself turned."""
+    """A loop that turns in C, in a played world. ``turns``: when the loop itself turned."""
 
     def __init__(
-        self, patch: pytest.MonkeyPatch, layout: Layout | None = None, **more: Any
+        self,
+        patch: pytest.MonkeyPatch,
+        layout: Layout | None = None,
+        escs: Sequence[EscSettings] = ESCS,
+        **more: Any,
     ) -> None:
         patch.setenv(load.PURE, "0")
-        self.world = world = wire_world.World()
-        self.loop = wire_world.loop_in(world, patch, ESCS, layout, **more)
+        self.world = world = wire_world.World(len(escs))
+        self.loop = wire_world.loop_in(world, patch, escs, layout, **more)
         self.bus, self.begun = world.bus, world.now
         self.turns: list[int] = []
         _count(patch, self.loop, "_serve", lambda: self.turns.append(world.now))
@@ -216,9 +81,6 @@ class InC:
             pass
 
 
-ESCS = (EscSettings("esc1"),)
-
-
 def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], None]) -> None:
     """``note`` is called before each call of a method."""
     method = getattr(of, name)
@@ -228,6 +90,85 @@ def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], 
         return method(*arguments)
 
     patch.setattr(of, name, noted)
+
+
+class Recorded(InC):
+    """One that is recorded, with random ESCs, layout and bytes. ``has_nodes``: each ESC has a CANopen node."""
+
+    def __init__(self, seed: int, patch: pytest.MonkeyPatch, has_nodes: bool = False) -> None:
+        chance = random.Random(seed)
+        self.entries: list[Entry] = []
+        self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
+        self.layout = layout(chance, self.escs)
+        self.canopen = _nodes(self.escs, has_nodes)
+        patch.setattr(wire_world, "Gateway", partial(RecordedGateway, self._put))
+        super().__init__(patch, self.layout, self.escs, canopen=self.canopen)
+        self.status = self.loop.gateway.status
+        for wire in self.world.wires:
+            at = self.begun
+            while at < self.begun + 2 * SECOND:
+                data = stream(chance)
+                step = chance.choice(
+                    (0, wire_world.NS_PER_BYTE)
+                )  # handed over at once, or as on the wire
+                wire.put(data, [at + n * step for n in range(1, len(data) + 1)])
+                at += len(data) * wire_world.NS_PER_BYTE
+                at += chance.choice((0, MS, 6 * MS, 6 * MS, 6 * MS, 300 * MS))
+
+    def _put(
+        self, now: int, kind: int, esc: int, data: bytes, flags: int, came: int | None = None
+    ) -> None:
+        self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
+
+    def sent(self) -> list[tuple[int, bytes]]:
+        """What the bus took, to the end."""
+        self.run(2.5)
+        self.loop.end()
+        assert len(self.bus.sent) == self.status.sent_frames
+        return on_the_wire(frame for _, frame in self.bus.sent)
+
+    def replayed(self, patch: pytest.MonkeyPatch) -> list[tuple[int, bytes]]:
+        patch.setattr(load, "library", lambda: (None, ""))
+        gateway = Gateway(self.escs, self.layout, self.begun, canopen=self.canopen)
+        assert gateway.core.language == "Python"
+        replay = Replay(gateway)
+        frames = [timed.frame for timed in replay.follow(self.entries)]
+        assert replay.rejected == 0
+        return on_the_wire(frames)
+
+
+@pytest.fixture(autouse=True)
+def _core_in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv(load.PURE, raising=False)
+    library = load.library
+    library.cache_clear()
+    if library()[0] is None:
+        pytest.skip(f"the core in C: {library()[1]}")
+    yield
+    library.cache_clear()
+
+
+def on_the_wire(frames: Iterable[CanFrame]) -> list[tuple[int, bytes]]:
+    return [(f.can_id | (EXTENDED if f.extended else 0), f.data) for f in frames]
+
+
+@pytest.mark.parametrize("has_nodes", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_sent_is_what_a_replay_in_python_sends(
+    seed: int, has_nodes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With nodes, order within an id: queue and slots take turns in Python's transmit queue. Nearly each frame has other error bits."""
+    it = Recorded(seed, monkeypatch, has_nodes)
+    sent, replayed = it.sent(), it.replayed(monkeypatch)
+    assert it.loop._poller.count > 100 > len(it.turns)  # type: ignore[attr-defined]
+    assert len(sent) == len(replayed) > 0
+    if not has_nodes:
+        assert sent == replayed
+    for can_id in {number for number, _ in replayed}:
+        received = [data for number, data in sent if number == can_id]
+        assert received == [data for number, data in replayed if number == can_id]
+    emergencies = sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed)
+    assert (emergencies > 100) == has_nodes
 
 
 @pytest.mark.parametrize("has_nodes", [True, False])
@@ -360,17 +301,16 @@ def test_where_the_bus_does_not_take_all_the_newest_values_are_sent(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was replaced is missing; nothing else comes, and nothing twice or in another order of its id."""
-    world = World(seed, True, monkeypatch)
-    world.run(200)
-    status = world.gateway.status
-    assert len(world.received) == status.sent_frames
-    replayed = on_the_wire(world.replayed(monkeypatch))
+    it = Recorded(seed, monkeypatch)
+    it.bus.frame_ns = 20 * MS
+    sent, replayed = it.sent(), it.replayed(monkeypatch)
     for can_id in {number for number, _ in replayed}:
         all_of_it = iter([data for number, data in replayed if number == can_id])
-        got = [data for number, data in world.received if number == can_id]
+        got = [data for number, data in sent if number == can_id]
         assert all(any(data == other for other in all_of_it) for data in got)
-    waiting = len(world.loop.can.transmitter.queue)
-    assert status.sent_frames + status.replaced_frames + waiting == len(replayed)
+    waiting = len(it.loop.can.transmitter.queue)
+    assert it.status.replaced_frames > 0
+    assert len(sent) + it.status.replaced_frames + waiting == len(replayed)
 
 
 @pytest.mark.extended
@@ -386,18 +326,14 @@ import os, pathlib, sys
 del os.environ["LD_PRELOAD"]  # the compiler needs none
 os.environ["KONTRONIK_PURE"] = "0"
 import pytest, native_world, sanitized, test_hold_ups, test_turns_in_c
-from kontronik_can_gw.native import binding, load
-
 patch = pytest.MonkeyPatch()
-plain = binding.load(pathlib.Path(sys.argv[1]))
-patch.setattr(load, "library", lambda: (plain, ""))
-for seed, is_slow, has_nodes in ((0, False, True), (1, True, False), (5, False, True)):
-    with pytest.MonkeyPatch.context() as each:
-        world = test_turns_in_c.World(seed, is_slow, each, has_nodes)
-        world.run(80)
-        print(len(world.received))
 faked = native_world.library(sanitized.SANITIZED)
 patch.setattr(native_world, "library", lambda: faked)
+for seed, frame_ns, has_nodes in ((0, 0, True), (1, 20_000_000, False), (5, 0, True)):
+    with pytest.MonkeyPatch.context() as each:
+        it = test_turns_in_c.Recorded(seed, each, has_nodes)
+        it.bus.frame_ns = frame_ns
+        print(len(it.sent()))
 hold_ups = test_hold_ups.test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true
 for seed in range(3):
     hold_ups.hypothesis.inner_test(seed, 60, 10, 0.05, seed % 2, seed % 3)
