@@ -81,7 +81,7 @@ class Handle:
         self.core = library.kcg_init(self._memory, c.byref(self._plan), settings, now)
         self.state = _Core.from_buffer(self._memory)
         begin = self.state.esc - c.addressof(self._memory)
-        self.escs = (Esc * len(tables.settings)).from_buffer(self._memory, begin)
+        self.esc_states = (Esc * len(tables.settings)).from_buffer(self._memory, begin)
         self._frames = (Frame * _MAX_FRAMES)()
         self._raw = memoryview(self._frames).cast("B")
 
@@ -91,7 +91,7 @@ class Handle:
             return (kind * max(1, len(rows)))(*rows)
         return (kind * len(rows)).from_buffer_copy(b"".join(rows))  # of rows it would keep them all
 
-    def follow(self, found: int, now: int) -> None:
+    def follow_all(self, found: int, now: int) -> None:
         """Give ``on_event`` what a call of the core returned, and what else there is."""
         while found >= 0:
             self._on_event(found >> 8, found & 0xFF, now)
@@ -103,7 +103,7 @@ class Handle:
 
     def _check(self, esc: int, now: int) -> None:
         """What a damaged capture may hold never reaches the core."""
-        if not 0 <= esc < len(self.escs):
+        if not 0 <= esc < len(self.esc_states):
             raise IndexError(f"ESC {esc}")
         if not 0 <= now < END_OF_TIME:
             raise OverflowError(f"time {now}")
@@ -115,23 +115,23 @@ class Handle:
         for begin in range(0, len(data) or 1, _MAX_READ):
             part = data[begin : begin + _MAX_READ] if len(data) > _MAX_READ else data
             while (found := receive(core, esc, part, len(part), now, since)) >= _AGAIN:
-                self.follow(found & ~_AGAIN, now)
-            self.follow(found, now)
+                self.follow_all(found & ~_AGAIN, now)
+            self.follow_all(found, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         """As Core.port."""
         self._check(esc, now)
-        self.follow(self.library.kcg_port(self.core, esc, is_open, now), now)
+        self.follow_all(self.library.kcg_port(self.core, esc, is_open, now), now)
 
     def expire(self, now: int) -> None:
         """As Core.expire."""
         self._check(0, now)
-        self.follow(self.library.kcg_expire(self.core, now), now)
+        self.follow_all(self.library.kcg_expire(self.core, now), now)
 
     def advance(self, now: int) -> None:
         """As Core.advance."""
         self._check(0, now)
-        self.follow(self.library.kcg_advance(self.core, now), now)
+        self.follow_all(self.library.kcg_advance(self.core, now), now)
 
     def next_deadline(self) -> int:
         """As Core.next_deadline."""

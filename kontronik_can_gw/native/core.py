@@ -20,7 +20,7 @@ from kontronik_can_gw.slots import Slot, Slots
 _LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"
 
 
-class NativeCore:
+class NativeCore(Handle):
     """As Core. NotInCore where the core in C cannot express the layout or an ESC's settings.
 
     ``slots``: of each ESC in C; further ones, and those with values that C does not know, are in Python and are handed over first.
@@ -39,10 +39,10 @@ class NativeCore:
     ) -> None:
         tables = Tables(layout, escs, silent)
         self._places = reserve(tables, slots)
-        self._handle = Handle(library, tables, now, self._follow)
-        self.status = cast(GatewayStatus, NativeStatus.from_buffer(self._handle.state.gateway))
+        super().__init__(library, tables, now, self._follow)
+        self.status = cast(GatewayStatus, NativeStatus.from_buffer(self.state.gateway))
         self.status.esc_count = len(escs)
-        self.escs = [NativeEsc(*pair) for pair in zip(escs, self._handle.escs, strict=True)]
+        self.escs = [NativeEsc(*pair) for pair in zip(escs, self.esc_states, strict=True)]
         self.own_ids: dict[int, Owner] = own_ids(layout)
         self._slots = Slots(self.escs, self.status)
         self._followers: Sequence[Follower] = ()
@@ -50,10 +50,6 @@ class NativeCore:
         self.link_changes: list[int] = []
         self.shortest_timeout_ns = self._shortest_timeout()
         self.packs_at_once = False
-        self.handle = handle = self._handle
-        self.receive, self.port, self.expire = handle.receive, handle.port, handle.expire
-        self.gateway_changed, self.repeat = handle.gateway_changed, handle.repeat
-        self.stop = handle.stop
 
     @property
     def followers(self) -> Sequence[Follower]:
@@ -72,16 +68,16 @@ class NativeCore:
         self.reports_live = bool(events & Event.LIVE)
         """True while somebody follows each live frame."""
         self.note = _LIVE_IN_PYTHON if self.reports_live else ""
-        self._handle.report_only(events)
+        self.report_only(events)
 
     def slot(self, esc: int) -> Slot:
         places, python = self._places[esc], self._slots.add(esc)
         place = places.pop(0) if places else None
         protocol = self.escs[esc].settings.protocol
-        return NativeSlot(self._handle, place, esc, protocol, python, self._choose_events)
+        return NativeSlot(self, place, esc, protocol, python, self._choose_events)
 
     def advance(self, now: int) -> None:
-        self._handle.advance(now)
+        super().advance(now)
         self._slots.advance(now)
 
     def advance_in_python(self, now: int) -> None:
@@ -89,7 +85,7 @@ class NativeCore:
         self._slots.advance(now)
 
     def next_deadline(self) -> int:
-        return min(self._handle.next_deadline(), self._slots.next_deadline())
+        return min(super().next_deadline(), self._slots.next_deadline())
 
     def deadline_in_python(self) -> int:
         """When ``advance_in_python`` has something to do; 0 while one of these slots is pending."""
@@ -97,7 +93,7 @@ class NativeCore:
 
     def turns(self) -> Turns:
         """Whole turns of a loop with this core."""
-        return Turns(self._handle.library, self._handle.core, len(self.escs))
+        return Turns(self.library, self.core, len(self.escs))
 
     def follow(self, found: int, now: int) -> None:
         """Follow an event that a turn came back with; if there are others it comes back with each."""
@@ -105,18 +101,17 @@ class NativeCore:
 
     def follow_others(self, now: int) -> None:
         """Follow these, where the rest of the turn is the loop's."""
-        handle = self._handle
-        handle.follow(handle.library.kcg_next_event(handle.core), now)
+        self.follow_all(self.library.kcg_next_event(self.core), now)
 
     @property
     def is_pending(self) -> bool:
-        return self._handle.is_pending or self._slots.is_pending
+        return super().is_pending or self._slots.is_pending
 
     def take(self, now: int) -> list[CanFrame]:
-        return self._slots.take(now) + self._handle.take(now)
+        return self._slots.take(now) + super().take(now)
 
     def apply(self, esc: int, settings: EscSettings) -> None:
-        self._handle.apply(esc, settings)
+        super().apply(esc, settings)
         self.escs[esc].apply(settings)
         self.shortest_timeout_ns = self._shortest_timeout()
 

@@ -40,12 +40,11 @@ class Player(Output):
 
     def bind(self, core: NativeCore, now: int) -> None:
         """Take the core that is to be played. NotInCore where it does not have one of the values."""
-        self._handle = handle = core.handle
-        self._library = library = handle.library
+        self._library = library = core.library
         self._settings = core.escs[0].settings
-        self._state.core = handle.core
+        self._state.core = core.core
         if self._columns is None:
-            self._state.room = size = max(_FRAMES, 2 * handle.pages)
+            self._state.room = size = max(_FRAMES, 2 * core.pages)
             self._rooms = [FrameRoom(library, size) for _ in range(2)]
             self._set_room()
             return
@@ -154,7 +153,7 @@ class Player(Output):
     @property
     def counters(self) -> Counters:
         """Of what found the frames."""
-        return NativeEsc(self._settings, self._finder.escs[0]).counters
+        return NativeEsc(self._settings, self._finder.esc_states[0]).counters
 
     # --- what came of it
 
