@@ -8,6 +8,7 @@ is counted and dropped. At most 43 bytes are held; work is linear in the bytes f
 
 from dataclasses import dataclass, fields
 from operator import attrgetter
+from typing import Any
 from zlib import crc32
 
 from kontronik_can_gw.esc.decoder import Reading
@@ -18,10 +19,11 @@ from kontronik_can_gw.esc.kontronik.codec import (
     Form,
     Layout,
 )
-from kontronik_can_gw.esc.kontronik.fields import Data, LiveData
+from kontronik_can_gw.esc.kontronik.fields import Data
 from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
 _new = tuple.__new__
+_LEGACY_LIVE = next(form for form in FORMS if form.name == "live_legacy")
 _PREFIX = b"KOD"
 # A line that is read at a far higher rate than it is sent shows its bits as long runs: zeros, then ones.
 _LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
@@ -41,10 +43,8 @@ class Frame(Reading):
     @property
     def suspect(self) -> bool:
         """True where the bytes outside a legacy live frame's CRC are impossible (operating state above 26)."""
-        data = self.data
-        if self.form.layout is Layout.V4 or not isinstance(data, LiveData):
-            return False
-        return data.operating_state > LARGEST_STATE
+        data: Any = self.data
+        return self.form is _LEGACY_LIVE and data.operating_state > LARGEST_STATE
 
 
 @dataclass(slots=True)
