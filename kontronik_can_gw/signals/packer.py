@@ -33,17 +33,20 @@ def take(pieces: Sequence[Piece], bits: int) -> int:
     return sum((bits >> piece.at & (1 << piece.width) - 1) << piece.shift for piece in pieces)
 
 
+_FLOATS = {16: "<e", 32: "<f", 64: "<d"}
+
+
 def float_bits(
     value: float | None, length: int, low: float, high: float, error: int, not_available: int = -1
 ) -> int:
-    """The IEEE 754 bits of a 32- or 64-bit float.
+    """The IEEE 754 bits of a float of 16, 32 or 64 bits.
 
     ``error`` for what is outside low..high, has no float of this length, or would look like ``not_available``.
     """
     if value is None or not low <= value <= high:
         return error
     try:
-        bits = int.from_bytes(struct.pack("<f" if length == 32 else "<d", value), "little")
+        bits = int.from_bytes(struct.pack(_FLOATS[length], value), "little")
     except OverflowError:
         return error
     return error if bits == not_available else bits
