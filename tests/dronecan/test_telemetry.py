@@ -87,7 +87,7 @@ def test_the_bec_once_a_second() -> None:
     assert circuit.current == pytest.approx(1.25, abs=0.001)
     assert (warm.device_id, warm.error_flags) == (2, 1)
     assert warm.temperature == pytest.approx(314.15, abs=0.25)
-    assert set(intervals(bench.of("CircuitStatus"))) == {SECOND}
+    assert set([*intervals(bench.of("CircuitStatus"))][1:]) == {SECOND}
 
 
 def test_status_extended_is_sent_only_by_choice() -> None:
@@ -95,7 +95,7 @@ def test_status_extended_is_sent_only_by_choice() -> None:
     bench = Bench(extended_hz=10)
     bench.live[0] = LIVE._replace(operating_errors=1 << 17 | 1 << 5 | 1 << 23)
     got = bench.run(2).of("StatusExtended")
-    assert set(intervals(got)) == {100 * MS}
+    assert set([*intervals(got)][1:]) == {100 * MS}
     last = got[-1].payload
     assert (last.input_pct, last.output_pct, last.motor_temperature_degC) == (55, 42, -256)
     assert last.status_flags == 1 << 17 | 1 << 5 | 1 << 18
@@ -107,7 +107,7 @@ def test_error_count_is_that_of_errors_since_the_motor_was_started() -> None:
     for errors, speed in ((0, 0), (1 << HOT, 0), (0, 0), (0, 700), (1 << HOT, 700), (1 << WARM, 700),
                           (1 << HOT | 1, 700), (1 << HOT | 1, 700), (0, 0), (0, 700)):  # fmt: skip
         bench.live[0] = LIVE._replace(operating_errors=errors, electrical_speed=speed)
-        counts.append(bench.run(0.1).of("Status")[-1].payload.error_count)
+        counts.append(bench.run(1.1).of("Status")[-1].payload.error_count)
     assert counts == [0, 1, 1, 0, 1, 1, 3, 3, 3, 0]
 
 
