@@ -213,7 +213,7 @@ def test_a_replay_and_a_gateway_do_not_send_as_one_node(
 ) -> None:
     monkeypatch.setattr(locks, "lock_folder", lambda: tmp_path / "lock")
     setup, layout = capture_bench.made(2, dronecan=ON)
-    gateway, capture = locks.Locks(), SimpleNamespace(setup=setup, sent_layout=layout)
+    gateway, capture = locks.Locks(), SimpleNamespace(setup=setup, sent_layout=layout, created_ns=0)
     assert not gateway.hold([locks.ids_lock("can7", id_block(43, 0x7F))])
     with pytest.raises(RunError, match=r"can7: another gateway .* 29-bit ids with 2Bh"):
         replay._hold(locks.Locks(), "can7", cast("Any", capture))
