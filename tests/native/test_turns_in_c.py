@@ -26,6 +26,7 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -33,7 +34,8 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
-from kontronik_can_gw.output import NEVER, Output
+from kontronik_can_gw.output import NEVER, Given, Output
+from kontronik_can_gw.outputs import setup_of
 from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.native_poller import NativePoller
@@ -64,7 +66,7 @@ def _nodes(escs: Sequence[EscSettings], wanted: bool) -> CanopenSetup | None:
 class World:
     """A loop with recorder, its ESCs' wires, and what comes out.
 
-    ``is_slow``: the bus takes what is sent only now and then. ``has_nodes``: each ESC has a CANopen node.
+    ``is_slow``: the bus takes what is sent only now and then. ``has_nodes``: each ESC has a CANopen node, and all one of DroneCAN.
     """
 
     def __init__(
@@ -83,10 +85,13 @@ class World:
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 if is_slow else 1 << 20)
         port = LocalBus(fileno=ours.detach())
         monkeypatch.setattr(can_link, "open_can", lambda _: SocketCanPort(port, port.close))
-        self.canopen = _nodes(self.escs, has_nodes)
         begun = time.monotonic_ns()
         arguments = (self.escs, self.layout, begun)
-        self.gateway = RecordedGateway(self.put, *arguments, canopen=self.canopen)
+        self.more: dict[str, Any] = {"canopen": _nodes(self.escs, has_nodes), "further": ()}
+        if has_nodes:
+            given = Given(DronecanConfig(node_id=42, extended_hz=30), b"", (1, 2), 3)
+            self.more["further"] = [setup_of("dronecan", given, self.escs).make]
+        self.gateway = RecordedGateway(self.put, *arguments, **self.more)
         self.begun = self.gateway.status.started_ns
         self.poller = NativePoller(self.gateway)
         ports = [os.ttyname(terminal) for _, terminal in pairs]
@@ -143,7 +148,7 @@ class World:
     def replayed(self, monkeypatch: pytest.MonkeyPatch) -> list[CanFrame]:
         monkeypatch.setenv(load.PURE, "1")
         load.library.cache_clear()
-        gateway = Gateway(self.escs, self.layout, self.begun, canopen=self.canopen)
+        gateway = Gateway(self.escs, self.layout, self.begun, **self.more)
         assert gateway.core.language == "Python"
         replay = Replay(gateway)
         frames = [timed.frame for timed in replay.follow(self.entries)]
@@ -190,6 +195,7 @@ def test_with_nodes_too_what_is_sent_is_what_a_replay_in_python_sends(
         assert received == [data for number, data in replayed if number == can_id]
     assert len(world.received) == len(replayed) == world.gateway.status.sent_frames
     assert sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed) > 500
+    assert sum(number == 0x98040A2A for number, _ in replayed) > 20
 
 
 @pytest.mark.parametrize("has_nodes", [True, False])
