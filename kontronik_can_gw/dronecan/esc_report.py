@@ -1,5 +1,6 @@
 """What is reported of one ESC: its measurements, which the core sends while they are fresh, and the errors that begin and end."""
 
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,6 +17,8 @@ SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "elect
 """Key ``rpm`` of the configuration to the value that is sent."""
 _QUIET_NS = 10 * SECOND
 """A bit is logged at most this often."""
+_PARTS = re.compile(rf"\S(?:.{{0,{types.MAX_TEXT - 1}}}(?!\S)|.{{0,{types.MAX_TEXT - 1}}})")
+"""A text in parts that end with a word, where there is one; textwrap would be loaded for this alone."""
 _LEVELS = {Severity.ERROR: 3, Severity.WARNING: 2}
 
 
@@ -133,11 +136,6 @@ class EscReport:
         if not begins:
             level, text = 1, f"{name}: over: {bit.meaning}"
         source = name.encode("ascii", "replace")
-        head, rest = types.LOG_MESSAGE.pack(level << 5 | len(source)) + source, text
-        while rest:  # textwrap would be loaded for this alone
-            end = len(rest)
-            if end > types.MAX_TEXT:
-                end = rest.rfind(" ", 1, types.MAX_TEXT + 1)
-                end = end if end > 0 else types.MAX_TEXT
-            yield head + rest[:end].encode("ascii", "replace")
-            rest = rest[end:].lstrip()
+        head = types.LOG_MESSAGE.pack(level << 5 | len(source)) + source
+        for part in _PARTS.findall(text):
+            yield head + part.encode("ascii", "replace")
