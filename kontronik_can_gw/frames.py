@@ -6,6 +6,7 @@ from typing import NamedTuple
 EXTENDED = 0x80000000
 """Marks a 29-bit id where ids of both lengths are numbers in one set, as SocketCAN does."""
 MAX_EXTENDED_ID = 0x1FFFFFFF
+FIRST_PART, PARTS = 64, 3
 _KEY = 0xFFFFFFFF
 
 
@@ -43,7 +44,8 @@ class CanFrame(NamedTuple):
 
     ``page`` separates frames of one id that do not replace each other (multiplexer pages). ``remote``: a remote frame (RTR), its
     data only says how much is asked for. ``queued``: it is sent in order and never replaced (answers of SDO, LSS and NMT, EMCY);
-    where False the newest frame of an id is the one that is sent.
+    where False the newest frame of an id is the one that is sent. From page ``FIRST_PART`` on ``PARTS`` pages each are the frames of
+    one transfer, which replace older ones together or not at all.
     """
 
     can_id: int

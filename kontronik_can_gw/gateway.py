@@ -12,7 +12,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.id_conflicts import IdConflicts
 from kontronik_can_gw.native.load import make_core
-from kontronik_can_gw.output import NEVER, Output
+from kontronik_can_gw.output import NEVER, SLOTS, Output
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class Gateway:
             self.core = PythonCore(escs, layout, now, silent_on_loss, packs_at_once)
             self.why_python = "a capture of 0.5.0 is replayed"
         else:
-            slots = 0 if canopen is None else canopen.pdos
+            slots = SLOTS * len(further) + (0 if canopen is None else canopen.pdos)
             self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
         self.layout = layout.fingerprint if layout.messages else None
         """Of the messages, as it stands in a DBC that `dbc -c` writes; None without messages."""
@@ -57,6 +57,8 @@ class Gateway:
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
         )
+        for output in self.outputs:
+            output.take_slots(self.core.slot)
         self.has_outputs = bool(self.outputs)
         """False: nothing but the layout's messages is sent, and no id to receive ever changes."""
         self.core.followers = [Follower(each.events, each.on_event) for each in self.outputs]

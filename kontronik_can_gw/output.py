@@ -4,7 +4,7 @@ The gateway holds its outputs in a tuple and treats all alike. An output overrid
 is integer nanoseconds of one monotonic clock.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
@@ -14,6 +14,8 @@ from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 NEVER = 1 << 62
 """Later than every deadline, ns."""
 NO_IDS: frozenset[int] = frozenset()
+SLOTS = 4
+"""Slots that an output may have for each ESC and be sent by the core in C; further ones are sent in Python."""
 
 
 class Owner(NamedTuple):
@@ -71,6 +73,9 @@ class Output:
         return NEVER
 
     # --- what happens
+
+    def take_slots(self, slot: Callable[[int], Any]) -> None:
+        """The gateway is made. ``slot`` gives a further slot of the core (slots.Slot) of an ESC, for frames that need no Python."""
 
     def start(self, now: int, can_open: bool) -> None:
         """The gateway runs. ``can_open``: there is a bus that can hear it."""

@@ -3,6 +3,10 @@
 What makes a slot's frame pending: events of its ESC, its timer (which each frame sent restarts), its owner. It is packed when it is handed
 over, so the newest wins; the inhibit time is the minimum distance between two. A slot with ``watched`` bits is made pending by events that
 change these only. Slots are handed over before the messages of the layout: in the order in which they became due, then of their number.
+
+A paced slot is a measurement at a rate. It goes with the first event after its inhibit time, else by its timer; its distance is the mean of
+both on average. It rests while the first of its signals is not available. A slot with a ``seed`` is a transfer (signals/transfer.py):
+slots of one id number theirs together.
 """
 
 from collections.abc import Sequence
@@ -11,11 +15,13 @@ from operator import itemgetter
 from typing import NamedTuple, Protocol
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
+from kontronik_can_gw.esc.values import divisor, steps
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.signals.packer import Pack
 from kontronik_can_gw.signals.plan import MessagePlan
+from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +29,7 @@ class SlotPlan:
     """How a slot is filled and what causes it. ESC 0 of the plan is the slot's."""
 
     message: MessagePlan
-    """Of up to 64 bits. Its id and send type do not matter."""
+    """Of up to 64 bits, but for a transfer. Its id and send type do not matter."""
     pack: Pack
     triggers: int
     """The events (of telemetry.Event) that are news to it."""
@@ -35,6 +41,9 @@ class SlotPlan:
     """It is not sent while telemetry is lost."""
     only_python: str = ""
     """What in it no core in C can know; empty else."""
+    seed: int | None = None
+    """It is a transfer of up to 16 bytes, and what its CRC begins with; None: a frame."""
+    paced: bool = False
 
 
 class SlotSettings(NamedTuple):
@@ -42,12 +51,16 @@ class SlotSettings(NamedTuple):
 
     plan: SlotPlan
     can_id: int
-    """11 bits."""
+    """11 bits; of a transfer 29."""
     by_event: bool
     """Events and the timer make it pending; else only ``Slot.send`` does."""
     inhibit_ns: int
     timer_ns: int
     """It is sent this long after its last frame at the latest; 0: never for that reason."""
+    fill: int = 0
+    """Bits that the owner fills, besides those of the plan."""
+    page: int = 0
+    """Of its frame (frames.CanFrame), of a transfer of the first one."""
 
 
 class Slot(Protocol):
@@ -88,6 +101,8 @@ class PythonSlot:
         """When ``advance`` has something to do."""
         self.triggers = 0
         """The events that it is to be given."""
+        self.can_id = self.transfer_id = 0
+        """Of the transfers of this id, if it is the first slot of it."""
         self._owner = owner
         self._esc = esc
         self._escs = (owner.escs[esc],)
@@ -99,6 +114,8 @@ class PythonSlot:
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
         before, self._settings = self._settings, settings
+        if settings is not None:
+            self.can_id = settings.can_id
         if not self._started:
             return
         if settings is None:
@@ -137,7 +154,7 @@ class PythonSlot:
         if now >= (until := self._last_ns + settings.inhibit_ns):
             self._deferred_until = NEVER
             self._owner.let_go(self, now)
-        elif self._deferred_until == NEVER:
+        elif self._deferred_until == NEVER and not settings.plan.paced:
             self._deferred_until = until
         self._set_due()
 
@@ -165,22 +182,43 @@ class PythonSlot:
         self.news(now)
         self._set_due()
 
-    def frame(self, now: int) -> CanFrame | None:
-        """The frame that is handed over now; None while it needs live data and there is none."""
+    def frames(self, now: int) -> list[CanFrame]:
+        """What is handed over now; nothing while it needs live data and there is none."""
         settings, escs = self._settings, self._escs
         assert settings is not None
         plan = settings.plan
+        if plan.paced and not self._is_known(plan):
+            self._last_ns, self._timer_due = -NEVER, NEVER
+            self._set_due()
+            return []
         if plan.needs_live and escs[0].live is None:
-            return None
+            return []
         self.is_news = False
-        self._last_ns = now
+        self._last_ns = self._moment(settings, now) if plan.paced else now
         self._deferred_until = NEVER
-        self._restart_timer(settings, now)
+        self._restart_timer(settings, self._last_ns)
         self._set_due()
-        bits = plan.pack(escs, self._owner.status, now, 0, 0)
+        bits = plan.pack(escs, self._owner.status, now, 0, 0) | settings.fill
         self._last_watched = bits & plan.watched
         self.sent += 1
-        return CanFrame(settings.can_id, bits.to_bytes(plan.message.length, "little"))
+        data = bits.to_bytes(plan.message.length, "little")
+        if plan.seed is None:
+            return [CanFrame(settings.can_id, data, page=settings.page)]
+        first = self._owner.first_of(settings.can_id)
+        number, first.transfer_id = first.transfer_id, first.transfer_id + 1 & TRANSFER_ID
+        return transfer(settings.can_id, plan.seed, data, number, page=settings.page)
+
+    def _is_known(self, plan: SlotPlan) -> bool:
+        source, esc = plan.message.signals[0].source, self._escs[0]
+        assert source is not None
+        found = steps(source, esc, self._owner.status, 0)
+        return found is not None and divisor(source, esc) is not None
+
+    def _moment(self, settings: SlotSettings, now: int) -> int:
+        """When a paced frame that goes now was to go: from there on its pace is kept, unless it was lost."""
+        period = (settings.inhibit_ns + settings.timer_ns) // 2
+        planned = self._last_ns + period
+        return planned if planned - period < now < planned + period else now
 
     def _restart_timer(self, settings: SlotSettings, now: int) -> None:
         runs = settings.timer_ns and settings.by_event
@@ -226,6 +264,10 @@ class Slots:
         self._of[esc].append(slot)
         return slot
 
+    def first_of(self, can_id: int) -> PythonSlot:
+        """The slot that numbers the transfers of an id."""
+        return next(slot for slot in self._slots if slot.can_id == can_id)
+
     @property
     def triggers(self) -> int:
         """The events that ``on_event`` is to be given."""
@@ -244,8 +286,8 @@ class Slots:
         """Let a slot be handed over."""
         if not self._packs_at_once:
             self.pending.setdefault(slot.number, now)
-        elif (frame := slot.frame(now)) is not None:
-            self._packed.append(frame)
+        else:
+            self._packed += slot.frames(now)
 
     def next_deadline(self) -> int:
         """When ``advance`` has something to do."""
@@ -275,6 +317,5 @@ class Slots:
         if self.pending:
             pending, self.pending = self.pending, {}
             for number, _ in sorted(pending.items(), key=itemgetter(1, 0)):
-                if (frame := self._slots[number].frame(now)) is not None:
-                    frames.append(frame)
+                frames += self._slots[number].frames(now)
         return frames

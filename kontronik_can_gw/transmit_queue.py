@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from enum import Enum
 from operator import itemgetter
 
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import FIRST_PART, PARTS, CanFrame
 
 QUEUE_LENGTH = 2048
 _place = CanFrame._fields.index
@@ -37,7 +37,7 @@ class TransmitQueue:
         self._queue: deque[CanFrame] = deque()
         self._queue_has_turn = True
         self.replaced = 0
-        """Frames of slots that were overtaken by a newer one of their id, or cleared; its owner may set it back to 0."""
+        """Frames of slots that gave way to a newer one of their id or to an older transfer, or cleared; its owner may set it back to 0."""
         self.dropped = 0
         """Queued frames that were lost: the queue was full, or cleared; likewise."""
 
@@ -56,10 +56,21 @@ class TransmitQueue:
             frames = [frame for frame in frames if not frame.queued]
         slots = self._slots
         count = len(slots) + len(frames)
+        if slots:
+            frames = [frame for frame in frames if not self._has_begun(frame)]
         slots.update(zip(map(_slot_of, frames), frames, strict=True))
         replaced = count - len(slots)
         self.replaced += replaced
         return replaced + dropped
+
+    def _has_begun(self, frame: CanFrame) -> bool:
+        """True for a part of a transfer while an older one is on its way: its first frame is gone, others wait. It ends as it began."""
+        can_id, _, extended, _, page, _, _ = frame
+        if page < FIRST_PART:
+            return False
+        first = page - (page - FIRST_PART) % PARTS
+        waiting = [(can_id, extended, first + part) in self._slots for part in range(PARTS)]
+        return any(waiting) and not waiting[0]
 
     def in_order(self) -> list[CanFrame]:
         """All that wait, in the order in which they are to be sent."""

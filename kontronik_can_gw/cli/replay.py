@@ -16,12 +16,11 @@ from kontronik_can_gw.desk.recordings.pacing import Pace
 from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import CanFrame, id_block
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.locks import Locks, ids_lock, in_use, messages_lock, node_lock
+from kontronik_can_gw.runtime.id_locks import names_of
+from kontronik_can_gw.runtime.locks import Locks, in_use
 from kontronik_can_gw.runtime.open_can import check_interface, open_can
-from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.transmit_queue import Sent
 
 _DRAIN_S = 0.2
@@ -128,17 +127,8 @@ def _bus(args: argparse.Namespace, recording: PlayedInput, fd: bool) -> CanConfi
 
 def _hold(locks: Locks, channel: str, recording: PlayedInput) -> None:
     """Lock messages and nodes against a gateway that sends the same. RunError where one does."""
-    keys = sorted(SignalReader(recording.sent_layout).keys)
-    names = [messages_lock(channel, key) for key in keys[:1]]
-    if recording.setup.canopen is not None:
-        for node in recording.setup.canopen.settings:
-            if node.node_id != UNCONFIGURED:
-                names.append(node_lock(channel, node.node_id))
-    for output in recording.setup.outputs:
-        # without the bits of a node-ID that an allocator gives
-        blocks = [key for key in output.taken_ids() if key >> 32 and key != id_block(0, 0)]
-        names += [ids_lock(channel, key) for key in blocks]
-    for taken in locks.hold(names):
+    gateway = recording.setup.gateway(recording.sent_layout, recording.created_ns)
+    for taken in locks.hold(names_of(gateway, channel)):
         raise in_use(taken)
 
 

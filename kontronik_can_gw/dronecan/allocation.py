@@ -4,11 +4,12 @@ The unique id goes out in three anonymous requests, each after the allocator has
 that hears another's request begins anew, later. Random numbers come from a seed, so that a replay asks at the same moments.
 """
 
-from kontronik_can_gw.dronecan.transport import LOW, MAX_NODE_ID, anonymous_id, transfer
+from kontronik_can_gw.dronecan.transport import LOW, MAX_NODE_ID, anonymous_id
 from kontronik_can_gw.dronecan.types import ALLOCATION
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.output import NEVER
+from kontronik_can_gw.signals.transfer import transfer
 
 _PERIOD_MS, _MORE_MS, _FOLLOW_UP_MS = 600, 401, 401
 _PART = 6
@@ -41,7 +42,7 @@ class Allocation:
         can_id = anonymous_id(ALLOCATION.number, self._random(1 << 14), LOW)
         self._begin_anew(now)  # without an answer
         payload = ALLOCATION.pack(first) + part
-        return transfer(can_id, ALLOCATION.seed, payload, self._transfer_id, False)
+        return transfer(can_id, ALLOCATION.seed, payload, self._transfer_id)
 
     def receive(self, source: int, payload: bytes, taken: set[int], now: int) -> int | None:
         """Take an Allocation message of a node, 0: of another that asks. Returns the node-ID that was allocated to us.

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.dronecan.esc_report import EscReport
-from kontronik_can_gw.dronecan.transport import LOW, TRANSFER_ID, message_id, response_id, transfer
+from kontronik_can_gw.dronecan.transport import LOW, message_id, response_id
 from kontronik_can_gw.dronecan.types import GET_NODE_INFO, GET_SET, RESTART_NODE, DataType
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
 
 if TYPE_CHECKING:
     from kontronik_can_gw.dronecan.setup import DronecanSetup, NodeSetup
@@ -36,20 +37,19 @@ class Node:
         self._version = of_all.given.version
         self._transfer_ids: dict[int, int] = {}
 
+    def start(self, now: int) -> None:
+        """It has its node-ID: let the core send what its ESCs measure."""
+        for place, report in enumerate(self.reports):
+            report.start(self.node_id, place, now)
+
     def message(
-        self,
-        kind: DataType,
-        payload: bytes,
-        page: int = 0,
-        queued: bool = False,
-        priority: int = LOW,
+        self, kind: DataType, payload: bytes, queued: bool = False, priority: int = LOW
     ) -> list[CanFrame]:
-        """The frames of a message to all. ``queued`` and ``page`` as in CanFrame."""
-        number, seed, _ = kind
-        count = self._transfer_ids.get(number, 0)
-        self._transfer_ids[number] = count + 1 & TRANSFER_ID
-        can_id = message_id(number, self.node_id, priority)
-        return transfer(can_id, seed, payload, count, queued, page)
+        """The frames of a message to all. ``queued`` as in CanFrame."""
+        count = self._transfer_ids.get(kind.number, 0)
+        self._transfer_ids[kind.number] = count + 1 & TRANSFER_ID
+        can_id = message_id(kind.number, self.node_id, priority)
+        return transfer(can_id, kind.seed, payload, count, queued)
 
     def status(self, uptime_s: int, mode: int, bus_is_well: bool) -> bytes:
         """NodeStatus. The ESCs' health counts by choice only: an autopilot does not arm beside a node that is not well."""

@@ -7,36 +7,21 @@ from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.dronecan.allocation import Allocation
 from kontronik_can_gw.dronecan.esc_report import EscReport
 from kontronik_can_gw.dronecan.node import SERVICES, Node
-from kontronik_can_gw.dronecan.transport import (
-    LOWEST,
-    NODE,
-    REQUEST,
-    SERVICE,
-    TRANSFER_ID,
-    Assembler,
-)
+from kontronik_can_gw.dronecan.transport import LOWEST, NODE, REQUEST, SERVICE, Assembler
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.output import NEVER, Output, Owner
+from kontronik_can_gw.signals.transfer import TRANSFER_ID
+from kontronik_can_gw.slots import Slot
 
 if TYPE_CHECKING:
     from kontronik_can_gw.dronecan.setup import DronecanSetup
 
 MAX_ANSWERS = 50
 """Requests that are answered in a second: nobody keeps the bus busy by asking."""
-_LOG_HZ = 2
 _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
 """Ids of Allocation messages: of an allocator, of others that ask."""
-
-
-class _Task:
-    """What is done at an interval."""
-
-    def __init__(self, period_ns: int, do: Callable[[int], None]) -> None:
-        self.due = NEVER
-        self.period_ns = period_ns
-        self.do = do
 
 
 class Dronecan(Output):
@@ -50,33 +35,33 @@ class Dronecan(Output):
     ) -> None:
         super().__init__()
         self._gateway = gateway
-        table = setup.given.table
+        self._table = table = setup.given.table
         self._reports = [
-            EscReport(esc, table.first_index + number, table.rpm) for number, esc in enumerate(escs)
+            EscReport(esc, table.first_index + number, table) for number, esc in enumerate(escs)
         ]
         self._nodes = [Node(each, setup, self._reports) for each in setup.nodes]
         self._by_id: dict[int, Node] = {}
         self._allocation = Allocation(setup.given.seed)
         self._assembler = Assembler()
-        self._status_sent = self._answered = self._unanswered = self._answers = 0
-        rates = (
-            *((1, self._say_second), (table.rate_hz, self._say_status)),
-            *(
-                (table.extended_hz, self._say_extended),
-                (_LOG_HZ * table.log_messages, self._say_log),
-            ),
-        )
-        self._tasks = [_Task(SECOND // hertz, do) for hertz, do in rates if hertz]
-        self._due = NEVER
+        self._answered = self._unanswered = self._answers = 0
+        self._second_due = NEVER
         self._follow_ids()
 
     # --- what happens
 
+    def take_slots(self, slot: Callable[[int], Slot]) -> None:
+        for number, report in enumerate(self._reports):
+            report.take_slots(slot, number)
+
     def start(self, now: int, can_open: bool) -> None:
         self.make_anew(now)
+        for node in self._by_id.values():
+            node.start(now)
         self._ask(now)
 
     def stop(self, now: int) -> None:
+        for report in self._reports:
+            report.stop()
         for node in self._by_id.values():
             self._say_node_status(node, now, types.OFFLINE)
 
@@ -89,33 +74,23 @@ class Dronecan(Output):
             self._log_anew()
 
     def make_anew(self, now: int) -> None:
-        for task in self._tasks:
-            task.due = now
-        self._set_due()
+        self._second_due = now
 
     def next_deadline(self) -> int:
-        return self._due
+        return min(self._second_due, self._allocation.due)
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        self._reports[esc].follow(events)
+        self._reports[esc].follow(events, now)
 
     def collision(self, esc: int, present: bool, now: int) -> None:
         self._nodes[esc].is_duplicate = present
 
     def advance(self, now: int) -> None:
-        if now < self._due:
-            return
         if now >= self._allocation.due:
             self.frames += self._allocation.advance(now)
-        due = self._allocation.due
-        for task in self._tasks:
-            if now >= task.due:
-                late = now - task.due >= task.period_ns  # none is made up for
-                task.due = (now if late else task.due) + task.period_ns
-                task.do(now)
-            if task.due < due:
-                due = task.due
-        self._due = due
+        if now >= (due := self._second_due):
+            self._second_due = SECOND + (now if now - due >= SECOND else due)  # none is made up for
+            self._say_second(now)
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
         if not frame.extended or frame.remote or frame.fd:
@@ -162,7 +137,7 @@ class Dronecan(Output):
         return {
             "lines": lines,
             "nodes": nodes,
-            "status_sent": self._status_sent,
+            "status_sent": sum(report.status_sent for report in self._reports),
             "requests_answered": self._answered,
             "requests_unanswered": self._unanswered,
             "transfer_errors": self._assembler.errors,
@@ -171,31 +146,13 @@ class Dronecan(Output):
 
     # --- what is said
 
-    def _say_status(self, now: int) -> None:
-        for node in self._by_id.values():
-            for place, report in enumerate(node.reports):
-                if (payload := report.status()) is not None:
-                    self._status_sent += 1
-                    self.frames += node.message(types.STATUS, payload, 3 * place)
-
-    def _say_extended(self, now: int) -> None:
-        for node in self._by_id.values():
-            for place, report in enumerate(node.reports):
-                if (payload := report.status_extended()) is not None:
-                    self.frames += node.message(types.STATUS_EXTENDED, payload, place)
-
     def _say_second(self, now: int) -> None:
         self._answers = 0
+        for report in self._reports:
+            report.follow(0, now)
         for node in self._by_id.values():
             self._say_node_status(node, now)
-            for place, report in enumerate(node.reports):
-                if (found := report.bec()) is not None:
-                    self.frames += node.message(types.CIRCUIT_STATUS, found[0], place)
-                    self.frames += node.message(types.TEMPERATURE, found[1], place)
-
-    def _say_log(self, now: int) -> None:
-        for node in self._by_id.values():
-            for report in node.reports:
+            for report in node.reports if self._table.log_messages else ():
                 for message in report.log(now):
                     self.frames += node.message(types.LOG_MESSAGE, message, queued=True)
 
@@ -218,7 +175,6 @@ class Dronecan(Output):
         waiting = [node.setup.unique_id for node in self._nodes if not node.node_id]
         self._allocation.ask(waiting[0] if waiting else b"", now)
         self._follow_ids()
-        self._set_due()
 
     def _take_allocation(self, frame: CanFrame, source: int, now: int) -> None:
         payload = self._assembler.receive(frame.can_id, frame.data, types.ALLOCATION.seed, now)
@@ -230,9 +186,9 @@ class Dronecan(Output):
             node.node_id = node_id
             self.news.append(f"DroneCAN node {node.setup.name}: has node-ID {node_id}")
             self.state_changes += 1
-            self._tasks[0].due = now  # it says that it is there
+            self._second_due = now  # it says that it is there
+            node.start(now)
             self._ask(now)
-        self._set_due()
 
     def _follow_ids(self) -> None:
         """Receive what is for the nodes as they are now; make the ids of the bus anew."""
@@ -242,6 +198,3 @@ class Dronecan(Output):
         blocks = frozenset(id_block(requests | node_id << 8, mask) for node_id in self._by_id)
         is_waiting = len(self._by_id) < len(self._nodes)
         self.receive_ids = blocks | _ALLOCATIONS if is_waiting else blocks
-
-    def _set_due(self) -> None:
-        self._due = min([self._allocation.due, *[task.due for task in self._tasks]])

@@ -67,8 +67,8 @@ class Handle:
         self._on_event = on_event
         self.pages = tables.pages
         arrays = {name: self._array(*table) for name, table in tables.arrays.items()}
-        self.messages, self.signals, self.pieces = (
-            arrays[name] for name in ("message", "signal", "piece")
+        self.messages, self.signals, self.pieces, self.constants = (
+            arrays[name] for name in ("message", "signal", "piece", "constant")
         )
         self.watched = self._array(c.c_uint64, tables.watched)
         self._kept = [*arrays.values(), self.watched]

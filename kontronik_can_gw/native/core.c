@@ -500,6 +500,24 @@ static double quotient(int64_t n, int64_t d)
     return (double)(q | (rest != 0)) * unit;
 }
 
+#if KCG_SLOTS
+/* A float of 16 bits, to the nearest, halves to the even one; |v| <= 65504. */
+static uint64_t half_bits(double v)
+{
+    uint64_t b, sign, rest, middle;
+    memcpy(&b, &v, sizeof b);
+    int exponent = (int)(b >> 52 & 2047) - 1023, drop = exponent < -14 ? 28 - exponent : 42;
+    sign = b >> 48 & 0x8000;
+    if (exponent < -25)
+        return sign;
+    b = (b & ((UINT64_C(1) << 52) - 1)) | UINT64_C(1) << 52;
+    rest = b & ((UINT64_C(1) << drop) - 1), middle = UINT64_C(1) << (drop - 1);
+    b >>= drop;
+    b += rest > middle || (rest == middle && b & 1);
+    return sign | (b + (exponent < -14 ? 0 : (uint64_t)(exponent + 14) << 10)); /* one bit is that of the exponent */
+}
+#endif
+
 static uint64_t float_bits(const kcg_signal *s, double v)
 {
     double low, high;
@@ -515,6 +533,10 @@ static uint64_t float_bits(const kcg_signal *s, double v)
         if ((word & 0x7F800000u) == 0x7F800000u && v - v == 0.0)
             return s->error; /* finite, but too large for 32 bits */
         bits = word;
+#if KCG_SLOTS
+    } else if (s->length == 16) {
+        bits = half_bits(v);
+#endif
     } else {
         memcpy(&bits, &v, sizeof bits);
     }
@@ -752,7 +774,8 @@ static void slot_news(kcg *g, uint32_t i, int64_t now)
     if (!(g->plan->message[i].flags & KCG_EVENT) || s->why)
         return;
     if (!may_go(g, i, now)) {
-        defer(g, i, s->last + g->plan->message[i].delay);
+        if (!(g->plan->message[i].flags & KCG_PACED))
+            defer(g, i, s->last + g->plan->message[i].delay);
         return;
     }
     if (s->deferred != KCG_NEVER)
@@ -798,13 +821,33 @@ static void slot_due(kcg *g, uint32_t i, int64_t now)
 
 static void slot_sent(kcg *g, uint32_t i, int64_t now)
 {
+    const kcg_message *m = &g->plan->message[i];
     kcg_sending *s = &g->sending[i];
-    g->last[g->plan->message[i].first_word + 1]++;
+    int64_t period = (m->delay + m->cycle) / 2, planned = s->last + period;
+    g->last[m->first_word + 1]++;
     s->page &= STARTED | SEEN;
     s->why = 0;
-    s->last = now;
+    s->last = m->flags & KCG_PACED && planned - period < now && now < planned + period ? planned : now;
     s->deferred = KCG_NEVER;
-    restart_timer(g, i, now);
+    restart_timer(g, i, s->last);
+}
+
+/* Whether a paced slot rests; then it goes with the first event after that. */
+static int slot_rests(kcg *g, uint32_t i, int64_t now)
+{
+    const kcg_message *m = &g->plan->message[i];
+    int64_t x, by, over;
+    if (!(m->flags & KCG_PACED) || value_of(g, g->plan->signal + m->first_signal, now, &x, &by, &over))
+        return 0;
+    g->sending[i].last = LONG_AGO, g->sending[i].cycle_due = KCG_NEVER;
+    moved(g, i);
+    return 1;
+}
+
+/* The frames of a message. */
+static uint32_t parts_of(const kcg_message *m)
+{
+    return KCG_SLOTS && m->flags & KCG_TRANSFER && m->length > 7 ? (m->length + 8u) / 7 : 1;
 }
 
 #if KCG_SLOTS
@@ -861,6 +904,40 @@ int kcg_slot_is_news(const kcg *g, uint32_t slot)
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot)
 {
     return g->last[g->plan->message[g->plan->messages + slot].first_word + 1];
+}
+
+static uint32_t crc_16(uint32_t crc, const uint8_t *data, size_t size) /* CCITT */
+{
+    for (; size; data++, size--) {
+        crc ^= (uint32_t)*data << 8;
+        for (int k = 0; k < 8; k++)
+            crc = crc << 1 ^ (crc & 0x8000 ? 0x11021u : 0);
+    }
+    return crc & 0xFFFF;
+}
+
+/* The frames of a transfer (twin: signals/transfer.py), of which the first holds the bare payload. */
+static void make_transfer(kcg *g, const kcg_message *m, kcg_frame *f)
+{
+    uint8_t data[2 + WORDS * 8], *rest = data + 2;
+    uint32_t parts = parts_of(m), size = m->length, first = g->plan->messages;
+    while (g->plan->message[first].id != m->id)
+        first++;
+    uint32_t number = g->sending[first].alive++ & 31u;
+    memcpy(rest, f->data, size);
+    if (parts > 1) {
+        uint32_t crc = crc_16(m->data_id, rest, size);
+        data[0] = (uint8_t)crc, data[1] = (uint8_t)(crc >> 8);
+        rest = data, size += 2;
+    }
+    for (uint32_t k = 0; k < parts; k++, f++) {
+        uint32_t length = size < 7 ? size : 7;
+        memset(f, 0, sizeof *f);
+        f->id = m->id, f->length = (uint8_t)(length + 1), f->page = (uint8_t)(m->crc_at + k);
+        memcpy(f->data, rest, length);
+        f->data[length] = (uint8_t)(number | (k ? 0 : 0x80) | (k + 1 < parts ? 0 : 0x40) | (k & 1 ? 0x20 : 0));
+        rest += length, size -= length;
+    }
 }
 #endif
 
@@ -1003,12 +1080,16 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     if (is_slot(g, i))
         watched_changed(g, i, bits);
     memset(f, 0, sizeof *f);
-    f->page = (uint8_t)place;
+    f->page = is_slot(g, i) ? m->crc_at : (uint8_t)place;
     f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
     for (int k = 0; k < (int)WORDS_OF(m); k++) /* beyond the length they are 0 */
         put_u64(f->data + k * 8, bits[k]);
     if (KCG_E2E && m->flags & KCG_HAS_CRC)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
+#if KCG_SLOTS
+    if (m->flags & KCG_TRANSFER)
+        make_transfer(g, m, f);
+#endif
 }
 
 static int goes_before(const kcg *g, uint32_t i, uint32_t other)
@@ -1048,7 +1129,9 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
         const kcg_message *m = &g->plan->message[i];
         kcg_sending *s = &g->sending[i];
         int why = s->why;
-        if (is_silent(g, m)) {
+        if (g->taken + parts_of(m) > max)
+            break;
+        if (is_silent(g, m) || (is_slot(g, i) && slot_rests(g, i, now))) {
             for (int place = 0; place < PAGES_OF(m); place++)
                 g->page[m->first_page + place] &= KNOWN;
             s->pages_to_send = 0;
@@ -1060,7 +1143,8 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
             s->why = 0;
             continue;
         }
-        make_frame(g, i, now, &frames[g->taken++]);
+        make_frame(g, i, now, &frames[g->taken]);
+        g->taken += parts_of(m);
         g->pending[kept++] = (uint16_t)i;
         if (KCG_PAGED && g->stopping && s->pages_to_send > 1) {
             k++; /* its other pages go next */
@@ -1073,11 +1157,12 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
 
 void kcg_sent(kcg *g, int64_t now, uint32_t count)
 {
-    uint32_t kept = 0;
-    for (uint32_t k = 0; k < count; k++) {
+    uint32_t kept = 0, k = 0;
+    for (uint32_t parts = 0; parts < count; k++) {
         uint32_t i = g->pending[k];
         const kcg_message *m = &g->plan->message[i];
         kcg_sending *s = &g->sending[i];
+        parts += parts_of(m);
         if (is_slot(g, i)) {
             slot_sent(g, i, now);
             continue;
@@ -1107,7 +1192,7 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
                 defer(g, i, now + (m->delay > MIN_DISTANCE ? m->delay : MIN_DISTANCE));
         }
     }
-    keep_pending(g, kept, count);
+    keep_pending(g, kept, k);
     g->taken = 0;
 }
 

@@ -79,7 +79,8 @@ enum {
     KCG_N_LINK_STATE = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE_FRAMES, KCG_N_INFO_FRAMES, KCG_N_DROPPED_BYTES /* states, sums */
 };
 enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16, KCG_DIRECT = 32 }; /* of a signal; DIRECT: of live data, with no divisor, from every device */
-enum { KCG_EVENT = 1, KCG_ON_CHANGE = 2, KCG_SILENT = 4, KCG_HAS_CRC = 8, KCG_OF_THE_GATEWAY = 16, KCG_FREE = 32 }; /* of a message */
+enum { KCG_EVENT = 1, KCG_ON_CHANGE = 2, KCG_SILENT = 4, KCG_HAS_CRC = 8, KCG_OF_THE_GATEWAY = 16, KCG_FREE = 32, KCG_TRANSFER = 64, KCG_PACED = 128 }; /* of a message; the last two of a slot */
+enum { KCG_FIRST_PART = KCG_PAGES, KCG_PARTS = 3 }; /* pages of frames: each so many from the first one on are of one transfer */
 
 typedef struct { uint8_t shift, width; uint16_t at; } kcg_piece; /* (raw >> shift & mask of width) << at; within 64 bits of the frame */
 typedef struct { int64_t number; uint64_t raw; } kcg_pair;       /* of an enumeration */
@@ -95,7 +96,8 @@ typedef struct {
 typedef struct {
     uint32_t id;
     uint8_t length, words, flags, triggers, pages, crc_at, escs, fd_flags;
-    uint16_t first_signal, signals, data_id, first_page, last_alive; /* first_page: of all pages of all messages; last_alive: of the alive counter, which begins at 0 */
+    uint16_t first_signal, signals, data_id, first_page, last_alive; /* first_page: of all pages of all messages; last_alive: of the alive counter, which begins at 0;
+                                                                    of a slot crc_at: its frame's page, data_id: what the CRC of a transfer begins with */
     uint32_t first_word;                                         /* of the constants: `words` for each page */
     uint32_t first_esc;                                          /* `escs` whose values it holds: kcg_plan.esc_of */
     int64_t cycle, delay, phase;
@@ -131,7 +133,7 @@ typedef struct { /* what is read most comes first: a small machine's instruction
 } kcg_esc;
 
 typedef struct {
-    uint16_t place_in_heap, alive;
+    uint16_t place_in_heap, alive;             /* alive: of the first slot of a transfer's id the number of the next one */
     uint8_t page, pages_to_send, cycle_deferred, why; /* page: of a slot its state */
     int64_t last, cycle_due, deferred, since;  /* KCG_NEVER: no cycle, nothing deferred */
 } kcg_sending;
@@ -177,11 +179,12 @@ void kcg_apply(kcg *g, int esc, const kcg_settings *settings);
 void kcg_gateway_changed(kcg *g, int each_second, int64_t now);
 void kcg_repeat(kcg *g, int64_t now);
 void kcg_stop(kcg *g, int64_t now);
-/* Frames of what is pending, in their order, `max` at most; they stay pending until kcg_sent says how many of them were taken. */
+/* Frames of what is pending, in their order, `max` (with transfers 3 or more) at most; they stay pending until kcg_sent says how many of
+   them were taken: of a transfer of which some were not, the rest is not sent. */
 uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
-/* Slots (twin: slots.py): messages of one page, ESC and 8 bytes, with KCG_SLOTS, that their owner starts and stops; `cycle` runs from frame to
-   frame. The owner may write a slot's rows of `message`, `signal` and `piece` whenever it is stopped; while it is started, all but the
+/* Slots (twin: slots.py): messages of one page, ESC and 8 bytes (of a transfer 16, with KCG_DATA 64), with KCG_SLOTS, that their owner starts
+   and stops; `cycle` runs from frame to frame. The owner may write a slot's rows of `message`, `signal` and `piece` whenever it is stopped; while it is started, all but the
    signals, and then calls kcg_slot_changed. */
 void kcg_slot_start(kcg *g, uint32_t slot, int64_t now);
 void kcg_slot_changed(kcg *g, uint32_t slot, int64_t now);

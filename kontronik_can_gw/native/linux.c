@@ -112,13 +112,34 @@ static void watch_room(kcg_turns *t, int is_full)
     t->is_full = (uint32_t)is_full;
 }
 
+/* The place of what waits of an id and page; all that waits where there is none. */
+static uint32_t place_of(const kcg_turns *t, uint32_t id, uint32_t page)
+{
+    uint32_t i = t->spoken;
+    while (i < t->unsent && (t->frames[i].id != id || t->frames[i].page != page))
+        i++;
+    return i;
+}
+
+/* Whether an older transfer than this part's is on its way: its first frame is gone, others wait. It ends as it began. */
+static int has_begun(const kcg_turns *t, const kcg_frame *made)
+{
+    uint32_t first = made->page - (made->page - (uint32_t)KCG_FIRST_PART) % KCG_PARTS, waiting = 0;
+    if (made->page < KCG_FIRST_PART || place_of(t, made->id, first) < t->unsent)
+        return 0;
+    for (uint32_t k = 1; k < KCG_PARTS; k++)
+        waiting += place_of(t, made->id, first + k) < t->unsent;
+    return waiting > 0;
+}
+
 /* Let a frame wait: in the place of an older one of its id and page. */
 static void put(kcg_turns *t, const kcg_frame *made)
 {
-    uint32_t i = t->spoken;
-    while (i < t->unsent && (t->frames[i].id != made->id || t->frames[i].page != made->page))
-        i++;
-    t->core->gateway[KCG_REPLACED_FRAMES] += i < t->unsent;
+    uint32_t i = place_of(t, made->id, made->page);
+    int is_late = has_begun(t, made);
+    t->core->gateway[KCG_REPLACED_FRAMES] += is_late || i < t->unsent;
+    if (is_late)
+        return;
     t->unsent += i == t->unsent;
     t->frames[i] = *made;
 }

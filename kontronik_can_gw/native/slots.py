@@ -5,9 +5,10 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
-from kontronik_can_gw.native.tables import EVENT, MAX_ROWS, SILENT, Tables
+from kontronik_can_gw.native.tables import EVENT, MAX_ROWS, PACED, SILENT, TRANSFER, Tables
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import PythonSlot, SlotPlan, SlotSettings
 
@@ -15,6 +16,7 @@ MAX_SIGNALS = 8
 """Of a slot."""
 _MAX_PLANS = 256
 """Kept."""
+_WORD = (1 << 64) - 1
 
 
 class Place(NamedTuple):
@@ -170,8 +172,14 @@ class NativeSlot:
             handle.pieces[place.piece + number] = row
         handle.watched[place.number] = plan.watched
         message: Any = handle.messages[place.message]
-        message.id, message.length = settings.can_id, plan.message.length
+        is_transfer, length = plan.seed is not None, plan.message.length
+        message.id = settings.can_id | EXTENDED * is_transfer
+        message.length, message.words = length, 1 + (length > 8)
+        message.crc_at, message.data_id = settings.page, plan.seed or 0
+        for word in range(2):
+            handle.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
         message.flags = EVENT * settings.by_event | SILENT * plan.needs_live
+        message.flags |= TRANSFER * is_transfer | PACED * plan.paced
         message.triggers, message.signals = plan.triggers, len(rows.signals)
         message.cycle, message.delay = settings.timer_ns, settings.inhibit_ns
         return True

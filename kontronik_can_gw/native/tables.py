@@ -41,7 +41,9 @@ from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
 ROLLS, CODE_AMID, PLAIN, TABLE, REAL, DIRECT = 1, 2, 4, 8, 16, 32
-EVENT, ON_CHANGE, SILENT, HAS_CRC, OF_THE_GATEWAY, FREE = 1, 2, 4, 8, 16, 32
+EVENT, ON_CHANGE, SILENT, HAS_CRC, OF_THE_GATEWAY, FREE, TRANSFER, PACED = (
+    1 << n for n in range(8)
+)
 ALL_PAGES = 64
 ALL_ESCS = 255
 MAX_COUNT = 1 << 48

@@ -9,6 +9,18 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.locks import Locks, ids_lock, in_use, messages_lock, node_lock
 
 
+def names_of(gateway: Gateway, channel: str) -> list[str]:
+    """The names of the locks on the ids that a gateway has now."""
+    names = [
+        node_lock(channel, node_id)
+        for node_id, _, _ in gateway.node_states()
+        if node_id != UNCONFIGURED
+    ]
+    if (first := gateway.conflicts.first_own_id()) is not None:
+        names.append(messages_lock(channel, first))
+    return names + [ids_lock(channel, block) for block in gateway.conflicts.own_blocks()]
+
+
 class IdLocks:
     """The locks on the ids of a gateway. A virtual interface is in this process only: it needs none."""
 
@@ -23,15 +35,7 @@ class IdLocks:
         """Lock what the gateway has now. RunError ``at_start`` where another gateway has it; later that is logged, and tried again."""
         if self._config.interface == "virtual":
             return
-        channel = self._config.channel
-        names = [
-            node_lock(channel, node_id)
-            for node_id, _, _ in self._gateway.node_states()
-            if node_id != UNCONFIGURED
-        ]
-        if (first := self._gateway.conflicts.first_own_id()) is not None:
-            names.append(messages_lock(channel, first))
-        names += [ids_lock(channel, block) for block in self._gateway.conflicts.own_blocks()]
+        names = names_of(self._gateway, self._config.channel)
         if names == self._names:
             return
         all_taken = self._locks.hold(names)

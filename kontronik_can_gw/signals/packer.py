@@ -22,6 +22,7 @@ Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
 MakeFrame = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], CanFrame]
 """The same to the frame with its CRC."""
 _Raw = Callable[[Sequence[EscTelemetry], GatewayStatus, int], int]
+_FLOATS = {16: "<e", 32: "<f", 64: "<d"}
 
 
 def place(pieces: Sequence[Piece], raw: int) -> int:
@@ -179,9 +180,9 @@ def ratio(numerator: int, denominator: int) -> float:
 
 
 def float_bits(number: float | Fraction, length: int) -> int | None:
-    """The IEEE 754 bits of a float of 32 or 64 bits; None where it is too large."""
+    """The IEEE 754 bits of a float of 16, 32 or 64 bits; None where it is too large."""
     try:
-        packed = struct.pack("<f" if length == 32 else "<d", float(number))
+        packed = struct.pack(_FLOATS[length], float(number))
     except OverflowError:
         return None
     return int.from_bytes(packed, "little")
@@ -190,5 +191,5 @@ def float_bits(number: float | Fraction, length: int) -> int | None:
 def float_of(bits: int, length: int) -> float:
     """The number that IEEE 754 bits hold."""
     number: float
-    (number,) = struct.unpack("<f" if length == 32 else "<d", bits.to_bytes(length // 8, "little"))
+    (number,) = struct.unpack(_FLOATS[length], bits.to_bytes(length // 8, "little"))
     return number

@@ -71,6 +71,7 @@ class Reader:
 
     def __init__(self) -> None:
         self._begun: dict[int, list[Any]] = {}
+        self._numbers: dict[int, int] = {}
 
     def read(self, at: int, frame: CanFrame) -> Transfer | None:
         """The transfer that this frame completes; AssertionError where it is invalid."""
@@ -79,6 +80,12 @@ class Reader:
         frames = self._begun.setdefault(frame.can_id, [])
         if frame.data[-1] & 0x80:
             frames.clear()
+            number = frame.data[-1] & 0x1F
+            if (
+                not frame.can_id & 0x80
+            ):  # of a message: with the same one it would be taken for one that comes twice
+                assert number != self._numbers.get(frame.can_id)
+            self._numbers[frame.can_id] = number
         frames.append(transport.Frame(frame.can_id, frame.data, ts_monotonic=1.0))
         if not frame.data[-1] & 0x40:
             return None
@@ -114,8 +121,11 @@ class Bench:
 
     def info(self, esc: int, device: Device) -> None:
         """An info frame of this device."""
-        wire = encode(InfoData(device_and_variant=device_and_variant(device, 1)), codec.Layout.V4)
-        self.gateway.receive_bytes(esc, wire, self.now, self.now)
+        self.hear(InfoData(device_and_variant=device_and_variant(device, 1)), esc)
+
+    def hear(self, data: LiveData | InfoData, esc: int = 0) -> None:
+        """A frame of an ESC."""
+        self.gateway.receive_bytes(esc, encode(data, codec.Layout.V4), self.now, self.now)
 
     def take(self) -> None:
         for frame in self.gateway.take_frames(self.now):
@@ -136,8 +146,7 @@ class Bench:
             self.now = following
             for esc, live in enumerate(self.live):
                 if live is not None and following % (10 * MS) == START % (10 * MS):
-                    wire = encode(live, codec.Layout.V4)
-                    self.gateway.receive_bytes(esc, wire, self.now, self.now)
+                    self.hear(live, esc)
             self.gateway.advance(self.now)
             self.take()
         return self

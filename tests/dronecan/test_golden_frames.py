@@ -1,21 +1,27 @@
 """Frames and types byte by byte: golden ones, and random ones as the package ``dronecan`` makes and reads them."""
 
-import math
 import random
 import struct
+from typing import Any
 
 import pytest
 from dronecan_bench import Reader, dronecan, peers_frames
+from packer_oracle import random_live
 
+from kontronik_can_gw.core import PythonCore
 from kontronik_can_gw.dronecan import types
-from kontronik_can_gw.dronecan.transport import (
-    Assembler,
-    message_id,
-    response_id,
-    transfer,
-)
+from kontronik_can_gw.dronecan.measured import fill, plans_of
+from kontronik_can_gw.dronecan.transport import Assembler, message_id, response_id
 from kontronik_can_gw.dronecan.types import DataType
+from kontronik_can_gw.esc.kontronik import LiveData, encode
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.native.load import make_core
+from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.transfer import transfer
+from kontronik_can_gw.slots import SlotSettings
 
 equipment, protocol = dronecan.uavcan.equipment, dronecan.uavcan.protocol
 UNIQUE_ID = bytes(range(1, 17))
@@ -29,29 +35,57 @@ def shown(frames: list[CanFrame]) -> str:
     return f"{frames[0].can_id:08X}{data}"
 
 
-def message(kind: DataType, payload: bytes, priority: int = 16) -> list[CanFrame]:
-    return transfer(message_id(kind.number, 42, priority), kind.seed, payload, 5, False)
+class Measuring:
+    """A core with one ESC, which sends one message of it: in C where there is one, or in Python."""
+
+    def __init__(self, kind: DataType, is_pure: bool, speed: str = "electrical_speed") -> None:
+        escs, layout = [EscSettings()], Layout("", "", ())
+        self.core: Any = PythonCore(escs, layout, 0, False)
+        if not is_pure:
+            self.core, why = make_core(escs, layout, 0, False, slots=1)
+            if why:
+                pytest.skip(why)
+        self.kind, self.now = kind, 0
+        self.plan = plans_of(PROTOCOLS[0], speed)[kind]
+        self.slot = self.core.slot(0)
+        self.slot.start(0)
+
+    def sent(self, live: LiveData, index: int, errors: int = 0, turns: int = 1) -> list[CanFrame]:
+        """What goes out of node 42 with priority 16 for the last of so many frames of the ESC."""
+        can_id, bits = message_id(self.kind.number, 42, 16), fill(self.kind, index, errors)
+        self.slot.configure(SlotSettings(self.plan, can_id, True, 1, 3, bits, 64), self.now)
+        for _ in range(turns):
+            self.now += 10_000_000
+            self.core.receive(0, encode(live, WireLayout.V4), self.now, self.now)
+            frames: list[CanFrame] = self.core.take(self.now)
+        return frames
 
 
-def test_golden_messages() -> None:
+pure = pytest.mark.parametrize("is_pure", [True, False])
+
+
+@pure
+def test_golden_messages(is_pure: bool) -> None:
     """Made by another implementation, of node 42, with transfer id 5."""
-    status = types.status(7, 24.23, 47.3, 30.0, 6303, 42, 3)
-    assert shown(message(types.STATUS, status)) == (
+    live = LiveData(6303, 2423, 473, power_stage_temperature=30, output_opening=42)
+    assert shown(Measuring(types.STATUS, is_pure).sent(live, 3, 7, turns=6)) == (
         "10040A2A#A1F1070000000F85 #4EEA51BD5C9F1825 #150C45"
     )
-    extended = types.status_extended(50, 48, -256, 0, 0x12345, 3)
-    assert shown(message(types.STATUS_EXTENDED, extended)) == "10040C2A#64C00200452323C5"
+    live = LiveData(throttle=-50, output_opening=48, operating_errors=0x12345)
+    extended = Measuring(types.STATUS_EXTENDED, is_pure).sent(live, 3, turns=6)
+    assert shown(extended) == "10040C2A#64C00200452323C5"
     state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
-    assert shown(message(types.NODE_STATUS, state, 24)) == "1801552A#6400000000EFBEC5"
-    warm = types.TEMPERATURE.pack(1, 300.0, False)
-    assert shown(message(types.TEMPERATURE, warm)) == "1004562A#0100B05C00C5"
+    frames = transfer(
+        message_id(types.NODE_STATUS.number, 42, 24), types.NODE_STATUS.seed, state, 5
+    )
+    assert shown(frames) == "1801552A#6400000000EFBEC5"
 
 
 def test_a_golden_answer() -> None:
     state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
     info = types.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
     request = 0x10018000 | 42 << 8 | 0x80 | 10
-    answer = transfer(response_id(request), types.GET_NODE_INFO.seed, info, 5, True)
+    answer = transfer(response_id(request), types.GET_NODE_INFO.seed, info, 5)
     assert shown(answer) == (
         "10010AAA#6A76640000000085 #EFBE010200000025 #0000000000000005 #0000000304010225 #0304050607080905"
         " #0A0B0C0D0E0F1025 #006F72672E657805 #616D706C652E6525 #736345"
@@ -84,45 +118,35 @@ def half(value: float) -> float:
     return found
 
 
-def test_random_measurements_are_read_as_they_were_sent() -> None:
-    rng, reader = random.Random(1), Reader()
-    for turn in range(2000):
-        volts, amperes, celsius = (rng.uniform(-700, 700) for _ in range(3))
-        rpm, percent, index = rng.randrange(-131072, 131072), rng.randrange(128), rng.randrange(32)
-        errors = rng.randrange(1 << 32)
-        made = message(
-            types.STATUS, types.status(errors, volts, amperes, celsius, rpm, percent, index)
-        )
-        found = [reader.read(turn, frame) for frame in made][-1]
-        assert found is not None
-        got = found.payload
-        read = (got.error_count, got.voltage, got.current, got.temperature)
-        assert read == (errors, half(volts), half(amperes), half(celsius + 273.15))
-        assert (got.rpm, got.power_rating_pct, got.esc_index) == (rpm, percent, index)
-        parts = [rng.randrange(128), rng.randrange(128), rng.randrange(-256, 256)]
-        parts += [rng.randrange(512), rng.randrange(1 << 19), index]
-        made = message(types.STATUS_EXTENDED, types.status_extended(*parts))
-        found = reader.read(turn, made[0])
-        assert found is not None
-        got = found.payload
-        assert [got.input_pct, got.output_pct, got.motor_temperature_degC] == parts[:3]
-        assert [got.motor_angle, got.status_flags, got.esc_index] == parts[3:]
-
-
-def test_what_is_out_of_a_types_range_is_its_limit_and_what_is_unknown_is_nan() -> None:
+def read(frames: list[CanFrame]) -> Any:
     reader = Reader()
-    made = message(types.STATUS, types.status(0, 1e9, -1e9, None, 1 << 20, 200, 31))
-    found = [reader.read(0, frame) for frame in made][-1]
+    found = [reader.read(0, frame) for frame in frames][-1]
     assert found is not None
-    got = found.payload
-    assert (got.voltage, got.current, got.rpm, got.power_rating_pct) == (65504, -65504, 131071, 127)
-    assert math.isnan(got.temperature)
-    assert got.esc_index == 31
-    found = [
-        reader.read(0, f) for f in message(types.STATUS, types.status(0, 0, 0, 0, -(1 << 20), 0, 0))
-    ][-1]
-    assert found is not None
-    assert found.payload.rpm == -131072
+    return found.payload
+
+
+@pure
+def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
+    rng = random.Random(1)
+    status, extended = (Measuring(k, is_pure) for k in (types.STATUS, types.STATUS_EXTENDED))
+    for _ in range(500):
+        live = random_live(rng)
+        live = live._replace(throttle=max(-127, live.throttle))
+        index, errors = rng.randrange(32), rng.choice((0, 1, 300, (1 << 32) - 1))
+        got = read(status.sent(live, index, errors))
+        volts, amperes = live.battery_voltage / 100, live.battery_current / 10
+        kelvin = live.power_stage_temperature + 273.15
+        found = (got.error_count, got.voltage, got.current, got.temperature, got.esc_index)
+        assert found == (errors, half(volts), half(amperes), half(kelvin), index)
+        assert got.rpm == min(live.electrical_speed, 131_071)
+        assert got.power_rating_pct == min(live.output_opening, 127)
+        got, word = read(extended.sent(live, index)), live.operating_errors
+        assert [got.input_pct, got.output_pct] == [
+            abs(live.throttle),
+            min(live.output_opening, 127),
+        ]
+        assert (got.motor_temperature_degC, got.motor_angle, got.esc_index) == (-256, 0, index)
+        assert got.status_flags == word & 0x3FFFF | (word > 0x3FFFF) << 18
 
 
 def test_transfers_of_the_package_are_put_together_however_they_are_mixed() -> None:

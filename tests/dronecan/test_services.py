@@ -1,10 +1,9 @@
 """What a node of ours answers: asked by the package ``dronecan``, by too many, and by what is no request."""
 
 import pytest
-from dronecan_bench import LIVE, Bench, Peer, Reader, dronecan, loaded, peers_frames
+from dronecan_bench import Bench, Peer, dronecan, loaded, peers_frames
 
 from kontronik_can_gw.dronecan.nodes import MAX_ANSWERS
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 
 protocol = dronecan.uavcan.protocol
@@ -138,20 +137,3 @@ def test_another_device_with_our_node_id_is_reported_and_we_go_on() -> None:
     bench.run(11)
     assert [each.over for each in taken()] == [True]
     assert {node["state"] for node in bench.output.facts()["nodes"]} == {"operational"}
-
-
-def test_a_reader_of_another_hand_finds_no_fault_in_a_long_run() -> None:
-    """Every frame belongs to a transfer that is whole and of a type that is known; transfer ids count on."""
-    bench = Bench(3, extended_hz=20)
-    reader = Reader()
-    for turn in range(40):
-        bench.live[turn % 3] = LIVE._replace(operating_errors=1 << turn % 24)
-        bench.run(0.5)
-    ids: dict[int, int] = {}
-    for at, frame in bench.frames:
-        reader.read(at, frame)
-        if frame.data[-1] & 0x80:
-            number = frame.data[-1] & 0x1F
-            assert number == (ids.get(frame.can_id, number - 1) + 1) % 32
-            ids[frame.can_id] = number
-    assert bench.now > 20 * SECOND

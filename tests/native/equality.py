@@ -1,7 +1,9 @@
 """The core in C beside the core in Python: the same random DBC, bytes and times; every frame, event, counter and deadline equal."""
 
+import math
 import random
 from collections.abc import Sequence
+from contextlib import suppress
 from fractions import Fraction
 from functools import cache
 from itertools import zip_longest
@@ -31,12 +33,15 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
+from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import GATEWAY, NotInCore
 from kontronik_can_gw.native.settings import MAX_GEAR
-from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.slots import Slot, SlotSettings
+from kontronik_can_gw.native.slots import _rows
+from kontronik_can_gw.signals.packer import compile_pack
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.slots import Slot, SlotPlan, SlotSettings
 
 START = 1_000 * SECOND
 _STEPS = (0, 1_000, 100_000, MS, 2 * MS, 5 * MS, 10 * MS, 10 * MS, 10 * MS, 50 * MS, 260 * MS)
@@ -144,11 +149,12 @@ STATE = (
 
 
 class BothSlots:
-    """A slot of both cores, given the same calls. It carries random objects of the shipped EDS."""
+    """A slot of both cores, given the same calls. It carries random objects of the shipped EDS, or is a transfer of random values."""
 
     def __init__(self, chance: random.Random, *both: Slot) -> None:
         self.chance = chance
         self.both = both
+        self.is_transfer = chance.random() < 0.4
         self.settings: SlotSettings | None = self._random()
         self.started = False
         self._call("configure", self.settings, START)
@@ -182,8 +188,62 @@ class BothSlots:
             if sum(map(bits_of, [*mapped, variable])) <= 64:
                 mapped.append(variable)
         times = (chance.choice((0, 0, 5, 20, 25)) * MS, chance.choice((0, 0, 7, 500)) * MS)
+        if self.is_transfer:
+            fill, page = chance.getrandbits(8 * FILL), 64 + 3 * chance.randrange(40)
+            of_id = chance.choice((0x18040A2A, 0x18040A2A, 0x18040A2B)), chance.random() < 0.9
+            return SlotSettings(transfer_plan(chance), *of_id, *times, fill, page)
         plan = compile_pdo(mapped)
         return SlotSettings(plan, chance.randrange(1, 0x700), chance.random() < 0.8, *times)
+
+
+FILL = 2
+"""Bytes at the begin of a transfer that its owner fills."""
+
+
+def transfer_plan(chance: random.Random) -> SlotPlan:
+    """One that the core in C can express: slots of one id are all there, and count together."""
+    while True:
+        plan = _transfer_plan(chance)
+        with suppress(NotInCore):
+            _rows(plan, EscSettings().protocol)
+            return plan
+
+
+def _transfer_plan(chance: random.Random) -> SlotPlan:
+    """Up to seven values as integers or floats of any length; their Error code is the type's limit."""
+    at, signals = 8 * FILL, []
+    sources = [v for v in VALUES.values() if v.supplied and v.kind is not Kind.OBJECT]
+    for source in chance.sample(sources, chance.randint(1, 7)):
+        is_float = chance.random() < 0.4
+        signed = not is_float and chance.random() < 0.5
+        length = chance.choice((16, 16, 32)) if is_float else chance.randint(2, 24)
+        if at + length > 128:
+            break
+        high = (1 << length - signed) - 1
+        cut = chance.choice((0, 0, 0, length // 3))
+        pieces = [Piece(cut, length - cut, at)] + [Piece(0, cut, at + length - cut)] * (cut > 0)
+        signal = SignalPlan(
+            *(source.name, "", Role.SOURCE, length, signed, is_float, tuple(pieces)),
+            *(
+                -high - 1 if signed else 0,
+                high,
+                0x7E00 if is_float else 0,
+                0x7BFF if is_float else high,
+            ),
+            slope=Fraction(chance.choice((1, 1, 1, 1000)), source.per_unit),
+            intercept=Fraction(chance.choice(("0", "0", "273.15"))),
+            source=source,
+            esc=None if source.group is Group.GATEWAY else 0,
+            limits=(-65504.0, 65504.0) if length == 16 else (-math.inf, math.inf),
+        )
+        signals.append(signal)
+        at += length
+    plan = MessagePlan(
+        *("transfer", 0, True, False, (at + 7) // 8, SendType.EVENT, 0, 0, tuple(signals)),
+        *(frozenset({0}), frozenset({Group.LIVE})),
+    )
+    seed, paced = chance.randrange(1 << 16), chance.random() < 0.7
+    return SlotPlan(plan, compile_pack(plan), Event.LIVE, 0, None, False, "", seed, paced)
 
 
 @cache

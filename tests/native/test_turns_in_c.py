@@ -21,6 +21,7 @@ from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import Replay
+from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -28,7 +29,8 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
-from kontronik_can_gw.output import NEVER, Output
+from kontronik_can_gw.output import NEVER, Given, Output
+from kontronik_can_gw.outputs import setup_of
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
@@ -93,16 +95,20 @@ def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], 
 
 
 class Recorded(InC):
-    """One that is recorded, with random ESCs, layout and bytes. ``has_nodes``: each ESC has a CANopen node."""
+    """One that is recorded, with random ESCs, layout and bytes. ``has_nodes``: each ESC has a CANopen node, all one of DroneCAN."""
 
     def __init__(self, seed: int, patch: pytest.MonkeyPatch, has_nodes: bool = False) -> None:
         chance = random.Random(seed)
         self.entries: list[Entry] = []
         self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
         self.layout = layout(chance, self.escs)
-        self.canopen = _nodes(self.escs, has_nodes)
+        given = Given(DronecanConfig(node_id=42, extended_hz=30), b"", (1, 2), 3)
+        self.nodes: dict[str, Any] = {}
+        if has_nodes:
+            dronecan = setup_of("dronecan", given, self.escs).make
+            self.nodes = {"canopen": _nodes(self.escs, True), "further": [dronecan]}
         patch.setattr(wire_world, "Gateway", partial(RecordedGateway, self._put))
-        super().__init__(patch, self.layout, self.escs, canopen=self.canopen)
+        super().__init__(patch, self.layout, self.escs, **self.nodes)
         self.status = self.loop.gateway.status
         for wire in self.world.wires:
             at = self.begun
@@ -129,7 +135,7 @@ class Recorded(InC):
 
     def replayed(self, patch: pytest.MonkeyPatch) -> list[tuple[int, bytes]]:
         patch.setattr(load, "library", lambda: (None, ""))
-        gateway = Gateway(self.escs, self.layout, self.begun, canopen=self.canopen)
+        gateway = Gateway(self.escs, self.layout, self.begun, **self.nodes)
         assert gateway.core.language == "Python"
         replay = Replay(gateway)
         frames = [timed.frame for timed in replay.follow(self.entries)]
@@ -169,6 +175,7 @@ def test_what_is_sent_is_what_a_replay_in_python_sends(
         assert received == [data for number, data in replayed if number == can_id]
     emergencies = sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed)
     assert (emergencies > 100) == has_nodes
+    assert (sum(number == 0x98040A2A for number, _ in replayed) > 20) == has_nodes
 
 
 @pytest.mark.parametrize("has_nodes", [True, False])

@@ -49,6 +49,27 @@ def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     assert send(queue, sent, 9) == 0
 
 
+@given(st.lists(st.one_of(st.none(), st.integers(1, 7)), max_size=60))
+def test_what_is_sent_of_transfers_is_whole_and_the_newest(steps: list[int | None]) -> None:
+    """``steps``: put a newer transfer of two frames or three, or let the interface take so many frames."""
+    queue, sent = TransmitQueue(), list[CanFrame]()
+    pages, wanted = {0x18040A2A: (64, 65, 66), 0x18040C2A: (67, 68)}, 0
+    for number, step in enumerate(steps):
+        if step is None:
+            for can_id, parts in pages.items():
+                queue.put_all([CanFrame(can_id, bytes((number,)), True, page=p) for p in parts])
+            wanted += 1
+        else:
+            send(queue, sent, step)
+    send(queue, sent, 100)
+    for can_id, parts in pages.items():
+        found = [(frame.page, frame.data) for frame in sent if frame.can_id == can_id]
+        begun = [data for page, data in found if page == parts[0]]
+        assert found == [(page, data) for data in begun for page in parts]
+        assert begun == sorted(set(begun))
+        assert bool(begun) == bool(wanted)
+
+
 PUTS = st.tuples(st.booleans(), st.integers(0x181, 0x184))
 STEPS = st.lists(st.one_of(PUTS, st.integers(0, 6)), max_size=80)
 
