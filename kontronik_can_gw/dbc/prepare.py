@@ -75,6 +75,7 @@ def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
                 name=copy.name,
                 can_id=copy.frame_id,
                 escs=frozenset((copy.esc,)),
+                data_id=job.settings.data_ids.get(copy.name, copy.frame_id & 0xFFFF),
                 renamed=(of.prefix, copy.prefix),
             )
         elif (compiled := compile_message(job, copy)) is not None:

@@ -275,6 +275,19 @@ def test_extended_multiplexing_of_one_level_comes_through() -> None:
     assert voltage.multiplexer_signal == "RightPage"
 
 
+@pytest.mark.parametrize(("text", "node"), [(SHIPPED, "KontronikGateway"), (RICH, "Gw")])
+def test_what_is_sent_is_what_the_written_file_says(text: str, node: str) -> None:
+    """ESCs of which two are alike: what they share is the same as if each were compiled."""
+    three = [EscSettings("left", 7), EscSettings("mid", 14), EscSettings("right", 7)]
+    sent, again = (
+        prepare(database, "x", three, DbcSettings(node=node), fd_allowed=True)
+        for database in (read(text), multiplied(text, three, node)[0])
+    )
+    assert any(plan.renamed for plan in sent.messages)
+    plain = [replace(plan, compiled=plan.signals, renamed=None) for plan in sent.messages]
+    assert plain_plans(replace(sent, messages=tuple(plain))) == plain_plans(again)
+
+
 def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_they_were() -> None:
     more = (
         'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_DEF_ "SystemSignalLongSymbol" "";\n'
