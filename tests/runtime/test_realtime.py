@@ -39,7 +39,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
 
 def test_the_loop_goes_before_the_threads_beside_it(kernel: Scheduler) -> None:
     ended = threading.Event()
-    sleepers = [threading.Thread(target=ended.wait) for _ in range(2)]
+    sleepers = [threading.Thread(target=ended.wait, daemon=True) for _ in range(2)]
     sleepers[0].start()
     realtime.begin(30)
     assert start_beside_the_loop(sleepers[1])
