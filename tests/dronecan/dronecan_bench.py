@@ -81,9 +81,8 @@ class Reader:
         if frame.data[-1] & 0x80:
             frames.clear()
             number = frame.data[-1] & 0x1F
-            if (
-                not frame.can_id & 0x80
-            ):  # of a message: with the same one it would be taken for one that comes twice
+            # of a node's message: with the same one it would be taken for one that comes twice
+            if frame.can_id & 0x7F and not frame.can_id & 0x80:
                 assert number != self._numbers.get(frame.can_id)
             self._numbers[frame.can_id] = number
         frames.append(transport.Frame(frame.can_id, frame.data, ts_monotonic=1.0))
