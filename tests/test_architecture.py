@@ -70,6 +70,7 @@ ONLY_IN = {
     "asammdf": ("desk",),
     "paho": ("desk",),
     "shtab": ("cli",),
+    "canopen": ("desk/monitor/demo.py",),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -1,4 +1,4 @@
-"""The demonstration's bus: a gateway with a simulated ESC, and a CANopen master that starts its node; without ports and threads."""
+"""The demonstration's bus: a gateway with a simulated ESC, and a CANopen master that looks after its node; without ports and threads."""
 
 import time
 
@@ -20,7 +20,11 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.node_state import NmtState
+
+with without_asammdf():
+    import canopen
 
 _ERRORS = (
     OperatingError.POWER_STAGE_OVERTEMP_WARNING,
@@ -30,7 +34,39 @@ _ERRORS = (
 )
 _STEP_S = 0.005
 _NODE_ID = 1
-_HEARTBEAT, _EMERGENCY, _TPDOS = 0x701, 0x081, (0x181, 0x281, 0x381, 0x481)
+_TPDOS = (0x181, 0x281, 0x381, 0x481)
+
+
+class Master(canopen.Network):
+    """The ``canopen`` package as master: what it sends is put into ``sent``; it starts its one node."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent: list[CanFrame] = []
+        self._pdos = 0
+        self._node = self.add_node(_NODE_ID)
+        self._node.nmt.add_heartbeat_callback(self._heard)
+        for cob_id in _TPDOS:
+            self.subscribe(cob_id, self._count)
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
+        self.sent.append(CanFrame(can_id, bytes(data)))
+
+    def _heard(self, state: int) -> None:
+        if state in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):
+            self._node.nmt.send_command(nmt.Command.START)
+
+    def _count(self, *_: object) -> None:
+        self._pdos += 1
+
+    def line(self) -> str:
+        """What the master knows of its node."""
+        emergency = "no EMCY yet"
+        if log := self._node.emcy.log:
+            bits = PROTOCOLS[0].errors["operating_errors"]
+            text = next((bit.meaning for bit in bits if bit == log[-1].data[0]), "of the gateway")
+            emergency = f"EMCY {log[-1].code:04X}h {text if log[-1].code else 'no error any more'}"
+        return f"CANopen: node {_NODE_ID} {self._node.nmt.state.lower()}, {self._pdos} PDOs, {emergency}"
 
 
 class DemoBus(Source):
@@ -49,9 +85,7 @@ class DemoBus(Source):
         self._gateway = Gateway(made.escs, made.layout, now, canopen=made.canopen)
         self._gateway.port(0, True, now)
         self._gateway.start(now)
-        self._state = NmtState.INITIALISING
-        self._pdos = 0
-        self._last_emergency = b""
+        self._master = Master()
 
     def pump(self, take: Take, until_s: float) -> None:
         """Let the gateway work until this time."""
@@ -63,32 +97,14 @@ class DemoBus(Source):
             gateway.advance(now)
             for frame in gateway.take_frames(now):
                 take(frame, now)
-                self._hear(frame, now)
+                self._master.notify(frame.can_id, bytearray(frame.data), now / SECOND_NS)
+            for command in self._master.sent:
+                gateway.receive_frame(command, now, now)
+            self._master.sent.clear()
             if time.monotonic() >= until_s:
                 break
             time.sleep(_STEP_S)
-        self.note = self._line()
-
-    def _hear(self, frame: CanFrame, now: int) -> None:
-        """As the master: start the node once it has booted up; count its PDOs, and keep its last emergency."""
-        if frame.can_id == _HEARTBEAT:
-            self._state = NmtState(frame.data[0])
-            if self._state in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):
-                start = CanFrame(0, bytes((nmt.Command.START, _NODE_ID)))
-                self._gateway.receive_frame(start, now, now)
-        elif frame.can_id == _EMERGENCY:
-            self._last_emergency = frame.data
-        self._pdos += frame.can_id in _TPDOS
-
-    def _line(self) -> str:
-        """What the master knows of its node."""
-        emergency = "no EMCY yet"
-        if data := self._last_emergency:
-            code, bits = int.from_bytes(data[:2], "little"), PROTOCOLS[0].errors["operating_errors"]
-            text = next((bit.meaning for bit in bits if bit == data[3]), "of the gateway")
-            emergency = f"EMCY {code:04X}h {text if code else 'no error any more'}"
-        state = self._state.name.lower().replace("_", "-")
-        return f"CANopen: node {_NODE_ID} {state}, {self._pdos} PDOs, {emergency}"
+        self.note = self._master.line()
 
 
 def _flight(seed: int, start_ns: int) -> SimulatedEsc:
