@@ -33,7 +33,7 @@ def test_the_same_over_many_more_recordings(
     native_library: Any, tmp_path: Path, group: int
 ) -> None:
     seeds = range(1_000 + group, 1_040, 10)
-    assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 2_000
+    assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 500
 
 
 def test_what_it_does_not_play_python_plays(native_library: Any, tmp_path: Path) -> None:
