@@ -70,6 +70,8 @@ class SdoServer:
         self._answer = b""  # what confirms a download
         self._ticket = 0
         self._in_flight = InFlight()
+        self._next_burst = 0
+        """Of the last block upload: one that begins anew keeps its pace."""
 
     @property
     def busy(self) -> bool:
@@ -272,7 +274,9 @@ class SdoServer:
             self._start_upload(value)
             return
         with_crc = bool(data[0] & 4)
-        self._transfer = BlockUpload(value, block_size, with_crc, self._segment_ns, self._send)
+        self._transfer = BlockUpload(
+            value, block_size, with_crc, self._segment_ns, self._send, self._next_burst
+        )
         self._send(self._initiated(0xC6, len(value).to_bytes(4, "little")))
 
     # ---- all transfers
@@ -291,6 +295,8 @@ class SdoServer:
         """Drop any transfer without an answer."""
         if (download := self._open_block_download()) is not None:
             self._in_flight.expect(download.next_segment)
+        if isinstance(self._transfer, BlockUpload):
+            self._next_burst = self._transfer.next_burst
         self._transfer, self._confirming = None, False
         self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER

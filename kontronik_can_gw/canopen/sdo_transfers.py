@@ -168,8 +168,9 @@ class BlockUpload:
         with_crc: bool,
         segment_ns: int,
         send: Callable[[bytes], None],
+        next_burst: int = 0,
     ) -> None:
-        self.next_burst = 0
+        self.next_burst = next_burst
         """When more of a sub-block may be sent."""
         self._data = data
         self._with_crc = with_crc

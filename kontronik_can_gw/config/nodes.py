@@ -148,7 +148,9 @@ def with_stored(
     kept = list(stored)
     while True:
         setup = replace(plain, stored=tuple(kept))
-        clash = [number for number in _clashing(setup, escs, foreign) if kept[number].has_ids]
+        found = [n for n in sorted(_clashing(setup, escs, foreign)) if kept[n].has_ids]
+        # a node that is moved onto another one's ids clashes with a node that may be right
+        clash = [n for n in found if kept[n].node_id is not None] or found
         if not clash:
             return setup, said
         for number in clash:

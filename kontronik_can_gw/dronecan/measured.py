@@ -1,6 +1,7 @@
 """What is measured of an ESC, as plans for slots of the core: it sends them at a rate while telemetry is fresh.
 
-Layouts as in the DSDL. What a device does not supply is NaN, or 0 where the type has no such thing; what is out of range is the limit.
+Layouts as in the DSDL. What a device does not supply is NaN, or 0 where the type has no such thing; what is out of range is the limit
+(a throttle beyond 127 %, which no ESC sends, is 0).
 """
 
 from collections.abc import Mapping, Sequence

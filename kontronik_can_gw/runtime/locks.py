@@ -12,6 +12,7 @@ import fcntl
 import logging
 import os
 import stat
+import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -25,6 +26,8 @@ SYSTEM_FOLDER = Path("/run/kontronik-can-gw/lock")
 PREFIX = ""
 """Before the names of all locks, for tests that run side by side."""
 _NAME = "kontronik-can-gw"
+_MAX_NAME = 200
+"""Bytes of a file's name, of which more than 255 cannot be."""
 _TRIES = 100
 _OPEN = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
 
@@ -70,6 +73,8 @@ def network_namespace() -> int:
 def file_name(name: str, namespace: int) -> str:
     """The file that stands for a lock."""
     text = (PREFIX + name).replace("%", "%25").replace("/", "%2F")
+    if len(data := os.fsencode(text)) > _MAX_NAME:
+        text = f"{zlib.crc32(data):08x}{os.fsdecode(data[-_MAX_NAME:])}"
     return f"{namespace}.{text}"
 
 

@@ -61,8 +61,8 @@ class Statistics:
 
     def close(self) -> None:
         """Remove the file and end the thread; a disk that does not answer is waited for 0.2 s and no longer."""
-        self._locks.close()
         self._worker.stop(_CLOSE_S)
+        self._locks.close()
 
     def _work(self, _items: list[None]) -> None:
         """Write the newest document."""

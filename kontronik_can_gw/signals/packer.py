@@ -12,7 +12,7 @@ from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import Group, divisor, steps
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
@@ -76,7 +76,8 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
         data = pack(escs, gateway, now, alive, at).to_bytes(plan.length, "little")
         if crc is not None:
             data = e2e.protected(data, crc.pieces[0].at // 8, plan.data_id)
-        return CanFrame(plan.can_id, data, plan.extended, plan.fd, at)
+        # from FIRST_PART on a page would be a part of a transfer
+        return CanFrame(plan.can_id, data, plan.extended, plan.fd, at if at < FIRST_PART else -at)
 
     return frame
 

@@ -210,3 +210,13 @@ def test_swapped_node_ids_are_kept(tmp_path: Path) -> None:
     loaded, nodes = loaded_nodes(tmp_path)
     assert [node.node_id for node in nodes] == [2, 1]
     assert loaded.warnings == ()
+
+
+def test_the_stored_node_id_gives_way_and_not_the_node_that_has_it_by_right(tmp_path: Path) -> None:
+    moved = {0x180001: u32(0x40000300)}
+    keep(tmp_path, esc1=Stored(2), esc2=Stored(None, moved))
+    loaded, nodes = loaded_nodes(tmp_path)
+    assert [node.node_id for node in nodes] == [1, 2]
+    assert nodes[1].dictionary.number(0x1800, 1) == 0x40000300
+    (said,) = loaded.warnings
+    assert said.startswith("esc1: the stored node-ID")

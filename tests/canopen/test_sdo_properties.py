@@ -286,3 +286,17 @@ def test_the_canopen_package_transfers_in_every_way(size: int, segment_ns: int) 
         with sdo.open(0x2003, 0, "rb", block_transfer=True, request_crc_support=True) as stream:
             assert stream.read() == data
     assert not bench.server.busy
+
+
+def test_a_block_upload_that_is_begun_again_and_again_keeps_its_pace() -> None:
+    """A master that has no patience gets no more of the bus."""
+    bench = Bench(MS)
+    bench.objects.find(0x2003, 0).value = bytes(6000)
+    segments, end = 0, 200 * MS
+    while bench.now < end:
+        bench.request(bytes.fromhex("a4032000 7f000000"))
+        segments += len(bench.request(bytes.fromhex("a300000000000000")))
+        bench.answers = []
+        bench.pass_time(bench.now + MS // 2)
+        segments += len(bench.answers)
+    assert end // MS // 2 < segments <= end // MS + 4

@@ -214,16 +214,18 @@ def test_the_folder_is_the_services_or_the_users_own(
     assert str(locks.lock_folder()) == expected.replace("SYSTEM", system)
 
 
-@pytest.mark.parametrize("kind", ["link", "file", "open to all"])
+@pytest.mark.parametrize(
+    "kind", ["link", "file", "open to all", pytest.param("a stranger's", marks=needs_root)]
+)
 def test_a_users_folder_that_others_can_change_is_reported_once_and_done_without(
     kind: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine"
-    {"link": lambda: path.symlink_to(tmp_path), "file": path.touch, "open to all": path.mkdir}[
-        kind
-    ]()
-    if kind == "open to all":
-        path.chmod(0o777)
+    if kind in ("link", "file"):
+        path.symlink_to(tmp_path) if kind == "link" else path.touch()
+    else:
+        path.mkdir(0o700)
+        path.chmod(0o777) if kind == "open to all" else os.chown(path, STRANGER, STRANGER)
     said: list[str] = []
     mine = Locks(path, said.append)
     assert mine.hold([NODE]) == mine.hold([NODE, node_lock(CHANNEL, 6)]) == []
@@ -232,9 +234,12 @@ def test_a_users_folder_that_others_can_change_is_reported_once_and_done_without
     assert "Nothing keeps a second gateway" in said[0]
 
 
-@pytest.mark.parametrize("name", [NODE, node_lock("/dev/serial/by-id/usb-A%2F_1@115200", 127)])
+@pytest.mark.parametrize(
+    "name", [NODE, node_lock("/dev/serial/by-id/usb-A%2F_1@115200", 127), f"{'/ä' * 150}/node/1"]
+)
 def test_a_file_name_stands_for_one_lock_in_one_network_namespace(name: str) -> None:
     file = file_name(name, 4026531840)
     assert "/" not in file
+    assert len(os.fsencode(file)) < 250
     assert file != file_name(name + "0", 4026531840)
     assert file != file_name(name, 4026531841)

@@ -130,6 +130,18 @@ def test_a_slow_disk_holds_up_nobody_and_results_come_in_order(
     assert [number_of(store.load(f"esc{n}")[0]) for n in range(3)] == [9, 7, 8]
 
 
+def test_a_system_without_a_thread_to_give_refuses_the_saving(
+    store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", start)
+        assert not store.save("esc1", OLD)
+    assert put(store, "esc1", OLD) is None
+
+
 # --- damage
 
 

@@ -6,7 +6,13 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.frames import FIRST_PART, CanFrame
+from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.signals.packer import compile_frame
 from kontronik_can_gw.transmit_queue import QUEUE_LENGTH, TransmitQueue
 
 
@@ -108,3 +114,22 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
     slots_put, slots_sent = sum(not f.queued for f in put), sum(not f.queued for f in sent)
     assert slots_sent + queue.replaced == slots_put
     assert (len(queue), queue.dropped) == (0, 0)
+
+
+def test_pages_of_a_message_are_no_parts_of_a_transfer_however_many() -> None:
+    """Of 70 pages those that wait give way to newer ones, each for itself."""
+    numbers = range(FIRST_PART + 6)
+    rows = "".join(f' SG_ S{n} m{n} : 8|8@1+ (1,0) [0|0] "" X\n' for n in numbers)
+    text = f'VERSION ""\nBU_: G X\nBO_ 256 M: 2 G\n SG_ Page M : 0|8@1+ (1,0) [0|0] "" X\n{rows}'
+    bind: dict[str, str | float] = {f"S{n}": n for n in numbers}
+    escs = (EscSettings("esc1"),)
+    (plan,) = prepare(
+        parse_database(text.encode(), "m.dbc"), "m.dbc", escs, DbcSettings(bind)
+    ).messages
+    make = compile_frame(plan)
+    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue.put_all([make((), GatewayStatus(), 0, 0, FIRST_PART + 1)])
+    queue.put_all([make((), GatewayStatus(), 0, 0, at) for at in numbers])
+    send(queue, sent, 100)
+    assert sorted(frame.data[0] for frame in sent) == list(numbers)
+    assert queue.replaced == 1

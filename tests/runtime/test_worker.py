@@ -2,6 +2,7 @@
 
 import os
 import select
+import signal
 import threading
 
 import pytest
@@ -93,3 +94,16 @@ def test_a_job_that_fails_is_reported_and_the_next_one_is_done(
     assert worker.stop(PATIENCE) and silent.stop(PATIENCE)
     assert (done, failures) == ([1], ["ZeroDivisionError('of ours')"])
     assert caplog.messages == ["test: ZeroDivisionError('of ours')"], "where nobody else is told"
+
+
+def test_no_signal_is_delivered_to_a_thread_beside_the_loop() -> None:
+    """They are to wake the loop."""
+    masks: list[set[int]] = []
+    thread = threading.Thread(
+        target=lambda: masks.append({*signal.pthread_sigmask(signal.SIG_BLOCK, ())})
+    )
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert worker_module.start_beside_the_loop(thread)
+    thread.join()
+    assert {signal.SIGTERM, signal.SIGINT, signal.SIGHUP} <= masks[0]
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
