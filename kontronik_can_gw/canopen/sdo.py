@@ -30,6 +30,7 @@ from kontronik_can_gw.canopen.sdo_transfers import (
     BlockDownload,
     BlockUpload,
     InFlight,
+    Pace,
     SegmentedDownload,
     SegmentedUpload,
     check_block_size,
@@ -59,7 +60,7 @@ class SdoServer:
     ) -> None:
         self._objects = objects
         self._send = send
-        self._segment_ns = segment_ns
+        self._pace = Pace(segment_ns)
         self._transfer: _Transfer | None = None
         self._confirming = False
         """All data is here, the result of the dictionary is pending."""
@@ -70,8 +71,6 @@ class SdoServer:
         self._answer = b""  # what confirms a download
         self._ticket = 0
         self._in_flight = InFlight()
-        self._next_burst = 0
-        """Of the last block upload: one that begins anew keeps its pace."""
 
     @property
     def busy(self) -> bool:
@@ -130,7 +129,7 @@ class SdoServer:
     def due(self) -> int:
         """When ``advance`` has something to do."""
         upload = self._bursting
-        return self._deadline if upload is None else upload.next_burst
+        return self._deadline if upload is None else self._pace.next_burst
 
     @property
     def _bursting(self) -> BlockUpload | None:
@@ -274,9 +273,7 @@ class SdoServer:
             self._start_upload(value)
             return
         with_crc = bool(data[0] & 4)
-        self._transfer = BlockUpload(
-            value, block_size, with_crc, self._segment_ns, self._send, self._next_burst
-        )
+        self._transfer = BlockUpload(value, block_size, with_crc, self._pace, self._send)
         self._send(self._initiated(0xC6, len(value).to_bytes(4, "little")))
 
     # ---- all transfers
@@ -295,8 +292,6 @@ class SdoServer:
         """Drop any transfer without an answer."""
         if (download := self._open_block_download()) is not None:
             self._in_flight.expect(download.next_segment)
-        if isinstance(self._transfer, BlockUpload):
-            self._next_burst = self._transfer.next_burst
         self._transfer, self._confirming = None, False
         self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER

@@ -2,6 +2,7 @@
 
 from binascii import crc_hqx
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum, auto
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
@@ -158,23 +159,30 @@ class _Phase(Enum):
     END = auto()
 
 
+@dataclass(slots=True)
+class Pace:
+    """Of all block uploads of a server: one that begins anew has not more of the bus."""
+
+    segment_ns: int
+    """Distance that segments keep on average, 0: none."""
+    next_burst: int = 0
+    """When more of a sub-block may be sent."""
+
+
 class BlockUpload:
-    """The segments of one value, a sub-block at a time. ``segment_ns``: distance that segments keep on average, 0: none."""
+    """The segments of one value, a sub-block at a time."""
 
     def __init__(
         self,
         data: bytes,
         block_size: int,
         with_crc: bool,
-        segment_ns: int,
+        pace: Pace,
         send: Callable[[bytes], None],
-        next_burst: int = 0,
     ) -> None:
-        self.next_burst = next_burst
-        """When more of a sub-block may be sent."""
         self._data = data
         self._with_crc = with_crc
-        self._segment_ns = segment_ns
+        self._pace = pace
         self._send = send
         self._phase = _Phase.START
         # in segments: of the whole, confirmed, of this sub-block, of this sub-block sent
@@ -223,10 +231,10 @@ class BlockUpload:
 
     def advance(self, now: int) -> None:
         """Send of a sub-block what its time has come for."""
-        if now < self.next_burst:
+        if now < self._pace.next_burst:
             return
         count = self._sub_block - self._sent
-        if self._segment_ns:
+        if self._pace.segment_ns:
             count = min(count, BURST)
         for _ in range(count):
             at = self._confirmed + self._sent
@@ -234,7 +242,7 @@ class BlockUpload:
             last = _LAST_SEGMENT if at + 1 == self._segments else 0
             segment = self._data[7 * at : 7 * at + 7].ljust(7, b"\0")
             self._send(bytes((last | self._sent,)) + segment)
-        self.next_burst = now + count * self._segment_ns
+        self._pace.next_burst = now + count * self._pace.segment_ns
 
     def _expect(self, phase: _Phase) -> None:
         if self._phase is not phase:
