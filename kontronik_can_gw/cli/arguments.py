@@ -1,10 +1,8 @@
 """Options of commands as rows of a table, and what several commands share of them."""
 
 import argparse
-import os
 import tomllib
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -116,18 +114,31 @@ def config_file(given: Path | None) -> Path:
 
 def default_config() -> Path | None:
     """The first of CONFIG_PLACES that is there, whether it can be read or not."""
-    return next((place for place in CONFIG_PLACES if os.path.lexists(place)), None)
+    return next((place for place in CONFIG_PLACES if _is_there(place)), None)
+
+
+def _is_there(place: Path) -> bool:
+    """False where nothing has that name; a link that leads nowhere, and what a closed folder hides, are something."""
+    try:
+        place.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
-    """UserError with the replacement where a command line has a removed option."""
+    """UserError with the replacement where a command line has a removed option, or a removed action after the command."""
     options = words[: words.index("--")] if "--" in words else words
     parts = [
         part
         for word in options
         for part in (word.split("=", 1) if word.startswith("--") else [word])
     ]
-    for part, value in pairwise([*parts, ""]):
+    for before, part, value in zip(["", *parts], parts, [*parts[1:], ""], strict=False):
+        if not part.startswith("-") and before != command:
+            continue  # the value of an option
         for removed in (part, f"{part} {value}"):
             if (advice := REMOVED_OPTIONS.get((command or "", removed))) is not None:
                 raise UserError(f"{removed}: was removed. {advice}")

@@ -65,8 +65,8 @@ def main(args: argparse.Namespace) -> int:
         raise RunError("needs paho-mqtt 2: pip install 'kontronik-can-gw[mqtt]'") from None
     if args.file is not None:
         raise UserError(
-            f"{args.file}: recordings are not published any more. Type kontronik-can-gw replay {args.file} --on can --channel vcan0, "
-            "and beside it kontronik-can-gw mqtt --channel vcan0."
+            f"{args.file}: recordings are not published any more. Type kontronik-can-gw replay {args.file} --on can --channel vcan0 "
+            f"(a CAN log: canplayer -I {args.file} vcan0=can0), and beside it kontronik-can-gw mqtt --channel vcan0 --broker HOST."
         )
     with logging_to_stderr(), closing(Locks()) as locks:
         bus = bus_layout(args)

@@ -22,6 +22,7 @@ from kontronik_can_gw.cli.service_files import (
     COMPANIONS,
     CONFIGURATIONS,
     NAME,
+    NETWORK,
     OBSOLETE,
     UNITS,
     planned,
@@ -242,8 +243,9 @@ def _uninstall(args: argparse.Namespace) -> int:
         for folder in (root / f"run/{NAME}", *root.glob(f"run/{NAME}-*")):
             if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
                 remove(folder)
-        places = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*")
-        kept = [str(path) for place in places for path in root.glob(place)]
+        places = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*", NETWORK)
+        there = (path for place in places for path in root.glob(place))
+        kept = [str(path) for path in there if path not in found]
     for path in found:
         remove(path)
     if args.root is None and not args.instance:

@@ -19,10 +19,12 @@ COMPANIONS = {"mqtt": "paho", "metrics": "prometheus_client"}
 _PROGRAM = f"/usr/bin/{NAME}"
 """The program in the files."""
 _ANY_PROGRAM = r"(?m)^ExecStart=\S*", "ExecStart="
+NETWORK = f"etc/systemd/network/50-{NAME}-*"
+"""0.5.0's set-up of a CAN interface, which goes on working and stays."""
 OBSOLETE = (
     *(f"{UNITS}/{NAME}{end}.service.d/prometheus.conf" for end in ("", "@")),
     f"{UNITS}/{NAME}*@.service.d/instance.conf",
-    f"etc/systemd/network/50-{NAME}-*.example",
+    f"{NETWORK}.example",
 )
 """What earlier versions installed."""
 

@@ -3,16 +3,20 @@
 import contextlib
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from command_line import refused, run
 
+from kontronik_can_gw.cli import make_parser
 from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -200,3 +204,49 @@ def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -
 def test_a_reader_that_goes_away_gets_no_message() -> None:
     done = shell("PROGRAM dbc --esc 8 | head -c 10")
     assert (done.stdout, done.stderr) == ('VERSION "l', "")
+
+
+# --- advice
+
+
+def test_the_lines_that_replace_removed_options_are_accepted() -> None:
+    advice = " ".join(REMOVED_OPTIONS.values())
+    lines = set(
+        re.findall(r"(?:[Tt]ype|by) kontronik-can-gw ([a-z](?:'[^']*'|\.\w|[^.:;,'])*)", advice)
+    )
+    assert len(lines) >= 6
+    for line in lines:
+        command, *words = shlex.split(line)
+        make_parser([command]).parse_args([command, *words])
+    keys = set(re.findall(r"Write (\w+ = \S+) into the table \[(\w+)\]", advice))
+    assert len(keys) >= 13
+    for key, table in keys:
+        number = re.sub(r"= [A-Z]+$", "= 5", key)
+        parse(tomllib.loads(f'[{table}]\n{number}\n[[esc]]\nport = "a"\n'), "")
+
+
+def test_a_published_recording_is_replayed_instead() -> None:
+    said = refused(2, "mqtt", "a.log", "--broker", "x")
+    replay, publish = re.findall(r"kontronik-can-gw ((?:replay|mqtt)[^,(]*)", said)
+    assert publish == "mqtt --channel vcan0 --broker HOST."
+    for line in (replay, publish):
+        make_parser([line.split()[0]]).parse_args(line.split())
+    assert "(a CAN log: canplayer -I a.log vcan0=can0)" in said
+
+
+# --- CAN adapters
+
+
+@pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.bin --on can"])
+def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some adapters are written to at opening; to an ESC nothing may be written."""
+    monkeypatch.chdir(tmp_path)
+    port = tmp_path / "ttyESC"
+    port.touch()
+    (tmp_path / "x.bin").write_bytes(b"KODL")
+    file = configuration(tmp_path, port)
+    adapter = ["--interface", "slcan", "--channel", f"{port}@115200"]
+    assert "nothing may be sent to an ESC" in refused(2, *words.split(), "-c", file, *adapter)
+    assert port.read_bytes() == b""

@@ -45,7 +45,7 @@ def folder(tree: Tree, own: bool = False) -> Finding:
         ({"NRestarts": "7"}, "service", WARNING, "journalctl"),
         ({}, "service", OK, ""),
         ({"UnitFileState": "disabled"}, "service_enabled", NOTE, "systemctl enable"),
-        ({"User": "bob"}, "user", NOTE, "sudo -u bob kontronik-can-gw doctor"),
+        ({"User": "bob"}, "user", NOTE, f"sudo -u bob kontronik-can-gw doctor -c {CONFIG}"),
     ],
 )
 def test_how_the_service_fares_is_reported(

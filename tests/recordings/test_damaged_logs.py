@@ -90,8 +90,17 @@ def test_rubbish_between_lines_costs_no_frame(tmp_path: Path, format_: str, rubb
             "damaged after 9 frames (an object of 0 bytes)",
         ),
         (35, b"\x10", slice(9, 10), "1 damaged frame left out"),
+        (8, struct.pack("<L", 5000), slice(9, 30), "the last frame is cut off"),
+        *(
+            (
+                8,
+                struct.pack("<L", size),
+                slice(9, 30),
+                f"damaged after 9 frames (an object of {size} bytes)",
+            )
+            for size in (31, (1 << 20) + 1, 0x7FFFFFFF, 0xFFFFFFFF)
+        ),
     ],
-    ids=["a frame of size 0", "another object of size 0", "a DLC of 16"],
 )
 def test_of_a_damaged_blf_file_the_frames_before_the_damage_are_read(
     tmp_path: Path, place: int, bits: bytes, lost: slice, told: str
@@ -161,3 +170,64 @@ def test_a_clock_that_was_set_leaves_nothing_out(tmp_path: Path) -> None:
     path = tmp_path / "log.log"
     write_log(path, "candump", items, 0)
     assert read_log(path) == (items, [])
+
+
+@pytest.mark.parametrize("size", [15, 0x7FFFFFFF, 0xFFFFFFFF])
+def test_a_container_of_an_impossible_size_is_damage(tmp_path: Path, size: int) -> None:
+    """python-can takes all the rest for it, of which it unpacks the first."""
+    items = at_wall(some_frames(9_000))
+    path = tmp_path / "log.blf"
+    write_log(path, "blf", some_frames(9_000))
+    content = bytearray(path.read_bytes())
+    assert content.count(b"LOBJ", 144) > 2
+    content[152:156] = struct.pack("<L", size)
+    path.write_bytes(content)
+    found, damage = read_log(path)
+    assert found == items[: len(found)] and 1000 < len(found) < len(items)
+    assert damage[0] == f"a container of {size} bytes at byte 144"
+
+
+TRC = """;$FILEVERSION={version}
+;$STARTTIME=45244.0
+;$COLUMNS=N,O,T,I,d,L,D
+{lines}"""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "2 1e999 DT 0123 Rx 1 22",
+        "2 -inf DT 0123 Rx 1 22",
+        "2 nan DT 0123 Rx 1 22",
+        "2 1e300 DT 0123 Rx 1 22",
+        "2 2.0 DT 0123 Rx 2 11 22 33 44 55 66 77 88",
+        "2 2.0 DT 0123 Rx 8 11 22 33",
+        "2 2.0 FD 0123 Rx 15 " + "11 " * 48,
+        "2 2.0 FD 0123 Rx 9 " + "11 " * 9,
+    ],
+)
+@pytest.mark.parametrize("first", [False, True])
+def test_a_line_of_trc_whose_time_or_length_cannot_be_is_damaged(
+    tmp_path: Path, line: str, first: bool
+) -> None:
+    path = tmp_path / "log.trc"
+    lines = ["1 1.0 DT 0123 Rx 1 11", line, "3 3.0 FD 0124 Rx 15 " + "22 " * 64]
+    at = 0 if first else 1
+    lines.insert(at, lines.pop(1))
+    path.write_text(TRC.format(version="2.1", lines="\n".join(lines) + "\n"))
+    found, damage = read_log(path)
+    assert [item[1].data for item in found] == [b"\x11", b"\x22" * 64]
+    assert damage == [f"1 damaged line: {at + 4}"]
+
+
+@pytest.mark.parametrize(
+    ("version", "count", "damage"), [("1.0", 2, []), ("1.2", 0, ["its file version is not known"])]
+)
+def test_trc_of_version_1_0_is_read_where_it_says_so(
+    tmp_path: Path, version: str, count: int, damage: list[str]
+) -> None:
+    path = tmp_path / "log.trc"
+    lines = "  1)    1.0  0123  2  00 11\n  2)    2.0  0123  1  RTR\n  3)    3.0  00000124  1  22\n"
+    path.write_text(TRC.format(version=version, lines=lines))
+    found, said = read_log(path)
+    assert (len(found), said) == (count, damage)

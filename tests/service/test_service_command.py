@@ -85,12 +85,24 @@ def test_uninstall_removes_what_install_wrote_and_keeps_the_configuration(root: 
     old = root / UNITS / "kontronik-can-gw.service.d/prometheus.conf"  # of 0.5.0
     old.parent.mkdir(parents=True)
     old.touch()
+    networks = [
+        root / f"etc/systemd/network/50-kontronik-can-gw-can0.{end}" for end in ("link", "network")
+    ]
+    networks[0].parent.mkdir()
+    for path in networks:
+        path.write_text("of 0.5.0")
     assert f"{old}: removed" in install(root).err
     install(root, "--metrics", "--mqtt")
     edit(root)
     install(root, "--metrics")
-    uninstall(root)
-    assert tree(root) == [CONFIGURATION]
+    example = networks[1].with_suffix(".network.example")
+    example.touch()
+    kept = uninstall(root).splitlines()[-1]
+    assert [str(path) in kept for path in (*networks, example)] == [True, True, False]
+    assert {path.read_text() for path in networks} == {"of 0.5.0"}
+    assert tree(root) == sorted(
+        [CONFIGURATION, *(str(path.relative_to(root)) for path in networks)]
+    )
     assert "nothing is installed" in uninstall(root)
 
 
@@ -220,3 +232,8 @@ def test_a_program_that_a_unit_cannot_hold_or_its_user_not_reach_is_refused(
     (root / "opt").chmod(0o700)
     with pytest.raises(UserError, match="the service's user cannot reach it: /"):
         service._check_program(f"{root}{EXECUTABLE}", is_own=False)
+
+
+def test_a_service_may_have_the_name_of_a_removed_action(root: Path) -> None:
+    assert install(root, "--instance", "status").code == 0
+    assert (root / "etc/kontronik-can-gw/status.toml").exists()

@@ -14,9 +14,10 @@ _MIN_BYTES = 1_000_000
 
 
 class Unit(NamedTuple):
-    """A systemd unit: its properties as `systemctl show` has them."""
+    """A systemd unit, the configuration that it runs, and its properties as `systemctl show` has them."""
 
     name: str
+    config: str
     shown: dict[str, str]
 
     @property
@@ -26,7 +27,7 @@ class Unit(NamedTuple):
 
 
 def unit_of(machine: Machine, config: str) -> Unit | None:
-    """The unit for a configuration file; None where systemd has none."""
+    """The unit for a configuration file, by its absolute path; None where systemd has none."""
     path = PurePath(config)
     is_instance = str(path.parent) == f"/etc/{NAME}" and path.stem != "gateway"
     name = f"{NAME}@{path.stem}.service" if is_instance else f"{NAME}.service"
@@ -36,7 +37,7 @@ def unit_of(machine: Machine, config: str) -> Unit | None:
     shown = dict(line.partition("=")[::2] for line in lines)
     if shown.get("LoadState") != "loaded":
         return None
-    return Unit(name, shown)
+    return Unit(name, config, shown)
 
 
 def check_service(machine: Machine, findings: Findings, unit: Unit | None) -> None:
@@ -56,7 +57,8 @@ def check_service(machine: Machine, findings: Findings, unit: Unit | None) -> No
         findings.say("machine.service_enabled", "no", unit=unit.name)
     user = unit.shown.get("User") or "root"
     if user != machine.user:
-        findings.say("machine.user", "other", unit=unit.name, user=user, me=machine.user)
+        names = {"unit": unit.name, "user": user, "me": machine.user, "file": unit.config}
+        findings.say("machine.user", "other", **names)
 
 
 def check_folder(

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from can import Message
 
 logging.getLogger("can.io").setLevel(logging.CRITICAL)  # what it says is said here
-_MIN_OBJECT = 32
+_MIN_OBJECT, _MAX_OBJECT = 32, 1 << 20
+"""Bytes of an object in a container of a BLF file: a larger one would gather all that follows it."""
 _MS = 1_000_000
 
 
@@ -75,7 +76,7 @@ class _SoundObjects(BLFReader):
         at = 0
         while (found := data.find(b"LOBJ", at, at + 8)) >= 0 and found + 12 <= len(data):
             size = int.from_bytes(data[found + 8 : found + 12], "little")
-            if size < _MIN_OBJECT:
+            if not _MIN_OBJECT <= size <= _MAX_OBJECT:
                 yield from super()._parse_container(data[:found])
                 raise BLFParseError(f"an object of {size} bytes")
             at = found + size
@@ -96,9 +97,29 @@ class BlfReader(LibraryReader):
         if size < reader.file_size < 1 << 48:
             sizes = f"{size} of its {reader.file_size} bytes are there"
             damage.notes.append(f"the file is cut off: {sizes}")
+        elif problem := _faulty_size(file, size):
+            damage.notes.append(problem)
         if reader.start_timestamp >= OLDEST_WALL_S:
             self.wall_start_ns = round(reader.start_timestamp * 1000) * _MS
         reader.start_timestamp = 0.0
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        yield from super().__iter__()
+        if self._reader is not None and self._reader._tail.strip(b"\0"):
+            self._damage.notes.append("the last frame is cut off")
+
+
+def _faulty_size(file: BinaryIO, end: int) -> str | None:
+    """What is wrong with the size of a container, which python-can believes; the file stays where it is."""
+    first = at = file.tell()
+    problem = None
+    while problem is None and len(head := file.read(16)) == 16 and head.startswith(b"LOBJ"):
+        size = int.from_bytes(head[8:12], "little")
+        if size < len(head) or at + size > end:
+            problem = f"a container of {size} bytes at byte {at}"
+        at = file.seek(at + size + size % 4)
+    file.seek(first)
+    return problem
 
 
 class Mf4Reader(LibraryReader):

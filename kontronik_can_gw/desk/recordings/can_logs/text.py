@@ -17,6 +17,8 @@ from kontronik_can_gw.lean import without_asammdf
 SECOND_NS = 1_000_000_000
 OLDEST_WALL_S = 631_152_000
 """1990: what is earlier is no Unix time but seconds since a start."""
+MAX_S = 1 << 31
+"""A time of a frame is shorter; python-can gives any number, infinite ones too."""
 LONGEST_LINE = 4096
 """Bytes; a line of any of these formats is far shorter."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -39,7 +41,9 @@ def frame_of(message: Any) -> TimedFrame | None:
     if message.is_error_frame or message.is_remote_frame:
         return None
     data, dlc = bytes(message.data), message.dlc
-    if (dlc > 15 and not message.is_fd) or len(data) < (dlc if message.is_fd else min(dlc, 8)):
+    if (dlc > 15 and not message.is_fd) or len(data) != (dlc if message.is_fd else min(dlc, 8)):
+        raise ValueError
+    if not abs(message.timestamp) < MAX_S:
         raise ValueError
     frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
     time_ns = round(message.timestamp * SECOND_NS)
@@ -248,6 +252,10 @@ _TRC_HEAD = re.compile(
 )
 
 
+_NEWER_TRC = re.compile(r"\$FILEVERSION=(?!1\.0\s)")
+"""python-can reads a file without a version as 1.0, and does not know that some say so."""
+
+
 def trc_line(line: bytes) -> "re.Match[bytes] | None":
     """A line of the head."""
     return _TRC_HEAD.match(line)
@@ -259,13 +267,15 @@ class TrcReader(TextReader):
     def _read_head(self, lines: list[bytes]) -> None:
         with without_asammdf():
             from can.io.trc import TRCFileVersion, TRCReader
+            from can.util import dlc2len
         head = b"".join(line for line in lines if line.startswith(b";")).decode("latin-1")
+        self._length_of_code = dlc2len
         self._parser = parser = TRCReader(io.StringIO(head))
         try:
             parser._extract_header()
         except (ValueError, OverflowError):
             self._damage.notes.append("its head is damaged")
-        if parser.file_version is TRCFileVersion.UNKNOWN and "$FILEVERSION=" in head:
+        if parser.file_version is TRCFileVersion.UNKNOWN and _NEWER_TRC.search(head):
             parser._parse_cols = lambda _: None
             self._damage.notes.append("its file version is not known")
         if parser._start_time >= OLDEST_WALL_S:
@@ -277,5 +287,7 @@ class TrcReader(TextReader):
         if text.startswith(";"):
             return None
         message = self._parser._parse_cols(tuple(text.split(maxsplit=self._parser._num_columns)))
+        if message is not None and message.is_fd:  # its length, not the code, as in other formats
+            message.dlc = self._length_of_code(message.dlc)
         found = None if message is None else frame_of(message)
         return found and found._replace(time_ns=round(found.time_ns, -3))
