@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -90,10 +89,3 @@ def test_the_pace_is_that_of_the_recording() -> None:
     assert max(slept) <= 1.0
     fast = Pace(None, lambda: 0, lambda _s: pytest.fail("slept"))
     assert all(fast.wait(when) for when in (0, SECOND, 100 * SECOND))
-
-
-def test_a_pause_ends_when_it_is_stopped() -> None:
-    pace = Pace(1.0)
-    assert pace.wait(0)
-    threading.Timer(0.05, pace.stop).start()
-    assert not pace.wait(3600 * SECOND)

@@ -19,7 +19,6 @@ BA_DEF_DEF_ "GenMsgCycleTime" 0;
 BA_DEF_DEF_ "GenMsgSendType" "Event";
 """
 ON_CHANGE = 'BA_ "GenMsgSendType" BO_ 256 2;\n'
-EACH_CHANGE_AND_100_MS = 'BA_ "GenMsgSendType" BO_ 256 4;\nBA_ "GenMsgCycleTime" BO_ 256 100;\n'
 PERIOD = 10 * MS
 ESC = EscSettings("esc1")
 SPEED = ' SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
@@ -120,25 +119,6 @@ def test_a_read_of_many_old_frames_is_no_flood_of_link_changes() -> None:
     esc = bench.gateway.escs[0]
     assert bench.gateway.take_link_changes() == [0]
     assert (esc.losses, esc.late_frames > 20, sent[-1][0]) == (0, True, 99)
-
-
-def pages(*names: str) -> str:
-    """A multiplexed message: page n has the n-th of the names."""
-    signals = (
-        f' SG_ {name} m{n} : 8|16@1+ (0.01,0) [0|0] "V" Car\n' for n, name in enumerate(names)
-    )
-    return ' SG_ Page M : 0|4@1+ (1,0) [0|0] "" Car\n' + "".join(signals)
-
-
-def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others() -> None:
-    bench = Bench(
-        pages("BatteryVoltage", "BecVoltage", "MinBatteryVoltage"), EACH_CHANGE_AND_100_MS
-    )
-    sent: list[int] = []
-    for n in range(300):
-        sent += [data[0] for data in bench.read(wire(battery_voltage=n))]
-    assert sent.count(0) >= 297
-    assert sent.count(1) >= 9 and sent.count(2) >= 9
 
 
 def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:
