@@ -208,7 +208,9 @@ def test_line_errors_are_counted_by_kind_over_every_plugging_in(
     assert bench.gateway.escs[0].line_errors == 13
 
 
-def test_a_diagnosis_is_said_once(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_diagnosis_is_said_once_and_is_over_while_telemetry_comes(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     esc = bench.escs[0]
     for n in range(1, 400):
@@ -226,25 +228,13 @@ def test_a_diagnosis_is_said_once(bench: Bench, caplog: pytest.LogCaptureFixture
     esc.serve(21 * SECOND)
     esc.log.follow_link(21 * SECOND)
     assert caplog.messages[-1] == "left: telemetry ok (V4)"
-    assert esc.log.complaint == ""
-
-
-def test_there_is_no_diagnosis_while_telemetry_comes_and_one_when_not(bench: Bench) -> None:
-    esc = bench.escs[0]
-    assert (esc.facts().diagnosis or "").startswith("no bytes"), (
-        "of an ESC that is off at the start"
-    )
-    bench.port().reads = [LIVE]
-    esc.serve(SECOND)
-    for n in range(1, 20):
-        now = SECOND + n * 100 * MS
+    assert (esc.log.complaint, esc.facts().diagnosis) == ("", None)
+    for now in range(21 * SECOND, 23 * SECOND, 100 * MS):
         bench.gateway.advance(now)
         esc.report(now)
-        said = esc.facts().diagnosis
-        if now <= SECOND + 1200 * MS:
-            assert said is None, "frames come, or did so a moment ago"
-    assert said is not None
-    assert said.startswith("no bytes")
+        if now <= 22200 * MS:
+            assert esc.facts().diagnosis is None, "frames come, or did so a moment ago"
+    assert (esc.facts().diagnosis or "").startswith("no bytes")
 
 
 def test_a_usb_adapter_is_known_by_numbers_and_interface(
