@@ -10,35 +10,26 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from statistics_bench import moment_of
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import statistics as statistics_module
-from kontronik_can_gw.runtime.facts import CanFacts, GatewayFacts, ProgramFacts
-from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.worker import Report
+from kontronik_can_gw.signals.plan import Layout
 
 PATIENCE = 60.0
 """Seconds that something may take on a busy machine before a test fails."""
 
 
 def numbered(number: int) -> Moment:
-    """A moment of a gateway without an ESC."""
-    gateway = GatewayFacts(
-        [],
-        GatewayStatus(sent_frames=number, received_frames=3 * number),
-        [],
-        {},
-        None,
-        "Python",
-        "",
-    )
-    can = CanFacts("socketcan", "can0", None, True)
-    now = number * SECOND
-    return Moment(gateway, now, 0.0, ProgramFacts("x"), ProcessFacts(), [], can)
+    """A moment of a gateway that has sent so many frames."""
+    gateway = Gateway([EscSettings("esc1")], Layout("", "", ()), 0)
+    gateway.status.sent_frames, gateway.status.received_frames = number, 3 * number
+    return moment_of(gateway, number * SECOND)
 
 
 def until(condition: Callable[[], bool]) -> None:
