@@ -11,7 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
 
-from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, block_of, id_and_mask
+from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.transmit_queue import Sent
 
@@ -68,13 +68,7 @@ class CanPort(ABC):
         self.state = state
 
     def set_receive_ids(self, ids: Collection[int]) -> None:
-        """From now on receive data frames with these ids, in these blocks, and no others. ValueError for a number that is neither."""
-        if any(
-            not 0 <= can_id <= MAX_STANDARD_ID
-            and not EXTENDED <= id_and_mask(can_id)[0] <= EXTENDED | MAX_EXTENDED_ID
-            for can_id in ids
-        ):
-            raise ValueError(f"no identifiers: {sorted(ids)}")
+        """From now on receive data frames with these ids, in these blocks, and no others."""
         self._ids = frozenset(ids)
         self._blocks = tuple(can_id for can_id in ids if can_id >> 32)
         self._filter()

@@ -11,7 +11,6 @@ the old one (the new one, if only the last step failed).
 
 import contextlib
 import os
-import re
 from pathlib import Path
 
 from kontronik_can_gw.canopen.storage import Stored, decode
@@ -19,8 +18,6 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.disk import reason_of, sync_folder, write_new
 from kontronik_can_gw.runtime.locks import Taken, lock_file
 from kontronik_can_gw.runtime.worker import Handover, Worker
-
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,11}")
 
 
 class ParameterStore:
@@ -39,7 +36,7 @@ class ParameterStore:
 
         Where no lock can be made nothing can be saved either: returns the reason.
         """
-        path = self._path(name)
+        path = parameter_file(self._folder, name)
         try:
             _make_folder(path.parent)
             self._lock_files.append(lock_file(str(path.with_suffix(".lock"))))
@@ -55,10 +52,9 @@ class ParameterStore:
         """Read what a node kept; to be called before its first saving.
 
         A missing file is an empty ``Stored``, a damaged or unreadable one too, and then the reason is there. A damaged file is kept as
-        ``NAME.params.damaged``, in place of an older one of that name. What a killed writer left half is removed. ValueError for an
-        invalid name.
+        ``NAME.params.damaged``, in place of an older one of that name. What a killed writer left half is removed.
         """
-        path = self._path(name)
+        path = parameter_file(self._folder, name)
         with contextlib.suppress(OSError):
             _temporary(path).unlink()
         try:
@@ -80,9 +76,8 @@ class ParameterStore:
     def save(self, name: str, data: bytes) -> bool:
         """Let ``data`` become the file's content; never blocks. True: exactly one result follows; results come in the order of the savings.
 
-        False: the system gives no thread, or the store is closed; no result follows. ValueError for an invalid name.
+        False: the system gives no thread, or the store is closed; no result follows.
         """
-        self._path(name)
         return self._worker.start() and self._worker.put((name, data))
 
     def fileno(self) -> int:
@@ -105,13 +100,6 @@ class ParameterStore:
         self._lock_files = []
         return has_ended
 
-    def _path(self, name: str) -> Path:
-        if _NAME.fullmatch(name) is None:
-            raise ValueError(
-                f"{name!r} is not a node's name: a letter, then up to 11 letters, digits or underscores"
-            )
-        return parameter_file(self._folder, name)
-
     def _write_all(self, savings: list[tuple[str, bytes]]) -> None:
         for name, data in savings:
             try:
@@ -121,7 +109,7 @@ class ParameterStore:
             self._results.put((name, problem))
 
     def _write(self, name: str, data: bytes) -> str | None:
-        path = self._path(name)
+        path = parameter_file(self._folder, name)
         temporary = _temporary(path)
         try:
             _make_folder(self._folder)

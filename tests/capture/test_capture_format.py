@@ -4,7 +4,6 @@ import random
 import struct
 import zlib
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,16 +15,10 @@ from kontronik_can_gw.capture.format import (
     Kind,
     Scanner,
     block,
-    counters_data,
     data_payload,
     frame_data,
-    json_payload,
-    number_data,
-    read_counters,
     read_entries,
     read_frame,
-    read_json,
-    read_number,
 )
 from kontronik_can_gw.frames import CanFrame
 
@@ -68,38 +61,8 @@ def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> No
     assert data_payload(found) == data
 
 
-def test_version_1_has_no_times_of_arrival_and_version_2_is_refused_without_them() -> None:
-    """As 0.5.0 wrote it: bytes of an ESC, a CAN frame, time that passes."""
-    table = b"".join(
-        struct.pack("<QBBHI", *head) for head in ((7, 1, 0, 0, 3), (8, 2, 0, 0, 6), (9, 3, 0, 0, 0))
-    )
-    payload = struct.pack("<I", 3) + table + b"abc" + bytes.fromhex("0106000000 40")
-    first, second, third = read_entries(payload, 1)
-    assert (first.data, first.came_ns, second.came_ns, third.kind) == (
-        b"abc",
-        None,
-        None,
-        Kind.ADVANCE,
-    )
-    assert read_frame(second.data) == CanFrame(0x601, b"\x40")
-    with pytest.raises(ValueError, match="time of arrival"):
-        list(read_entries(payload))
-
-
 @given(
-    st.lists(st.tuples(st.sampled_from([b"H", b"D", b"I", b"E"]), payloads), max_size=6),
-    st.integers(1, 300),
-)
-def test_blocks_come_back_however_cut(listed: list[tuple[bytes, bytes]], size: int) -> None:
-    data = b"".join(block(kind, number, payload) for number, (kind, payload) in enumerate(listed))
-    found = scanned(data, size)
-    assert [(b.kind, b.payload) for b in found if isinstance(b, Block)] == listed
-    assert not any(isinstance(b, Damage) for b in found)
-    assert [b.number for b in found if isinstance(b, Block)] == list(range(len(listed)))
-
-
-@given(
-    st.lists(payloads, min_size=1, max_size=5),
+    st.lists(payloads, max_size=5),
     st.lists(st.binary(max_size=60), min_size=6, max_size=6),
     st.data(),
 )
@@ -112,9 +75,10 @@ def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
         places.append(len(stream))
         stream += block(b"D", number, payload)
     stream += rubbish[-1]
-    found = scanned(stream, data.draw(st.integers(1, len(stream))))
+    found = scanned(stream, data.draw(st.integers(1, max(1, len(stream)))))
     blocks = [b for b in found if isinstance(b, Block)]
     assert [(b.offset, b.payload) for b in blocks] == list(zip(places, listed, strict=True))
+    assert [b.number for b in blocks] == list(range(len(listed)))
     damaged = sum(d.length for d in found if isinstance(d, Damage))
     assert damaged == sum(len(rubbish[n]) for n in range(len(listed))) + len(rubbish[-1])
 
@@ -156,17 +120,3 @@ def test_a_block_that_claims_to_be_huge_is_none() -> None:
 )
 def test_a_can_frame_comes_back(frame: CanFrame) -> None:
     assert read_frame(frame_data(frame)) == frame
-
-
-def test_numbers_counters_and_json_come_back() -> None:
-    assert read_number(number_data(2**63)) == 2**63
-    assert read_counters(counters_data(tuple(range(8)))) == tuple(range(8))
-    content = {"a": [1, 2.5, None], "µ": "°\udcff"}
-    assert read_json(json_payload(content)) == content
-
-
-@pytest.mark.parametrize("read", [read_frame, read_number, read_counters])
-def test_data_that_is_too_short_is_refused(read: object) -> None:
-    assert callable(read)
-    with pytest.raises(ValueError):
-        read(b"abc")

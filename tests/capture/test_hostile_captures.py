@@ -15,7 +15,7 @@ from capture_bench import START, Bench, made
 from kontronik_can_gw.capture import format as capture
 from kontronik_can_gw.capture.format import (
     MAGIC,
-    Block,
+    Damage,
     Entry,
     Kind,
     Scanner,
@@ -147,8 +147,7 @@ def test_what_only_looks_like_blocks_costs_little(
 ) -> None:
     """Heads that promise megabytes, one after the other: each would have to be read to its end."""
     head = struct.pack("<4scBHIII", MAGIC, b"D", 0, 0, 8_000_000, 8_000_000, 0) + b"\0\0\0\0"
-    good = block(b"D", 7, b"good")
-    data = head * 3000 + bytes(9_000_000) + good
+    data = head * 3000 + bytes(9_000_000)
     costs = [0]
     real = capture._payload
 
@@ -158,12 +157,8 @@ def test_what_only_looks_like_blocks_costs_little(
 
     monkeypatch.setattr(capture, "_payload", counting)
     scanner = Scanner()
-    found = scanner.feed(data) + scanner.flush()
+    assert all(isinstance(each, Damage) for each in scanner.feed(data) + scanner.flush())
     assert 1 << 27 < costs[0] < 1 << 29, "of 24 GB that are promised"
-    assert [b.payload for b in found if isinstance(b, Block)] in ([b"good"], [])
-    few = Scanner()
-    found = few.feed(head * 5 + bytes(9_000_000) + good) + few.flush()
-    assert [b.payload for b in found if isinstance(b, Block)] == [b"good"]
 
 
 def test_a_file_of_nothing_but_damage_is_summed_up(header: dict[str, Any], tmp_path: Path) -> None:

@@ -108,23 +108,26 @@ def test_entries_are_in_the_file_in_order(tmp_path: Path) -> None:
     assert bed.it.facts.bytes == file.stat().st_size
 
 
-def test_parts_by_size_go_on_from_each_other(tmp_path: Path) -> None:
-    bed = Bed(tmp_path, part_bytes=3000)
-    for at in range(0, 2000, 100):
-        before = bed.it.facts.bytes
-        bed.put(100, at)
-        until(lambda before=before: bed.it.facts.bytes > before)  # type: ignore[misc]
-    assert bed.closed()[0] == entries(2000)
+def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:
+    bench = Bench(*made(2, canopen=True)).live(4, 12)
+    header = bench.setup.header() | {"created_ns": START, "state": {}}
+    bed = Bed(tmp_path, time.monotonic_ns, header=header, part_bytes=40_000)
+    for at in range(0, len(bench.entries), 1000):
+        for entry in bench.entries[at : at + 1000]:
+            bed.it.put(*entry)
+        until(lambda: not bed.it._entries and bed.it._worker.busy_since is None)
+    bed.it.close()
     files = sorted(tmp_path.iterdir())
-    assert len(files) > 3
+    assert len(files) > 2
     assert [f.stem.rpartition("-")[2] for f in files] == [f"{n:05d}" for n in range(len(files))]
     for path in (tmp_path, tmp_path / files[0].name.rpartition("-")[0]):
         with open_input(path) as found:
-            assert isinstance(found, CaptureInput)
-            assert sum(1 for _ in found.entries()) >= 2000
+            frames = [frame for frame in found.frames() if not frame.received]
             assert found.damage == []
+        assert len(frames) > 1000
+        assert frames == bench.sent
     files[1].unlink()
-    assert len(recorded(tmp_path, "1 parts of the run in front of it are not given")) < 2000
+    recorded(tmp_path, "1 parts of the run in front of it are not given")
 
 
 def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
@@ -331,20 +334,3 @@ def test_a_header_that_is_damaged_is_there_once_more(tmp_path: Path) -> None:
     for place in (0, 100, 5000):
         file.write_bytes(whole[:place] + bytes((whole[place] ^ 0x10,)) + whole[place + 1 :])
         assert recorded(tmp_path, "are damaged") == entries(100)
-
-
-def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:
-    bench = Bench(*made(2, canopen=True)).live(4, 12)
-    header = bench.setup.header() | {"created_ns": START, "state": {}}
-    bed = Bed(tmp_path, time.monotonic_ns, header=header, part_bytes=40_000)
-    for at in range(0, len(bench.entries), 1000):
-        for entry in bench.entries[at : at + 1000]:
-            bed.it.put(*entry)
-        until(lambda: not bed.it._entries and bed.it._worker.busy_since is None)
-    bed.it.close()
-    assert len(list(tmp_path.iterdir())) > 2
-    with open_input(tmp_path) as found:
-        frames = [frame for frame in found.frames() if not frame.received]
-        assert found.damage == []
-    assert len(frames) > 1000
-    assert frames == bench.sent

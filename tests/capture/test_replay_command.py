@@ -4,18 +4,15 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import pytest
 from capture_bench import START, Bench, capture, made
 from command_line import refused, written
 
 from kontronik_can_gw.capture.format import Kind
-from kontronik_can_gw.desk.recordings.pacing import Pace
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.telemetry import SECOND
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 
@@ -68,32 +65,3 @@ def test_a_terminal_has_the_bytes_of_its_esc(tmp_path: Path) -> None:
         os.close(fd)
         assert player.wait(600) == 0
     assert found == b"".join(e.data for e in bench.entries if e.kind == Kind.BYTES and e.esc == 1)
-
-
-# --- recorded time against real time
-
-
-def test_the_pace_is_that_of_the_recording() -> None:
-    now = 50 * SECOND
-    slept: list[float] = []
-
-    def sleep(seconds: float) -> None:
-        nonlocal now
-        slept.append(seconds)
-        now += int(seconds * SECOND) + 2 * MS  # always a little late
-
-    pace = Pace(2.0, lambda: now, sleep)
-    for when in range(1000, 1000 + 10 * SECOND, 500 * MS):
-        assert pace.wait(when)
-    assert abs(now - 50 * SECOND - 4.75 * SECOND) <= 3 * MS  # no lateness adds up
-    assert pace.latest_ns <= 3 * MS
-    assert max(slept) <= 1.0
-    fast = Pace(None, lambda: 0, lambda _s: pytest.fail("slept"))
-    assert all(fast.wait(when) for when in (0, SECOND, 100 * SECOND))
-
-
-def test_a_pause_ends_when_it_is_stopped() -> None:
-    pace = Pace(1.0)
-    assert pace.wait(0)
-    threading.Timer(0.05, pace.stop).start()
-    assert not pace.wait(3600 * SECOND)

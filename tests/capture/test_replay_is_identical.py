@@ -56,24 +56,6 @@ def test_frames_and_times_are_the_live_ones(
     assert received > 3
 
 
-def test_frames_that_were_thrown_away_are_not_replayed() -> None:
-    """The interface was down when they were to be handed over: a NOT_SENT entry after the turn in which they were made."""
-    bench = Bench(*made(1))
-    gateway, now = bench.gateway, START
-    gateway.port(0, True, now)
-    gateway.start(now)
-    bench.take(now)
-    for n in range(1, 30):
-        now += 50 * 10**6
-        bench._is_open = not 10 <= n < 20
-        gateway.advance(now)
-        bench.take(now)
-    assert sum(entry.kind == 18 for entry in bench.entries) > 3
-    times = {frame.time_ns for frame in replayed(bench)}
-    assert times == {frame.time_ns for frame in bench.sent}
-    assert not [at for at in times if START + 450 * 10**6 < at < START + 1000 * 10**6]
-
-
 def test_a_marked_replay_differs_in_the_state_and_nowhere_else() -> None:
     bench = Bench(*made(1)).live(3, 4, wild=False)
     found = bench.setup.database()
@@ -93,15 +75,3 @@ def test_a_marked_replay_differs_in_the_state_and_nowhere_else() -> None:
     assert differing == {"GatewayState"}
     assert states[-1] == "Stopping"
     assert set(states[:-1]) == {"Replay"}
-
-
-def test_a_setup_comes_back_from_its_header() -> None:
-    setup = Bench(*made(3, True, bind={"EscEnergy.EnergyAlive": 3.0})).setup
-    again = CaptureSetup.of(read_json(json_payload(setup.header())))
-    assert again.header() == setup.header()
-    assert again.escs == setup.escs
-    assert again.dbc_settings == setup.dbc_settings
-    assert again.canopen is not None
-    assert setup.canopen is not None
-    assert again.canopen.settings == setup.canopen.settings
-    assert again.canopen.eds.data == setup.canopen.eds.data

@@ -38,7 +38,7 @@ for now in range(0, 3_000_000_000, 10_000_000):
 fields = [f for f in fields_of_values(config.escs) if f.source != "dummy"]
 read = [reader_of(v) for f, v in values_of_fields(fields, config.escs) if f.esc == 1]
 port = PortFacts("esc", "/dev/null", open=True)
-status = json.loads(_esc(gateway.escs[1], port, gateway.status, now))
+status = _esc(gateway.escs[1], port, gateway.status, now)
 status["values"].pop("dummy", None)
 print(json.dumps({
     "first": LiveData._fields[0],

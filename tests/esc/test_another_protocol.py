@@ -1,6 +1,5 @@
 """The recipe for another ESC protocol: kiss.py goes through the whole gateway, beside a KONTRONIK ESC, without a change of the package."""
 
-import json
 import re
 import termios
 from dataclasses import asdict, replace
@@ -161,7 +160,7 @@ def test_the_status_shows_it() -> None:
     flight = Flight()
     flight.send(OLD, frame(20, 2_400, 1_234, 55, 210))
     port = PortFacts("kiss", "/dev/zero", open=True)
-    document = json.loads(_esc(flight.gateway.escs[1], port, flight.gateway.status, flight.now))
+    document = _esc(flight.gateway.escs[1], port, flight.gateway.status, flight.now)
     assert document["values"]["battery_current"] == 12.34
     assert document["values"]["bec_voltage"] is None
     assert document["counters"]["live"] == 1

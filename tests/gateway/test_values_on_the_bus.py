@@ -1,6 +1,7 @@
 """What a gateway sends at a known time, from bytes to frames: values that are easily taken for others, or not sent at all."""
 
 import pytest
+from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
@@ -11,24 +12,21 @@ from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSetti
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
 
-HEAD = 'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Gw Car\n\nBO_ 256 M: 8 Gw\n'
-ATTRIBUTES = """
-BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
-BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange";
-BA_DEF_DEF_ "GenMsgCycleTime" 0;
-BA_DEF_DEF_ "GenMsgSendType" "Event";
-"""
+EVENT = 'BA_ "GenMsgSendType" BO_ 256 1;\n'
 ON_CHANGE = 'BA_ "GenMsgSendType" BO_ 256 2;\n'
-EACH_CHANGE_AND_100_MS = 'BA_ "GenMsgSendType" BO_ 256 4;\nBA_ "GenMsgCycleTime" BO_ 256 100;\n'
 PERIOD = 10 * MS
 ESC = EscSettings("esc1")
-SPEED = ' SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
+SPEED = Sig("ElectricalSpeed", 0, 32, unit="1/min")
+
+
+def text_of(signal: Sig, more: str = EVENT) -> str:
+    """A DBC with one message of one signal, as a rule sent with each live frame."""
+    return dbc_text([Msg("M", 256, 8, [signal])], more)
 
 
 def layout_of(text: str) -> Layout:
-    return prepare(
-        parse_database(text.encode(), "t.dbc"), "t.dbc", (ESC,), DbcSettings(), fd_allowed=True
-    )
+    database = parse_database(text.encode(), "t.dbc")
+    return prepare(database, "t.dbc", (ESC,), DbcSettings(), fd_allowed=True)
 
 
 def wire(**values: int) -> bytes:
@@ -38,8 +36,8 @@ def wire(**values: int) -> bytes:
 class Bench:
     """One message, as a rule sent with each live frame, of a gateway that is awake at each deadline."""
 
-    def __init__(self, signals: str, more: str = "") -> None:
-        self.gateway = Gateway((ESC,), layout_of(f"{HEAD}{signals}{ATTRIBUTES}{more}"), 0)
+    def __init__(self, signal: Sig, more: str = EVENT) -> None:
+        self.gateway = Gateway((ESC,), layout_of(text_of(signal, more)), 0)
         self.now = 0
         self.gateway.start(0)
         self.first = self.take()
@@ -76,7 +74,7 @@ class Bench:
         return [frame.data for frame in self.gateway.take_frames(self.now)]
 
 
-BEC_CURRENT = ' SG_ BecCurrent : 0|16@1+ (0.01,0) [0|655] "A" Car\n'
+BEC_CURRENT = Sig("BecCurrent", 0, 16, factor="0.01", maximum="655", unit="A")
 NO_BEC_CURRENT = 0xFFFF
 
 
@@ -102,11 +100,10 @@ def test_after_an_outage_of_the_bus_what_has_no_cycle_is_sent_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "per_second"), [("", "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)]
+    ("kind", "name", "per_second"), [(EVENT, "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)]
 )
 def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_second: int) -> None:
-    unit = "s" if name == "Uptime" else ""
-    bench = Bench(f' SG_ {name} : 0|32@1+ (1,0) [0|0] "{unit}" Car\n', kind)
+    bench = Bench(Sig(name, 0, 32, unit="s" if name == "Uptime" else ""), kind)
     good = wire(battery_voltage=5000)
     sent: list[bytes] = []
     for n in range(500):  # for 5 s; each tenth frame is damaged
@@ -122,26 +119,7 @@ def test_a_read_of_many_old_frames_is_no_flood_of_link_changes() -> None:
     assert (esc.losses, esc.late_frames > 20, sent[-1][0]) == (0, True, 99)
 
 
-def pages(*names: str) -> str:
-    """A multiplexed message: page n has the n-th of the names."""
-    signals = (
-        f' SG_ {name} m{n} : 8|16@1+ (0.01,0) [0|0] "V" Car\n' for n, name in enumerate(names)
-    )
-    return ' SG_ Page M : 0|4@1+ (1,0) [0|0] "" Car\n' + "".join(signals)
-
-
-def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others() -> None:
-    bench = Bench(
-        pages("BatteryVoltage", "BecVoltage", "MinBatteryVoltage"), EACH_CHANGE_AND_100_MS
-    )
-    sent: list[int] = []
-    for n in range(300):
-        sent += [data[0] for data in bench.read(wire(battery_voltage=n))]
-    assert sent.count(0) >= 297
-    assert sent.count(1) >= 9 and sent.count(2) >= 9
-
-
 def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:
     cycle = 'BA_ "GenMsgSendType" BO_ 256 "Cyclic";\nBA_ "GenMsgCycleTime" BO_ 256 20;\n'
-    (message,) = layout_of(f"\ufeff{HEAD}{SPEED}{ATTRIBUTES}{cycle}").messages
+    (message,) = layout_of("\ufeff" + text_of(SPEED, cycle)).messages
     assert message.cycle_ns == 20 * MS

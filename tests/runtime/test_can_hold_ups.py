@@ -120,18 +120,6 @@ def test_an_interface_that_opens_slowly_is_no_hold_up(
     made.loop.close()
 
 
-def test_requests_that_waited_are_answered_all_in_their_order(bench: Bench) -> None:
-    """More than are read at once."""
-    for n in range(300):
-        bench.world.bus.came(
-            REQUEST, bytes((0x40, n & 255, 0x99, 0, 0, 0, 0, 0)), bench.world.now + n * MS
-        )
-    bench.hold_up()
-    assert [data[1] for can_id, data in bench.take() if can_id == ANSWER] == [
-        n & 255 for n in range(300)
-    ]
-
-
 def test_a_transfer_that_cannot_go_on_is_aborted(bench: Bench) -> None:
     assert bench.ask("21 17 10 00 02 00 00 00").startswith("60")
     bench.hold_up(3 * SECOND)

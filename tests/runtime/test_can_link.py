@@ -116,6 +116,15 @@ class Bench:
         self.port.note_state(state)
         self.can._follow_reception(self.now)
 
+    def goes_off(self) -> None:
+        """The controller: the error frame, and what rtnetlink says from then on."""
+        self.kernel.facts = OFF._replace(running=False)
+        self.error_frame(CanState.BUS_OFF)
+
+    def changes(self, facts: LinkFacts, there: bool = True) -> None:
+        """The interface, which rtnetlink tells."""
+        self.kernel.facts, self.kernel.news, Port.there = facts, [facts], there
+
     def take(self) -> list[tuple[int, bytes]]:
         return self.port.take()
 
@@ -151,8 +160,7 @@ def test_behind_a_restart_the_node_boots_and_says_8140h_as_soon_as_the_queue_run
 ) -> None:
     """The kernel's order: error frame "restarted", then the queue is started, which rtnetlink tells; before that frames vanish."""
     bench.begin()
-    kernel.facts = OFF._replace(running=False)
-    bench.error_frame(CanState.BUS_OFF)
+    bench.goes_off()
     bench.turn(200)
     assert bench.take() == [], "nothing is handed to a controller that is off"
     assert bench.gateway.status.bus_off_count == 1
@@ -161,8 +169,7 @@ def test_behind_a_restart_the_node_boots_and_says_8140h_as_soon_as_the_queue_run
     if late_ms:
         bench.turn(late_ms)
         assert bench.take() == []
-    kernel.facts = ACTIVE
-    kernel.news = [ACTIVE]
+    bench.changes(ACTIVE)
     bench.turn(2)
     assert told(bench.take()) == ["boot-up", "8140", "0000"]
     bench.turn(3000)
@@ -175,8 +182,7 @@ def test_a_driver_that_reports_bus_off_late_makes_one_boot_up(
     kernel: Kernel,
 ) -> None:
     bench.begin()
-    kernel.facts = OFF._replace(running=False)
-    bench.error_frame(CanState.BUS_OFF)
+    bench.goes_off()
     bench.turn(50)
     bench.error_frame(CanState.ERROR_ACTIVE)
     kernel.facts = OFF  # it runs, and its driver has not noticed
@@ -201,13 +207,10 @@ def test_a_controller_that_nobody_restarts_costs_nothing_and_is_said_with_the_re
 
 
 def test_an_interface_that_comes_late_makes_one_boot_up(bench: Bench, kernel: Kernel) -> None:
-    kernel.facts = LinkFacts(exists=False)
-    Port.there = False
+    bench.changes(LinkFacts(exists=False), there=False)
     bench.start()
     bench.turn(3000)
-    Port.there = True
-    kernel.facts = ACTIVE
-    kernel.news = [ACTIVE]
+    bench.changes(ACTIVE)
     bench.turn(2)
     assert told(bench.take()) == ["boot-up"]
     bench.turn(2000)
@@ -216,18 +219,14 @@ def test_an_interface_that_comes_late_makes_one_boot_up(bench: Bench, kernel: Ke
 
 def test_old_news_of_a_link_does_not_close_what_was_opened(bench: Bench, kernel: Kernel) -> None:
     bench.begin()
-    kernel.facts = LinkFacts(exists=False)
-    Port.there = False
-    kernel.news = [LinkFacts(exists=False)]
+    bench.changes(LinkFacts(exists=False), there=False)
     bench.turn(100)
     assert not bench.can.is_open
-    Port.there = True
-    kernel.facts = ACTIVE
+    bench.changes(ACTIVE)
     bench.now += SECOND
     kernel.news = []
     bench.can.reopen(bench.now)  # by its own pause, before the kernel's news of the making are read
     port = bench.can.port
-    kernel.news = []
     bench.turn(100)
     assert bench.can.port is port
 
@@ -248,8 +247,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     bench.begin()
     caplog.clear()
-    kernel.facts = LinkFacts(exists=True, up=False)
-    kernel.news = [kernel.facts]
+    bench.changes(LinkFacts(exists=True, up=False))
 
     def is_down(_config: object) -> Port:
         raise socketcan_error(bench.can.config, 100)
@@ -258,8 +256,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
         patch.setattr(can_link, "open_can", is_down)
         bench.turn(5000)
     assert (bench.can.is_open, bench.gateway.status.can_state) == (False, CanState.DOWN)
-    kernel.facts = ACTIVE
-    kernel.news = [ACTIVE]
+    bench.changes(ACTIVE)
     bench.turn(100)
     down, back = caplog.messages
     assert down.startswith("CAN interface can0: is down. Start it: sudo ip link set can0 up")

@@ -356,10 +356,10 @@ def readers() -> list[threading.Thread]:
 
 
 @contextmanager
-def virtual() -> Iterator[tuple[DriverPort, can.BusABC]]:
+def virtual(**options: bool) -> Iterator[tuple[DriverPort, can.BusABC]]:
     """A port on a bus of its own, and another participant."""
     channel = f"reception-{os.getpid()}-{next(_numbers)}"
-    port = open_can(CanConfig("virtual", channel))
+    port = open_can(CanConfig("virtual", channel, options=options))
     assert isinstance(port, DriverPort)
     try:
         with can.Bus(interface="virtual", channel=channel) as other:
@@ -446,20 +446,13 @@ def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> N
 
 
 def test_own_frames_do_not_come_back_even_where_the_driver_is_told_to_return_them() -> None:
-    channel = f"own-{os.getpid()}"
-    config = CanConfig("virtual", channel, options={"receive_own_messages": True})
-    port = open_can(config)
-    try:
-        with can.Bus(interface="virtual", channel=channel) as other:
-            port.set_receive_ids({0x581})
-            assert port.send(CanFrame(0x581, b"own")) is Sent.OK
-            other.send(message(0x581, b"other"))
-            assert receive(port, 1) == [CanFrame(0x581, b"other")]
-            seen = other.recv(1)
-            assert seen is not None
-            assert bytes(seen.data) == b"own"
-    finally:
-        port.close()
+    with virtual(receive_own_messages=True) as (port, other):
+        port.set_receive_ids({0x581})
+        assert port.send(CanFrame(0x581, b"own")) is Sent.OK
+        other.send(message(0x581, b"other"))
+        assert receive(port, 1) == [CanFrame(0x581, b"other")]
+        seen = other.recv(1)
+        assert seen is not None and bytes(seen.data) == b"own"
 
 
 @pytest.mark.parametrize(

@@ -60,18 +60,6 @@ def test_what_comes_and_goes_is_summed_up_once_a_minute(
     assert told.messages[-1] == "lost"
 
 
-def test_a_condition_that_lasts_is_said_to_last(
-    told: pytest.LogCaptureFixture,
-) -> None:
-    conditions = FaultLog()
-    for n in range(FLAPPING):
-        conditions.begin("x", "bad", n * SECOND)
-        if n < FLAPPING - 1:
-            conditions.end("x", "good", n * SECOND + 1)
-    conditions.advance(2 * MINUTE)
-    assert told.messages[-1] == "x: no longer comes and goes, it lasts: bad"
-
-
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
 def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, int]]) -> None:
     conditions, now, lines = FaultLog(), 0, 0

@@ -1,7 +1,6 @@
 """One ESC's port in the loop: which adapter is opened, what is counted, what is said. Time is passed in, ports are scripted."""
 
 import errno
-import fcntl
 import logging
 import os
 import termios
@@ -209,7 +208,9 @@ def test_line_errors_are_counted_by_kind_over_every_plugging_in(
     assert bench.gateway.escs[0].line_errors == 13
 
 
-def test_a_diagnosis_is_said_once(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_diagnosis_is_said_once_and_is_over_while_telemetry_comes(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     esc = bench.escs[0]
     for n in range(1, 400):
@@ -227,25 +228,13 @@ def test_a_diagnosis_is_said_once(bench: Bench, caplog: pytest.LogCaptureFixture
     esc.serve(21 * SECOND)
     esc.log.follow_link(21 * SECOND)
     assert caplog.messages[-1] == "left: telemetry ok (V4)"
-    assert esc.log.complaint == ""
-
-
-def test_there_is_no_diagnosis_while_telemetry_comes_and_one_when_not(bench: Bench) -> None:
-    esc = bench.escs[0]
-    assert (esc.facts().diagnosis or "").startswith("no bytes"), (
-        "of an ESC that is off at the start"
-    )
-    bench.port().reads = [LIVE]
-    esc.serve(SECOND)
-    for n in range(1, 20):
-        now = SECOND + n * 100 * MS
+    assert (esc.log.complaint, esc.facts().diagnosis) == ("", None)
+    for now in range(21 * SECOND, 23 * SECOND, 100 * MS):
         bench.gateway.advance(now)
         esc.report(now)
-        said = esc.facts().diagnosis
-        if now <= SECOND + 1200 * MS:
-            assert said is None, "frames come, or did so a moment ago"
-    assert said is not None
-    assert said.startswith("no bytes")
+        if now <= 22200 * MS:
+            assert esc.facts().diagnosis is None, "frames come, or did so a moment ago"
+    assert (esc.facts().diagnosis or "").startswith("no bytes")
 
 
 def test_a_usb_adapter_is_known_by_numbers_and_interface(
@@ -313,49 +302,28 @@ def test_settings_are_looked_at_twice_a_second(
     assert sum("changed the settings of /fake/0" in message for message in caplog.messages) == 1
 
 
-def test_echo_is_off_before_anything_else_is_done(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_echo_is_off_before_anything_else_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
     """A terminal that was just made echoes; what comes before that is off goes back to the ESC."""
-    done: list[str] = []
-
-    def watched(module: Any, name: str) -> None:
-        real = getattr(module, name)
-
-        def call(*words: Any, **more: Any) -> Any:
-            on_port = words[0] == esc.path or (isinstance(words[0], int) and words[0] in opened)
-            if on_port and name == "tcsetattr":
-                echoes = words[2][3] & (termios.ECHO | termios.ECHONL)
-                done.append("echo on" if echoes else "echo off")
-            elif on_port:
-                done.append(name)
-            result = real(*words, **more)
-            if on_port and name == "open":
-                opened.add(result)
-            return result
-
-        monkeypatch.setattr(module, name, call)
-
-    opened: set[int] = set()
+    real, echoes = serial_port._open, []
     with PtyEsc() as esc:
-        changed = termios.tcgetattr(esc.fileno())
-        changed[3] |= termios.ECHO
-        termios.tcsetattr(esc.fileno(), termios.TCSANOW, changed)
-        for module, names in (
-            (os, ("open", "read", "close")),
-            (termios, ("tcgetattr", "tcsetattr", "tcflush", "tcdrain", "tcsendbreak")),
-            (fcntl, ("ioctl", "flock", "fcntl")),
-        ):
-            for name in names:
-                watched(module, name)
-        port = serial_port.SerialPort(esc.path, KONTRONIK)
-        port.close()
-    assert done[:3] == ["open", "tcgetattr", "echo off"]
-    assert "echo on" not in done
-    assert done.count("open") == 2, (
-        "once to switch echo off, once to use it: the first stays open until then"
-    )
-    assert "close" not in done[: [n for n, name in enumerate(done) if name == "open"][1]]
+
+        def switch(on: bool) -> None:
+            mode = termios.tcgetattr(esc.fileno())
+            mode[3] = mode[3] | termios.ECHO if on else mode[3] & ~termios.ECHO
+            termios.tcsetattr(esc.fileno(), termios.TCSANOW, mode)
+
+        def opened(path: str, *more: Any) -> Any:
+            links = [os.readlink(link) for link in Path("/proc/self/fd").glob("*") if link.exists()]
+            echoes.append(termios.tcgetattr(esc.fileno())[3] & termios.ECHO)
+            assert links.count(esc.path) > before, "held open: else it may echo again"
+            return real(path, *more)
+
+        monkeypatch.setattr(serial_port, "_open", opened)
+        switch(True)
+        links = [os.readlink(link) for link in Path("/proc/self/fd").glob("*") if link.exists()]
+        before = links.count(esc.path)
+        serial_port.SerialPort(esc.path, KONTRONIK).close()
+    assert echoes == [0]
 
 
 def test_an_adapter_pulled_out_while_it_is_set_is_one_line(

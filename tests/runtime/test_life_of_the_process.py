@@ -2,62 +2,119 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from kontronik_can_gw.desk import pty
 from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
+
+PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
+ENOUGH = 36_000
+"""Bytes of a capture with some seconds of telemetry."""
 
 LIMIT_S = 120
 """For what comes; nothing is judged by how long it takes."""
 
 
-def test_it_is_ready_and_alive_outlives_a_hang_up_and_says_that_it_ends(tmp_path: Path) -> None:
+@contextmanager
+def telemetry(*options: EscOptions) -> Iterator[list[str]]:
+    """ESCs on pseudo terminals; their paths."""
+    terminals, stopped = [PtyEsc() for _ in options], threading.Event()
+    simulated = [SimulatedEsc(one, seed=number) for number, one in enumerate(options)]
+    escs = list(zip(simulated, terminals, strict=True))
+    thread = threading.Thread(target=lambda: pty.run(escs, stop=stopped.is_set), daemon=True)
+    thread.start()
+    try:
+        yield [terminal.path for terminal in terminals]
+    finally:
+        stopped.set()
+        thread.join(LIMIT_S)
+        for terminal in terminals:
+            terminal.close()
+    assert [terminal.received for terminal in terminals] == [0, 0], "sent to an ESC"
+
+
+CONFIGURATION = """
+can = {{interface = "virtual"}}
+canopen = {{enabled = true, self_start = true, store = "{folder}/store"}}
+record = {{can_log = "blf"}}
+run = {{realtime_priority = 7}}
+esc = [{{port = "{ports[0]}"}}, {{port = "{ports[1]}"}}]
+"""
+
+
+def test_it_is_ready_and_alive_outlives_a_hang_up_records_all_and_says_that_it_ends(
+    tmp_path: Path,
+) -> None:
+    """By a configuration of 0.5.0, which asks for a CAN log beside the capture: that is not written any more."""
     config, file, errors = (tmp_path / name for name in ("g.toml", "status.json", "errors"))
     manager = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
     environment = os.environ | manager | {"RUNTIME_DIRECTORY": str(tmp_path)}
     environment.pop("WATCHDOG_PID", None)
-    command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
+    captures = tmp_path / "captures"
+    command = [*PROGRAM, "run", "-c", str(config), "--wait", "--record", str(captures)]
     with (
-        PtyEsc() as esc,
+        telemetry(EscOptions(faults=Faults(noise=0.5, lost_bytes=0.002)), EscOptions()) as ports,
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening,
         errors.open("w") as log,
     ):
-        config.write_text(f'[can]\ninterface = "virtual"\n[[esc]]\nport = "{esc.path}"\n')
+        config.write_text(CONFIGURATION.format(folder=tmp_path, ports=ports))
         listening.bind(manager["NOTIFY_SOCKET"])
         listening.settimeout(LIMIT_S)
         process = subprocess.Popen(command, stderr=log, env=environment)
         try:
             said, end = "", time.monotonic() + LIMIT_S
 
-            def heard(text: str) -> str:
+            def heard(condition: Callable[[], bool]) -> None:
                 nonlocal said
-                while text not in said:
-                    assert time.monotonic() < end, f"{text} was never said"
+                while not condition():
+                    assert time.monotonic() < end, errors.read_text()
                     said += listening.recv(4096).decode() + "\n"
-                return said.partition(text)[0]
 
-            assert "WATCHDOG" not in heard("READY=1")
-            heard("STATUS=")
+            heard(lambda: "READY=1" in said)
+            assert "WATCHDOG" not in said.partition("READY=1")[0]
+            heard(lambda: "STATUS=" in said)
+            policy = os.sched_getscheduler(process.pid)
+            priority = os.sched_getparam(process.pid).sched_priority
             process.send_signal(signal.SIGHUP)
             before = said.count("WATCHDOG=1")
-            while said.count("WATCHDOG=1") < before + 4 or not file.exists():
-                assert time.monotonic() < end, "no signs of life, or no status file"
-                said += listening.recv(4096).decode() + "\n"
+            heard(lambda: said.count("WATCHDOG=1") >= before + 4 and file.exists())
+            heard(lambda: "esc2: telemetry ok" in errors.read_text())
+            heard(lambda: sum(part.stat().st_size for part in captures.iterdir()) > ENOUGH)
             assert json.loads(file.read_text())["escs"][0]["name"] == "esc1"
             process.terminate()
-            heard("STOPPING=1")
+            heard(lambda: "STOPPING=1" in said)
             assert process.wait(LIMIT_S) == 0
         finally:
             process.kill()
             process.wait()
-        esc.check()
-        assert esc.received == 0, "the gateway wrote to the ESC"
     assert not file.exists()
-    assert "SIGHUP is ignored: the configuration is read at the start only." in errors.read_text()
+    logged = errors.read_text()
+    assert "SIGHUP is ignored: the configuration is read at the start only." in logged
+    assert "record.can_log: was removed and is ignored. `kontronik-can-gw convert" in logged
+    if "not permitted" in logged:
+        assert "Running without." in logged and policy == os.SCHED_OTHER
+    else:
+        assert (policy, priority) == (os.SCHED_FIFO, 7)
+    assert {path.suffix for path in captures.iterdir()} == {".kcap"}
+    converted = tmp_path / "converted.log"
+    subprocess.run([*PROGRAM, "convert", "-q", str(captures), str(converted)], check=True)
+    assert len(converted.read_text().splitlines()) > 300
+    with open_input(captures) as found:
+        list(found.frames())
+        assert found.damage == []
+        assert "KOSMIK 120, firmware 4.17, V4 layout" in found.provenance["esc1"]
+        assert re.fullmatch(r".*\.dbc, layout [0-9A-F]{8}", found.provenance["DBC"])
 
 
 def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path: Path) -> None:
@@ -67,7 +124,7 @@ def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path:
         listening.bind(str(tmp_path / "notify"))
         listening.settimeout(LIMIT_S)
         process = subprocess.Popen(
-            [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)],
+            [*PROGRAM, "run", "-c", str(config)],
             stderr=subprocess.PIPE,
             env={**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")},
         )

@@ -107,11 +107,6 @@ def test_other_interfaces_are_none_of_ours_and_a_removed_one_is_gone() -> None:
     assert [facts.exists for facts in heard(datagram)] == [True, False]
 
 
-def test_the_answer_that_there_is_no_such_interface() -> None:
-    error = struct.pack("=i", -19) + bytes(16)
-    assert heard(struct.pack("=IHHII", 16 + len(error), 2, 0, 0, 0) + error) == [LinkFacts(False)]
-
-
 def test_after_an_overrun_the_kernel_is_asked_anew() -> None:
     monitor, fake = monitor_of(105, link_message())
     assert len(monitor.take()) == 1

@@ -1,15 +1,10 @@
 """Real-time priority: who gets which, and what is said where it is not permitted."""
 
 import os
-import subprocess
-import sys
 import threading
-import time
-from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime import realtime
 from kontronik_can_gw.runtime.worker import start_beside_the_loop
@@ -58,30 +53,3 @@ def test_what_is_not_permitted_is_said_with_the_remedy(
     monkeypatch.setenv("INVOCATION_ID", "1")  # a service
     with pytest.raises(RunError, match="LimitRTPRIO=20"):
         realtime.begin(20)
-
-
-def test_a_real_process_has_what_it_is_permitted_to(tmp_path: Path) -> None:
-    """With the right the main thread has the priority; without it, where --wait asks to go on in any case, an error is logged."""
-    with PtyEsc() as esc:
-        command = [sys.executable, "-m", "kontronik_can_gw", "run", "--wait", "-c"]
-        command.append(str(tmp_path / "gateway.toml"))
-        tables = '[can]\ninterface = "virtual"\n[run]\nrealtime_priority = 7\n[[esc]]\n'
-        (tmp_path / "gateway.toml").write_text(f'{tables}port = "{esc.path}"\n')
-        errors = tmp_path / "errors"
-        with errors.open("w") as file, subprocess.Popen(command, stderr=file) as process:
-            try:
-                begun = time.monotonic()
-                while "is open" not in errors.read_text() and time.monotonic() - begun < 120:
-                    time.sleep(0.01)
-                policy, priority = (
-                    os.sched_getscheduler(process.pid),
-                    os.sched_getparam(process.pid).sched_priority,
-                )
-            finally:
-                process.terminate()
-    said = errors.read_text()
-    assert process.returncode == 0
-    if "not permitted" in said:
-        assert "Running without." in said and policy == os.SCHED_OTHER
-    else:
-        assert (policy, priority) == (os.SCHED_FIFO, 7)

@@ -4,10 +4,9 @@ import json
 import os
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import pytest
-from statistics_bench import PROGRAM, Bench
+from statistics_bench import Bench, moment_of
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters
@@ -17,41 +16,23 @@ from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.runtime.facts import (
-    CanFacts,
-    GatewayFacts,
-    PortFacts,
-    gateway_facts,
-    program_facts,
-)
-from kontronik_can_gw.runtime.process import ProcessFacts, process_facts, start_ticks
-from kontronik_can_gw.runtime.snapshot import Moment, snapshot
+from kontronik_can_gw.runtime.facts import program_facts
+from kontronik_can_gw.runtime.process import process_facts, start_ticks
+from kontronik_can_gw.runtime.snapshot import snapshot
 
 
 def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> None:
     bench = Bench()
     bench.run(3)
-
-    def document_of(gateway: GatewayFacts) -> Any:
-        return json.loads(snapshot(Moment(gateway, **facts)))
-
-    facts: dict[str, Any] = {
-        "now": bench.now,
-        "wall": 0.0,
-        "program": PROGRAM,
-        "process": ProcessFacts(),
-        "ports": [PortFacts(f"esc{n}", "/dev/null", True) for n in (1, 2)],
-        "can": CanFacts("socketcan", "can0", 500_000, True),
-    }
-    moment = gateway_facts(bench.gateway)
-    document = document_of(moment)
+    moment = moment_of(bench.gateway, bench.now)
+    document = json.loads(snapshot(moment))
     bench.silent = {1}
     bench.run(2)
     bench.gateway.escs[0].line_errors += 1
     bench.gateway.status.sent_frames += 1
     bench.gateway.core.apply(0, EscSettings("another", 3))
-    assert document_of(moment) == document
-    assert document_of(gateway_facts(bench.gateway))["escs"] != document["escs"]
+    assert json.loads(snapshot(moment)) == document
+    assert bench.document()["escs"] != document["escs"]
     assert document["escs"][1]["fresh"]
 
 

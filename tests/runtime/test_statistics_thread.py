@@ -8,40 +8,28 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-from wire_world import World, loop_in
+from statistics_bench import moment_of
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import statistics as statistics_module
-from kontronik_can_gw.runtime.facts import CanFacts, GatewayFacts, ProgramFacts
-from kontronik_can_gw.runtime.process import ProcessFacts
-from kontronik_can_gw.runtime.recorder import RecorderFacts
-from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment, snapshot
+from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.worker import Report
+from kontronik_can_gw.signals.plan import Layout
 
 PATIENCE = 60.0
 """Seconds that something may take on a busy machine before a test fails."""
 
 
 def numbered(number: int) -> Moment:
-    """A moment of a gateway without an ESC."""
-    gateway = GatewayFacts(
-        [],
-        GatewayStatus(sent_frames=number, received_frames=3 * number),
-        [],
-        {},
-        None,
-        "Python",
-        "",
-    )
-    can = CanFacts("socketcan", "can0", None, True)
-    now = number * SECOND
-    return Moment(gateway, now, 0.0, ProgramFacts("x"), ProcessFacts(), [], can)
+    """A moment of a gateway that has sent so many frames."""
+    gateway = Gateway([EscSettings("esc1")], Layout("", "", ()), 0)
+    gateway.status.sent_frames, gateway.status.received_frames = number, 3 * number
+    return moment_of(gateway, number * SECOND)
 
 
 def until(condition: Callable[[], bool]) -> None:
@@ -59,12 +47,8 @@ def number_in(file: Path) -> int:
         return 0
 
 
-def publish(statistics: Statistics, number: int) -> None:
-    statistics.publish(numbered(number))
-
-
 def put(statistics: Statistics, file: Path, number: int) -> None:
-    publish(statistics, number)
+    statistics.publish(numbered(number))
     until(lambda: number_in(file) == number)
 
 
@@ -77,23 +61,6 @@ def reports(statistics: Statistics, count: int) -> list[Report]:
 
     until(come)
     return found
-
-
-class StuckDisk:
-    """``os.write`` of the statistics' thread waits until it is let go; everybody else's works."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.free = threading.Event()
-        self.stuck = threading.Event()
-        real = os.write
-
-        def write(fd: int, data: bytes) -> int:
-            if threading.current_thread().name == "statistics" and not self.free.is_set():
-                self.stuck.set()
-                assert self.free.wait(PATIENCE)
-            return real(fd, data)
-
-        monkeypatch.setattr(os, "write", write)
 
 
 @pytest.fixture(autouse=True)
@@ -129,18 +96,26 @@ def test_the_file_is_readable_for_all_whole_and_alone(file: Path) -> None:
 def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk = StuckDisk(monkeypatch)
-    publish(statistics, 1)
-    assert disk.stuck.wait(PATIENCE)
+    free, stuck, real = threading.Event(), threading.Event(), os.write
+
+    def write(fd: int, data: bytes) -> int:
+        if threading.current_thread().name == "statistics" and not free.is_set():
+            stuck.set()
+            assert free.wait(PATIENCE)
+        return real(fd, data)
+
+    monkeypatch.setattr(os, "write", write)
+    statistics.publish(numbered(1))
+    assert stuck.wait(PATIENCE)
     since = statistics._worker.busy_since
     assert since is not None
     for number in range(2, 502):
-        publish(statistics, number)  # which never waits
+        statistics.publish(numbered(number))  # which never waits
     assert statistics.reports(since + STALE_NS) == []
     (report,) = statistics.reports(since + STALE_NS + 1)
     assert report.begins and str(file) in report.text and "disk does not answer" in report.text
     assert statistics.reports(since + 2 * STALE_NS) == []
-    disk.free.set()
+    free.set()
     (report,) = reports(statistics, 1)
     assert not report.begins and "answers again" in report.text
     until(lambda: number_in(file) == 501)  # the newest, and none of those between
@@ -157,7 +132,7 @@ def test_the_end_removes_the_file_ends_the_thread_and_closes_what_was_opened(fil
         statistics.close()
         assert os.listdir(file.parent) == []
         statistics.close()
-        publish(statistics, 2)  # too late, and nothing happens
+        statistics.publish(numbered(2))  # too late, and nothing happens
     assert descriptors() == before
     assert threading.active_count() == threads
     assert os.listdir(file.parent) == []
@@ -174,9 +149,9 @@ def test_a_file_that_another_gateway_writes_is_refused(file: Path) -> None:
 def test_a_folder_that_is_missing_is_told_once_and_the_file_comes_with_it(tmp_path: Path) -> None:
     file = tmp_path / "run" / "status.json"
     statistics = Statistics(file)
-    publish(statistics, 1)
+    statistics.publish(numbered(1))
     (report,) = reports(statistics, 1)
-    publish(statistics, 2)
+    statistics.publish(numbered(2))
     text = f"statistics file {file}: cannot be written: No such file or directory. Trying again."
     assert report == Report("statistics: file", True, text)
     file.parent.mkdir()
@@ -189,7 +164,7 @@ def test_a_folder_that_is_missing_is_told_once_and_the_file_comes_with_it(tmp_pa
 def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "device")
     statistics = Statistics(tmp_path / "device")
-    publish(statistics, 1)
+    statistics.publish(numbered(1))
     assert "no plain file" in reports(statistics, 1)[0].text
     statistics.close()
     assert stat.S_ISFIFO((tmp_path / "device").stat().st_mode)
@@ -210,30 +185,9 @@ def test_a_full_disk_leaves_the_old_document_and_no_half_one(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
-        publish(statistics, 2)
+        statistics.publish(numbered(2))
         (report,) = reports(statistics, 1)
         assert report.begins and "No space left on device" in report.text
         assert number_in(file) == 1
         assert os.listdir(file.parent) == ["status.json"]
     put(statistics, file, 3)
-
-
-def test_a_document_has_the_recorder_as_it_was(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The recorder's thread goes on while the statistics' thread makes it."""
-    loop = loop_in(World(), monkeypatch)
-    made: list[Moment] = []
-    facts = RecorderFacts("one.kcap", 1000)
-    keeping = loop._housekeeping
-    monkeypatch.setattr(keeping, "_recorder", SimpleNamespace(facts=facts))
-    statistics = SimpleNamespace(
-        due=0,
-        publish=made.append,
-        reports=lambda _now: [],
-    )
-    monkeypatch.setattr(keeping, "_statistics", statistics)
-    keeping.publish(7 * SECOND)
-    before = dict(vars(facts))
-    facts.file, facts.bytes, facts.problem = "", 2000, "the disk is full"
-    assert json.loads(snapshot(made[0]))["recording"] == before

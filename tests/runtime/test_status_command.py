@@ -252,26 +252,6 @@ def test_the_core_that_runs_is_named() -> None:
     assert judged(document).code == HEALTHY
 
 
-def test_nothing_that_a_terminal_might_obey_comes_from_a_file(tmp_path: Path) -> None:
-    evil = "\x1b[2J\x1b]0;x\x07\r\n\x9b[31m\u202e"
-    document = heard().document(log_lines=[evil])
-    document |= {"configuration": evil, "version": evil}
-    document["can"] |= {"channel": evil, "state": evil, "complaint": evil}
-    document["escs"][0] |= {
-        "name": evil,
-        "link": evil,
-        "errors": [evil],
-        "fresh": False,
-        "diagnosis": evil,
-    }
-    shown = words(judged(document))
-    assert all(char.isprintable() or char == "\n" for char in shown)
-    document["process"]["pid_namespace"] = ""
-    (tmp_path / "s").write_text(json.dumps(document | {"monotonic_ns": NOW}), encoding="utf-8")
-    _, out, _ = shell("--file", tmp_path / "s")
-    assert all(char.isprintable() or char == "\n" for char in out)
-
-
 WHOLE = with_nodes(heard(3).document(log_lines=["14:03:01 esc1: telemetry lost"]))
 
 
@@ -290,12 +270,15 @@ _ODD = st.one_of(
     st.integers(-(10**30), 10**30),
     st.sampled_from([float("nan"), float("inf"), 1e308, 10**400, [], {}, [None, {}], {"a": {}}]),
     st.text(max_size=20),
+    st.just("\x1b[2J\x1b]0;x\x07\r\n\x9b[31m\u202e"),
 )
 
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(PLACES), _ODD), min_size=1, max_size=5), st.booleans())
-def test_any_document_makes_lines(changes: list[tuple[tuple[Any, ...], Any]], alive: bool) -> None:
+def test_any_document_makes_lines_that_no_terminal_obeys(
+    changes: list[tuple[tuple[Any, ...], Any]], alive: bool
+) -> None:
     document: Any = json.loads(json.dumps(WHOLE))
     for place, value in changes:
         at = document

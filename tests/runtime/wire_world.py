@@ -11,11 +11,11 @@ from typing import cast
 
 import native_world
 import pytest
+from packer_oracle import Msg, Sig, dbc_text, read
 
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
@@ -42,35 +42,19 @@ NS_PER_BYTE = KONTRONIK.byte_ns
 NOT_AVAILABLE = 0xFFFFFFFF
 _FIRST_PORT, CAN_FD = 1000, 2000
 _MAX_READ = 4096
-_DBC = """VERSION ""
-
-NS_ :
-
-BS_:
-
-BU_: Gw Car
-
-{messages}
-BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
-BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange";
-BA_DEF_DEF_ "GenMsgCycleTime" 20;
+_TIMES = """BA_DEF_DEF_ "GenMsgCycleTime" 20;
 BA_DEF_DEF_ "GenMsgSendType" "CyclicAndEvent";
-"""
-_MESSAGE = """BO_ {can_id} M{number}: 8 Gw
- SG_ {esc}ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car
- SG_ {esc}DataAge : 32|16@1+ (1,0) [0|0] "ms" Car
-
 """
 
 
 def layout_of(escs: Sequence[EscSettings]) -> Layout:
     """For each ESC a message 100h, 101h ... with speed and age, sent with each frame and every 20 ms."""
-    prefix = [f"{esc.name}" if len(escs) > 1 else "" for esc in escs]
-    messages = "".join(
-        _MESSAGE.format(can_id=256 + n, number=n, esc=name) for n, name in enumerate(prefix)
-    )
-    text = _DBC.format(messages=messages).encode()
-    return prepare(parse_database(text, "w.dbc"), "w.dbc", escs, DbcSettings(), fd_allowed=False)
+    messages = []
+    for n, esc in enumerate(escs):
+        name = esc.name if len(escs) > 1 else ""
+        speed = Sig(f"{name}ElectricalSpeed", 0, 32, unit="1/min")
+        messages.append(Msg(f"M{n}", 256 + n, 8, [speed, Sig(f"{name}DataAge", 32, 16, unit="ms")]))
+    return prepare(read(dbc_text(messages, _TIMES)), "w", escs, DbcSettings(), fd_allowed=False)
 
 
 def live(speed: int) -> bytes:
