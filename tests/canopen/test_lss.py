@@ -1,6 +1,5 @@
-"""LSS slaves: dialogues from lss_dialogues/*.txt, and a foreign master on a bus of several nodes (CiA 305)."""
+"""LSS slaves and a foreign master on a bus of several nodes (CiA 305). More: lss_dialogues/*.txt."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,21 +7,9 @@ import canopen
 import canopen.lss
 import pytest
 from dialogue import QUIET, Bench
-from lss_bench import Talk
-from script import Dialogue, play_lines, read_dialogues
 from wire import Wire
 
-FILES = Path(__file__).parent.glob("lss_dialogues/*.txt")
 UNCONFIGURED = 255
-
-
-@pytest.mark.parametrize(
-    "dialogue",
-    [each for path in sorted(FILES) for each in read_dialogues(path)],
-    ids=lambda dialogue: dialogue.name,
-)
-def test_dialogue(dialogue: Dialogue) -> None:
-    play_lines(Talk(dialogue.options), dialogue.lines)
 
 
 def master_of(bench: Bench) -> Any:

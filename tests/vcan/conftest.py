@@ -7,7 +7,6 @@ import itertools
 import os
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -24,8 +23,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("vcan")
 
 
-@contextmanager
-def fresh_vcan() -> Iterator[str]:
+@pytest.fixture
+def vcan() -> Iterator[str]:
+    """The name of a fresh virtual CAN interface (CAN FD capable), up."""
     name = f"kcg{os.getpid() % 10000}n{next(_numbers)}"
     made = subprocess.run(
         ["ip", "link", "add", name, "type", "vcan"], capture_output=True, text=True, check=False
@@ -39,20 +39,6 @@ def fresh_vcan() -> Iterator[str]:
     ip("link", "set", name, "mtu", "72", "up")
     yield name
     subprocess.run(["ip", "link", "del", name], capture_output=True, check=False)
-
-
-@pytest.fixture
-def vcan() -> Iterator[str]:
-    """The name of a fresh virtual CAN interface (CAN FD capable), up."""
-    with fresh_vcan() as name:
-        yield name
-
-
-@pytest.fixture(scope="module")
-def module_vcan() -> Iterator[str]:
-    """One for all tests of a module."""
-    with fresh_vcan() as name:
-        yield name
 
 
 @pytest.fixture

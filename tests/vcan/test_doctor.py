@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from slcan_adapters import Adapter, Bus
-from vcan_tools import Candump, configuration, ip, wait_for
+from vcan_tools import configuration, ip, recording, wait_for
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.pty import PtyEsc
@@ -58,9 +58,9 @@ def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_n
         assert code == 1
         assert found[check]["severity"] == "error"
         subprocess.run(found[check]["command"].replace("sudo ", ""), shell=True, check=True)
-        with Candump(vcan) as dump:
+        with recording(vcan) as watch:
             found, code = doctor(file)
-        assert dump.frames == []
+        assert watch.recorded == []
         assert code == 0
         assert found["can.kernel"]["severity"] == found["can.up"]["severity"] == "ok"
         assert "virtual interface" in found["can.exists"]["text"]
