@@ -191,15 +191,3 @@ def test_status_registers() -> None:
     assert bench.number(0x1002) == 0x00000304
     bench.gateway.status.state = GatewayState.REPLAY
     assert bench.number(0x1002) & 0xFF == bench.number(0x2020, 1) == 0x44
-
-
-# --- read only
-
-
-def test_read_only_refuses_every_download() -> None:
-    bench = Bench(changes=QUIET, read_only=True)
-    for entry in shipped_eds().entries:
-        for data in (b"\0", bytes(4), bytes(9)):
-            assert bench.write(entry.index, entry.sub, data) == DEVICE_STATE, of(entry)
-    assert bench.write(0x1A09, 0, 0) == NO_OBJECT
-    assert bench.write(0x1A00, 9, 0) == NO_SUB
