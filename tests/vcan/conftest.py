@@ -10,9 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from vcan_tools import GatewayProcess, ip
-
-from kontronik_can_gw.desk.pty import PtyEsc
+from harness import PtyPort
+from vcan_tools import GatewayProcess, feeding, ip
 
 _numbers = itertools.count()
 
@@ -42,12 +41,10 @@ def vcan() -> Iterator[str]:
 
 
 @pytest.fixture
-def esc() -> Iterator[PtyEsc]:
+def escs(tmp_path: Path) -> Iterator[list[PtyPort]]:
     """The port of an ESC, to which nothing may be sent."""
-    with PtyEsc() as terminal:
-        yield terminal
-        terminal.check()
-        assert terminal.received == 0, "something was transmitted to an ESC"
+    with feeding(tmp_path) as ports:
+        yield ports
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import cantools.database
 import pytest
 from encoding import POLE_PAIRS, Identity
 from harness import PtyPort
-from vcan_tools import GatewayProcess, chain, configuration, wait_for
+from vcan_tools import GatewayProcess, chain, configuration, sent_by, wait_for
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -111,7 +111,7 @@ def test_a_users_dbc_is_followed(
         closing(PtyPort(tmp_path / "esc1", Identity(1))) as port,
         can.Bus(interface="socketcan", channel=vcan, fd=True) as bus,
     ):
-        gateway = start_gateway(configuration(vcan, [port.path], dbc))
+        gateway = start_gateway(configuration(vcan, [port], dbc))
         gateway.wait_for_line("CAN socketcan")
         gateway.wait_for_line("esc1: /")
 
@@ -129,7 +129,7 @@ def test_a_users_dbc_is_followed(
 
         wait_for(enough, lambda: shown)
         assert port.received() == 0
-        sent = [port.live(n) for n in range(len(port.sent))]
+        sent = sent_by(port)
     for name, (of, half) in FOLLOWED.items():
         wrong = {v for v in shown[name] if all(abs(of(each) - v) > half for each in sent)}
         assert len(wrong) <= 1, (name, wrong)  # what stands for none, before the first frame

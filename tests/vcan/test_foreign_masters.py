@@ -10,33 +10,27 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from encoding import Identity
 from foreign_tools import NODE_CANOPEN, NodeMaster, has_tshark, need, refusal, tshark
+from harness import PtyPort
 from vcan_tools import (
     EDS,
     SERIAL,
-    Bench,
     GatewayProcess,
     Witness,
-    bench,
     canopen_table,
     configuration,
+    feeding,
     recording,
+    sent_by,
     wait_for,
 )
-
-from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults, Phase
-from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
 
 pytestmark = pytest.mark.extended
 
 Start = Callable[..., GatewayProcess]
 
 PRODUCT, REVISION = 0x4B4F4E01, 0x00010000
-# something changes all the time
-LIVELY = (
-    Phase("up", 0.5, 80, OperatingState.Forward, 0.5),
-    Phase("down", 0.5, 20, OperatingState.Forward, 0.5),
-)
 LOSES = "telemetry_timeout_ms = 10000"
 """Where telemetry is to be lost: no machine stands still for so long."""
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
@@ -55,12 +49,15 @@ def master(vcan: str) -> Iterator[NodeMaster]:
         yield master
 
 
-def start_nodes(vcan: str, start: Start, run: Bench, folder: Path, node_id: int) -> GatewayProcess:
+def start_nodes(
+    vcan: str, start: Start, ports: list[PtyPort], folder: Path, node_id: int
+) -> GatewayProcess:
     """The gateway with nodes and no DBC, and telemetry running."""
     tables = "[dbc]\nenabled = false\n" + canopen_table(folder, node_id)
-    gateway = start(configuration(vcan, [port.path for port in run.ports], tables, LOSES))
-    gateway.wait_for_line(f"esc{len(run.ports)}: /dev/pts")
-    run.start()
+    gateway = start(configuration(vcan, ports, tables, LOSES))
+    gateway.wait_for_line(f"esc{len(ports)}: /")
+    for port in ports:
+        port.on = True
     return gateway
 
 
@@ -71,11 +68,11 @@ def u32(value: int) -> bytes:
 def test_node_canopen_reads_every_object_of_the_eds_and_writes_in_every_way(
     vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
 ) -> None:
-    with bench(EscOptions()) as run:
-        start_nodes(vcan, start_gateway, run, tmp_path, 5)
+    with feeding(tmp_path) as ports:
+        start_nodes(vcan, start_gateway, ports, tmp_path / "store", 5)
         master("add", node=5)
         wait_for(lambda: master.states(5) != [], "a heartbeat")
-        wait_for(lambda: bool(run.info(0)), "an info frame")
+        wait_for(lambda: bool(ports[0].info_sent), "an info frame")
         objects = master("eds", file=str(EDS))
         assert len(objects) > 200
         for index, sub, name, data_type, access in objects:
@@ -109,10 +106,11 @@ def test_node_canopen_reads_every_object_of_the_eds_and_writes_in_every_way(
 def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
     vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
 ) -> None:
-    hot = ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_ERROR, 3_000_000_000, 1_000_000_000)
-    with bench(EscOptions(profile=LIVELY, faults=Faults(errors=(hot,)))) as run:
+    with feeding(tmp_path) as ports:
+        (esc,) = ports
+        esc.identity = Identity(1, alarms=True)
         master("add", node=7)
-        start_nodes(vcan, start_gateway, run, tmp_path, 7)
+        start_nodes(vcan, start_gateway, ports, tmp_path / "store", 7)
         wait_for(lambda: master.states(7) == BOOTED, "boot-up and heartbeat")
         ids = [master("receivePdo", node=7, file=str(EDS), number=n) for n in (1, 2, 3, 4)]
         assert ids == [0x187, 0x287, 0x387, 0x487]
@@ -124,24 +122,26 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
             return [tuple(value for _, value in each["values"]) for each in told]
 
         wait_for(lambda: all(len(pdos(cob_id)) >= 3 for cob_id in ids), "changes in all four PDOs")
-        wait_for(lambda: len(master.of("emergency")) >= 2, "an emergency and its end")
+        wait_for(lambda: master.of("emergency") != [], "an emergency")
+        esc.identity = Identity(1)
+        wait_for(lambda: len(master.of("emergency")) >= 2, "its end")
         wait_for(lambda: master.states(7)[-1] == OPERATIONAL, "OPERATIONAL")
-        run.stop()
+        esc.on = False
         wait_for(lambda: len(master.of("emergency")) >= 3, "telemetry lost")
         assert refusal(master.upload, 7, 0x2000, 1) == DEVICE_STATE
         assert master.upload(7, 0x2020, 1)[0] & 0x3F == 4  # lost
         count = len(pdos(0x187))
-        sent = run.live(0)
+        sent = sent_by(esc)
         assert set(pdos(0x187)) <= {tuple(d[:3]) for d in sent}
         assert set(pdos(0x287)) <= {
             (d.motor_current, d.peak_current, d.consumed_charge, d.throttle, d.output_opening)
             for d in sent
         }
-        run.start()
+        esc.on = True
         wait_for(lambda: len(master.of("emergency")) >= 4, "telemetry back")
         wait_for(lambda: len(pdos(0x187)) > count + 3, "PDO 1 again")
         emergencies = [(told["cob_id"], told["code"]) for told in master.of("emergency")[:4]]
-        assert emergencies == [(0x87, code) for code in (0x4210, 0, 0x7510, 0)]
+        assert emergencies == [(0x87, code) for code in (0x3220, 0, 0x7510, 0)]
 
 
 IDENTITY = {"vendorId": 0, "productCode": PRODUCT, "revisionNumber": REVISION}
@@ -164,8 +164,8 @@ def named(master: NodeMaster, node_id: int) -> None:
 def test_node_canopen_names_nodes_by_lss(
     vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
 ) -> None:
-    with bench(EscOptions(), EscOptions()) as run, recording(vcan) as watch:
-        gateway = start_nodes(vcan, start_gateway, run, tmp_path, 255)
+    with feeding(tmp_path, 2) as ports, recording(vcan) as watch:
+        gateway = start_nodes(vcan, start_gateway, ports, tmp_path / "store", 255)
         gateway.wait_for_line("esc2: CANopen node waits for LSS")
         for node_id, serial in ((0x31, SERIAL + 1), (0x32, SERIAL)):
             scanned(master, serial)
@@ -189,7 +189,7 @@ def test_node_canopen_names_nodes_by_lss(
 # --- tshark
 
 
-def session(master: NodeMaster, run: Bench, watch: Witness) -> None:
+def session(master: NodeMaster, esc: PtyPort, watch: Witness) -> None:
     """Something of every service, with a node that waits for its node-ID."""
     scanned(master, SERIAL)
     master("add", node=0x55)
@@ -204,7 +204,7 @@ def session(master: NodeMaster, run: Bench, watch: Witness) -> None:
     master("nmt", command="startNode", node=0x55)
     wait_for(lambda: len(watch.of(0x1D5)) > 10, "PDOs")
     wait_for(lambda: master.states(0x55)[-1] == OPERATIONAL, "OPERATIONAL")
-    run.stop()
+    esc.on = False
     wait_for(lambda: master.of("emergency") != [], "an emergency")
     master("nmt", command="stopNode", node=0x55)
     wait_for(lambda: master.states(0x55)[-1] == STOPPED, "STOPPED")
@@ -219,11 +219,11 @@ def test_tshark_reads_what_was_said(
     vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
 ) -> None:
     need(has_tshark(), "tshark")
-    with bench(EscOptions(profile=LIVELY)) as run:
+    with feeding(tmp_path) as ports:
         with recording(vcan) as watch:
-            gateway = start_nodes(vcan, start_gateway, run, tmp_path / "store", 255)
+            gateway = start_nodes(vcan, start_gateway, ports, tmp_path / "store", 255)
             gateway.wait_for_line("esc1: CANopen node waits for LSS")
-            session(master, run, watch)
+            session(master, ports[0], watch)
         frames = tshark(watch.recorded, tmp_path / "bus.log")
     ids = [frame.can_id for frame in watch.recorded]
     assert [int(f.can_id, 0) for f in frames] == ids
@@ -246,4 +246,4 @@ def test_tshark_reads_what_was_said(
     assert {int(f.lss_command, 0) for f in of(0x7E4)} == {0x4F, 0x11}
     assert {int(f.lss_command, 0) for f in of(0x7E5)} == {0x51, 0x11, 0x04}
     pdos = {struct.unpack("<IHh", bytes.fromhex(f.pdo.replace(":", ""))) for f in of(0x1D5)}
-    assert pdos and pdos <= {tuple(d[:3]) for d in run.live(0)}
+    assert pdos and pdos <= {tuple(d[:3]) for d in sent_by(ports[0])}

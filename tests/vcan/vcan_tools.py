@@ -8,24 +8,21 @@ to not happen is followed by something that has to.
 import itertools
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from bus_watch import SECOND, BusWatch
 from encoding import Identity
-from feeder import CURRENT, SPEED
+from feeder import CURRENT, SPEED, Feeder
 from harness import LoggedProcess, PtyPort
 from raw_bus import RawBus
 from signals import Table, table_sent
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk import pty
-from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Sent, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIMIT_S = 60.0
@@ -145,11 +142,13 @@ def recording(interface: str) -> Iterator[Witness]:
 
 
 def configuration(
-    interface: str, ports: Sequence[str], dbc: str = "", esc: str = NEVER_STALE
+    interface: str, ports: Iterable[PtyPort], dbc: str = "", esc: str = NEVER_STALE
 ) -> str:
     """A configuration text for these ports."""
     parts = [f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n{dbc}\n']
-    parts += [f'[[esc]]\nport = "{port}"\npole_pairs = 7\ngear = 9.8\n{esc}\n' for port in ports]
+    parts += [
+        f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ngear = 9.8\n{esc}\n' for port in ports
+    ]
     return "\n".join(parts)
 
 
@@ -173,8 +172,7 @@ class Chain:
         for fed in self.escs:
             fed.info_every = 10
         self.config = folder / "gateway.toml"
-        ports = [esc.path for esc in self.escs]
-        self.config.write_text(configuration(interface, ports, toml, esc))
+        self.config.write_text(configuration(interface, self.escs, toml, esc))
         table = table_sent(["-c", str(self.config)], "[canopen]" in toml, len(identities))
         self.watch = Witness(interface, table, self.escs)
         self.gateway: GatewayProcess | None = None
@@ -244,67 +242,28 @@ def chain(
         made.close()
 
 
-# --- simulated ESCs in real time
-
-
-class NotedEsc(SimulatedEsc):
-    """A simulated ESC that notes each frame before anybody can have it: a value that came from an ESC is in a list read after it came."""
-
-    def __init__(self, options: EscOptions, seed: int, noted: list[Sent]) -> None:
-        super().__init__(options, seed=seed)
-        self._noted = noted
-
-    def frames_until(self, now_ns: int) -> list[Sent]:
-        frames = super().frames_until(now_ns)
-        self._noted.extend(frames)
-        return frames
-
-
-class Bench:
-    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent."""
-
-    def __init__(self, escs: Sequence[EscOptions]) -> None:
-        self.ports = [pty.PtyEsc() for _ in escs]
-        self.sent: list[list[Sent]] = [[] for _ in escs]
-        self._options = escs
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def start(self) -> None:
-        self._stop.clear()
-        escs = [NotedEsc(each, 1 + i, self.sent[i]) for i, each in enumerate(self._options)]
-        self._thread = threading.Thread(
-            target=pty.run,
-            args=(list(zip(escs, self.ports, strict=True)),),
-            kwargs={"stop": self._stop.is_set},
-            daemon=True,
-        )
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stop.set()
-        if self._thread:
-            self._thread.join(LIMIT_S)
-
-    def live(self, index: int) -> list[LiveData]:
-        return [sent.data for sent in self.sent[index] if isinstance(sent.data, LiveData)]
-
-    def info(self, index: int) -> list[InfoData]:
-        return [sent.data for sent in self.sent[index] if isinstance(sent.data, InfoData)]
+# --- ESCs that send in real time
 
 
 @contextmanager
-def bench(*escs: EscOptions) -> Iterator[Bench]:
-    """A bench that also checks, at its end, that nothing was ever transmitted to an ESC."""
-    made = Bench(escs)
+def feeding(folder: Path, count: int = 1) -> Iterator[list[PtyPort]]:
+    """ESCs that send 100 frames a second once they are switched on (``on``), and to which nothing may be sent."""
+    ports = [PtyPort(folder / f"port{n}", Identity(n + 1), rate_hz=100) for n in range(count)]
+    for port in ports:
+        port.on = False
+    feeder = Feeder(ports).start()
     try:
-        yield made
+        yield ports
+        assert not any(port.received() for port in ports), "something was sent to an ESC"
     finally:
-        made.stop()
-        for port in made.ports:
-            port.check()
+        feeder.close()
+        for port in ports:
             port.close()
-    assert not any(port.received for port in made.ports), "something was transmitted to an ESC"
+
+
+def sent_by(port: PtyPort) -> list[LiveData]:
+    """All live frames so far."""
+    return [port.live(n) for n in range(len(port.sent))]
 
 
 # --- CANopen
