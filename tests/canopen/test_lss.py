@@ -7,20 +7,14 @@ import canopen
 import canopen.lss
 import pytest
 from dialogue import QUIET, Bench
-from wire import Wire
+from wire import wire_to
 
 UNCONFIGURED = 255
 
 
 def master_of(bench: Bench) -> Any:
     """A foreign master whose requests all nodes hear."""
-
-    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
-        bench.put(cob_id, data, remote=remote)
-        bench.answer_saves()
-        return [(frame.can_id, frame.data) for frame in bench.take() if frame.can_id == 0x7E4]
-
-    master: Any = Wire(exchange).lss
+    master: Any = wire_to(bench).lss
     master.RESPONSE_TIMEOUT = 0.0002  # what is answered is there before it waits
     return master
 
