@@ -1,19 +1,6 @@
-"""Dialogues with CANopen nodes: who says what and when, as text, played against a whole gateway.
+"""A whole gateway with CANopen nodes whose time is turned by hand: for tests in Python, and for dialogues (dialogues/README.md).
 
-One line for each frame or happening, times in ms from power-on, data in hexadecimal::
-
-     time    what
-       0 <- 000 01 00                                 a frame from the bus
-       0 -> 701 05                                    a frame that the node is to send; ".." stands for any byte
-      10 uart 0 live battery_voltage=2442             a UART frame of an ESC, fields as in LiveData and InfoData
-      20 read 1 2000:02 = 8A 09                       an upload by SDO from node 1, and its data
-      20 read 1 2001:05 ! 08000024                    the same, refused
-      30 write 1 1017:00 F4 01                        a download that is confirmed; with "! code" refused
-      40 do gateway.port(0, False, now)                 anything else
-     500 -                                            nothing more until then
-
-Between the lines time passes by ``advance`` at each ``next_deadline``; what is due at the time of a line comes before it. Nothing
-but what is written may be sent. Text behind ";" is a comment.
+Time passes by ``advance`` at each ``next_deadline``. Nothing but what is written or taken may be sent.
 """
 
 import ast
@@ -22,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache, partial
+from types import MappingProxyType
 from typing import Any
 
-from script import MS, bytes_of, hexadecimal, ms
+from script import MS, Talker, bytes_of, hexadecimal, ms
 from sdo_client import Refused, download, upload
 
 from kontronik_can_gw.canopen.dcf import without
@@ -97,7 +85,7 @@ def info(**fields: int) -> bytes:
     return codec.encode(InfoData(**fields), codec.Layout.V4)
 
 
-class Bench:
+class Bench(Talker):
     """A gateway with ``nodes`` ESCs and nodes, node-IDs 1, 2, … and serial numbers 77, 78, …, whose time is turned by hand.
 
     ``changes`` are made to the shipped EDS. ``settings`` are further fields of every NodeSettings, ``escs`` those of EscSettings, or
@@ -113,17 +101,19 @@ class Bench:
         stored: Sequence[Stored] | None = None,
         node_ids: Sequence[int] | None = None,
         layout: Layout = EMPTY,
-        escs: Mapping[str, Any] | Sequence[EscSettings] = (),
+        escs: Mapping[str, Any] | Sequence[EscSettings] = MappingProxyType({}),
         boot: bool = True,
         **settings: Any,
     ) -> None:
-        own = () if isinstance(escs, Mapping) else tuple(escs)
-        same = escs if isinstance(escs, Mapping) else {}
-        if node_ids is None:
-            node_ids = range(1, (len(own) or nodes) + 1)
-        base = own or tuple(EscSettings(f"esc{n}", **same) for n in range(len(node_ids)))
-        self._arguments: dict[str, Any] = {"changes": changes, "eds": eds, "node_ids": node_ids}
-        self._arguments |= {"layout": layout, "escs": escs, **settings}
+        super().__init__()
+        if isinstance(escs, Mapping):
+            count = nodes if node_ids is None else len(node_ids)
+            escs = [EscSettings(f"esc{n}", **escs) for n in range(count)]
+        base = tuple(escs)
+        node_ids = node_ids or range(1, len(base) + 1)
+        self._arguments = dict(
+            changes=changes, eds=eds, node_ids=node_ids, layout=layout, escs=escs, **settings
+        )
         self.setup = CanopenSetup(
             changed(eds or shipped_eds(), changes or {}),
             tuple(NodeSettings(i, serial=77 + n, **settings) for n, i in enumerate(node_ids)),
@@ -144,12 +134,6 @@ class Bench:
     def nodes(self) -> list[Node]:
         assert self.gateway.nodes is not None
         return self.gateway.nodes.nodes
-
-    @property
-    def listened_to(self) -> frozenset[int]:
-        """COB-IDs that the nodes take."""
-        assert self.gateway.nodes is not None
-        return self.gateway.nodes.receive_ids
 
     def restart(self) -> None:
         """The program ends and starts again with what is on disk; time begins anew."""
@@ -210,8 +194,7 @@ class Bench:
 
     def ask(self, node: int, request: bytes) -> bytes:
         """One request and its one answer."""
-        self.gateway.receive_frame(CanFrame(0x600 + node, request), self.now, self.now)
-        self._collect()
+        self.put(0x600 + node, request)
         return self._answer(node)
 
     def read(self, index: int, sub: int = 0, node: int = 1) -> bytes | int:
@@ -305,7 +288,9 @@ class Bench:
             case "state", [node, _]:
                 return f"state {node} {self.nodes[int(node) - 1].state:02X}"
             case "listens", _:
-                return f"listens {' '.join(f'{cob_id:03X}' for cob_id in sorted(self.listened_to))}"
+                assert self.gateway.nodes is not None
+                listened_to = sorted(self.gateway.nodes.receive_ids)
+                return f"listens {' '.join(f'{cob_id:03X}' for cob_id in listened_to)}"
             case "rejected", [node, *_]:
                 keys = sorted(self.nodes[int(node) - 1].parameters.rejected)
                 return " ".join(["rejected", node, *map(_name, keys)])
@@ -407,13 +392,13 @@ def bench_of(options: Sequence[str]) -> Bench:
             case ["drop", *indices]:
                 dropped = {int(index, 16) for index in indices}
                 arguments["eds"] = load(without(shipped_eds().data, dropped), "my.eds")
-            case [place, "=", value] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
-                base = int(value.removeprefix("$NODEID+"), 16)
-                change = {"default": base, "relative": value.startswith("$NODEID+")}
-                changes.setdefault(_place(place), {}).update(change)
             case [place, *words] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
-                pairs = (word.split("=") for word in words)
-                change = {key: _attribute(value) for key, value in pairs}
+                if words[0] == "=":
+                    base = int(words[1].removeprefix("$NODEID+"), 16)
+                    change = {"default": base, "relative": words[1].startswith("$NODEID+")}
+                else:
+                    pairs = (word.split("=") for word in words)
+                    change = {key: _attribute(value) for key, value in pairs}
                 changes.setdefault(_place(place), {}).update(change)
             case _:
                 raise AssertionError(f"what is 'with {option}'?")

@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from configparser import RawConfigParser
 from pathlib import Path
 
 from kontronik_can_gw.config.keys import shipped
@@ -40,14 +39,6 @@ def with_object(source: str, index: int, content: str) -> str:
     source = with_key(source, "ManufacturerObjects", "SupportedObjects", str(count + 1))
     source = with_key(source, "ManufacturerObjects", str(count + 1), f"0x{index:04X}")
     return f"{source.rstrip()}\r\n\r\n[{index:04X}]\r\n{content}\r\n"
-
-
-def device_info(text: str) -> dict[str, int]:
-    """The numbers of [DeviceInfo], by their keys in lower case."""
-    parser = RawConfigParser()
-    parser.read_string(text)
-    section = parser["DeviceInfo"]
-    return {key: int(value, 0) for key, value in section.items() if re.match("-?[0-9]", value)}
 
 
 def dcfchk(file: Path, node_id: int) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from script import Heard, bytes_of, hexadecimal, ms
+from script import Talker, bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.canopen.lss import LssSlave
 
@@ -47,12 +47,11 @@ class Node:
             self.active_node_id = self.pending_node_id
 
 
-class Talk(Heard):
+class Talk(Talker):
     """One slave as the talker of a dialogue."""
 
     def __init__(self, options: Sequence[str]) -> None:
         super().__init__()
-        self.now = 0
         self.node = Node()
         self.slave = LssSlave(cast(Any, self.node), self._sent)
         for option in options:
@@ -72,11 +71,6 @@ class Talk(Heard):
 
     def _sent(self, data: bytes) -> None:
         self.hear(self.now, hexadecimal(data))
-
-    def pass_time(self, until: int) -> None:
-        self.now = until
-
-    jump = pass_time
 
     def say(self, what: str) -> str:
         verb, _, rest = what.partition(" ")

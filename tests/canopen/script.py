@@ -6,43 +6,38 @@ from dataclasses import dataclass
 from difflib import ndiff
 from itertools import zip_longest
 from pathlib import Path
-from typing import Protocol
 
 MS = 1_000_000
 Line = tuple[str, str]
 """Where a line of a dialogue stands, and the line."""
 
 
-class Talker(Protocol):
+class Talker:
     """What dialogues are played with."""
 
-    now: int
-
-    def pass_time(self, until: int) -> None:
-        """Let time pass, ns, serving each deadline."""
-
-    def jump(self, now: int) -> None:
-        """Let time pass and serve what is due once, at its end."""
-
-    def say(self, what: str) -> str:
-        """Do what a line says; the line with what really is in place of what is expected."""
-
-    def heard_lines(self) -> list[str]:
-        """What was sent since the last call, "time -> ...": lines."""
-
-
-class Heard:
-    """What a talker has sent, as lines of a dialogue."""
+    now = 0
 
     def __init__(self) -> None:
         self._lines: list[str] = []
+
+    def pass_time(self, until: int) -> None:
+        """Let time pass, ns, serving each deadline."""
+        self.now = until
+
+    def jump(self, now: int) -> None:
+        """Let time pass and serve what is due once, at its end."""
+        self.now = now
+
+    def say(self, what: str) -> str:
+        """Do what a line says; the line with what really is in place of what is expected."""
+        raise NotImplementedError
 
     def hear(self, now: int, frame: str) -> None:
         """Note a frame that was sent."""
         self._lines.append(f"{ms(now)} -> {frame}".rstrip())
 
     def heard_lines(self) -> list[str]:
-        """What was sent since the last call."""
+        """What was sent since the last call, "time -> ...": lines."""
         lines, self._lines = self._lines, []
         return lines
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from script import MS, Heard, bytes_of, hexadecimal, ms
+from script import MS, Talker, bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.canopen.abort import Abort
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, key
@@ -52,14 +52,13 @@ class Objects(Dictionary):
         self.downloads.append((entry.index, entry.sub, variable.encode(variable.value)))
 
 
-class Bench(Heard):
+class Bench(Talker):
     """A server whose time is turned by hand; a talker of dialogues (see script.py)."""
 
     def __init__(self, segment_ns: int = 0) -> None:
         super().__init__()
         self.objects = Objects()
         self.server = SdoServer(self.objects, self._sent, segment_ns)
-        self.now = 0
         self.answers: list[bytes] = []
         """Those of the last request, and what followed it."""
         self._tickets: list[int] = []

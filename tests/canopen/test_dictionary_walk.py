@@ -5,9 +5,7 @@ import struct
 import pytest
 from dialogue import QUIET, Bench, shipped_eds
 
-from kontronik_can_gw.canopen.dcf import without
-from kontronik_can_gw.canopen.eds import Entry, load
-from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.canopen.eds import Entry
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.codec import encode as uart
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
@@ -46,27 +44,16 @@ def ends(entry: Entry) -> tuple[int, int]:
     return (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
 
 
-def test_every_other_index_is_06020000h(bench: Bench) -> None:
-    known = {index for index, _ in entries()}
-    gateway, codes = bench.gateway, set()
-    for index in set(range(0x10000)) - known:
-        answer = bench.ask(1, b"\x40" + index.to_bytes(2, "little") + bytes(5))
-        assert answer[1:3] == index.to_bytes(2, "little")
-        codes.add(answer[:1] + answer[3:])
-    assert codes == {b"\x80\0" + NO_OBJECT.to_bytes(4, "little")}
+def test_every_other_index_is_06020000h_and_every_other_sub_index_06090011h(bench: Bench) -> None:
+    known = entries()
+    indices = {index for index, _ in known}
+    found = {index: bench.read(index) for index in set(range(0x10000)) - indices}
+    assert set(found.values()) == {NO_OBJECT}
     unknown = "0000 0001 1006 1201 1400 1600 1806 2003 5FFF 6000 A000 FFFF"
     for index in (int(text, 16) for text in unknown.split()):
         assert bench.write(index, 0, 0) == NO_OBJECT
-    assert gateway.take_frames(bench.now) == []
-
-
-def test_every_other_sub_index_is_06090011h(bench: Bench) -> None:
-    known = entries()
-    for index in {index for index, _ in known}:
-        for sub in range(256):
-            if (index, sub) not in known:
-                assert bench.read(index, sub) == NO_SUB
-                assert bench.write(index, sub, 0) == NO_SUB
+    for index, sub in {(index, sub) for index in indices for sub in range(256)} - known.keys():
+        assert bench.read(index, sub) == bench.write(index, sub, 0) == NO_SUB
 
 
 @pytest.mark.parametrize("entry", shipped_eds().entries, ids=of)
@@ -120,19 +107,6 @@ def test_limits(entry: Entry, bench: Bench) -> None:
         assert bench.write(*at, before) is None
 
 
-def test_the_defaults_are_those_of_the_eds() -> None:
-    bench = Bench(boot=False)
-    others = {0x1018_04, 0x100A_00} | {0x1003_00 | sub for sub in range(1, 9)}
-    for (index, sub), entry in entries().items():
-        shown = entry.access == "wo" or (index >= 0x2000 and entry.access == "ro")
-        if shown or entry.default is None or index << 8 | sub in others:
-            continue
-        data, wanted = bench.read(index, sub), entry.default
-        if not isinstance(wanted, bytes):
-            wanted = int(wanted + entry.relative).to_bytes(len(data), "little")  # type: ignore[arg-type]
-        assert data == wanted, of(entry)
-
-
 def test_the_serial_number_and_the_vendor_are_the_configurations() -> None:
     bench = Bench(2, vendor_id=0x12345, version="1.2.3")
     assert [bench.number(0x1018, 4, node) for node in (1, 2)] == [77, 78]
@@ -167,14 +141,6 @@ def fed(behaviour: int = 0) -> Bench:
     bench.uart(uart(LIVE, Layout.V4))
     bench.take()
     return bench
-
-
-def test_before_the_first_frame_there_is_no_data() -> None:
-    bench = Bench(changes=QUIET)
-    for at in [*ALL_LIVE, *INFORMATION]:
-        assert bench.read(*at) == NO_DATA
-    assert bench.number(0x2020, 1) == 0
-    assert bench.number(0x2020, 3) == bench.number(0x2020, 4) == 0xFFFF
 
 
 def test_fresh_values_are_those_of_the_uart_frame() -> None:
@@ -225,25 +191,3 @@ def test_status_registers() -> None:
     assert bench.number(0x1002) == 0x00000304
     bench.gateway.status.state = GatewayState.REPLAY
     assert bench.number(0x1002) & 0xFF == bench.number(0x2020, 1) == 0x44
-
-
-# --- read only
-
-
-def test_read_only_refuses_every_download() -> None:
-    bench = Bench(changes=QUIET, read_only=True)
-    for entry in shipped_eds().entries:
-        for data in (b"\0", bytes(4), bytes(9)):
-            assert bench.write(entry.index, entry.sub, data) == DEVICE_STATE, of(entry)
-    assert bench.write(0x1A09, 0, 0) == NO_OBJECT
-    assert bench.write(0x1A00, 9, 0) == NO_SUB
-
-
-# --- another EDS
-
-
-def test_an_eds_without_an_object_is_what_1021h_gives() -> None:
-    data = without(shipped("eds/kontronik_esc.eds").read_bytes(), range(0x6000, 0x7000))
-    bench = Bench(eds=load(data, "shorter.eds"))
-    assert bench.read(0x606C) == NO_OBJECT
-    assert (bench.read(0x1021), bench.number(0x1022)) == (data, 0)

@@ -111,22 +111,6 @@ def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject)
         assert problem.startswith("mine.eds: ") and problem.endswith((".", ";'."))
 
 
-DROPPED = [
-    ([0x1A03], ["1A03h:00 is mandatory and is not there. Add it."]),
-    ([0x1803], ["1803h:00 is mandatory and is not there. Add it."]),
-    ([0x2020], ["1A03h:04 TPDO 4 application object 4: DefaultValue 0x20200108 is not", "1A03h:05"]),
-    ([0x1000, 0x1018], ["1000h:00 is mandatory", "1018h:01 is mandatory"]),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("dropped", "said"), DROPPED)
-def test_what_is_missing_is_named(dropped: list[int], said: list[str]) -> None:
-    found = problems(dcf.without(SHIPPED.encode(), dropped))
-    assert len(found) == len(said)
-    for problem, start in zip(found, said, strict=True):
-        assert problem.startswith(f"mine.eds: {start}")
-
-
 # --- what is allowed ------------------------------------------------------------------------------------------------
 
 
@@ -146,6 +130,12 @@ def test_any_case_lf_comments_and_unknown_sections_are_taken() -> None:
     assert ours.entries == reader.load(SHIPPED.encode(), "kontronik_esc.eds").entries
 
 
+def entry_2200(content: str) -> Entry:
+    """A variable of an EDS that is accepted."""
+    eds = reader.load(with_object(content).encode("ascii"), "mine.eds")
+    return next(entry for entry in eds.entries if entry.index == 0x2200)
+
+
 @pytest.mark.parametrize(("data_type", "text", "read", "written"), list(rows_of("values.txt")))
 def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
     data_type: str, text: str, read: str, written: str
@@ -160,6 +150,19 @@ def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
     assert re.findall("(?m)^ParameterValue=(.*)\r$", text) == ([written] if written != "-" else [])
 
 
+EMPTY = dict.fromkeys(("ObjectType", "LowLimit", "HighLimit", "DefaultValue", "PDOMapping"), "")
+
+
+def test_signed_limits_in_twos_complement_and_keys_without_a_value() -> None:
+    signed = {"LowLimit": "0x9C", "HighLimit": "0x64", "DefaultValue": "-100"}
+    for data_type, keys, wanted in (
+        (0x02, signed, (-100, 100, -100)),
+        (0x06, EMPTY, (None, None, None)),
+    ):
+        entry = entry_2200(variable(data_type, **keys))
+        assert (entry.low, entry.high, entry.default, entry.mappable) == (*wanted, False)
+
+
 # --- the DCF --------------------------------------------------------------------------------------------------------
 
 
@@ -170,18 +173,3 @@ def test_a_text_that_a_dcf_cannot_hold_is_named(value: bytes) -> None:
         UserError, match=r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot stand"
     ):
         dcf.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left", "left.dcf")
-
-
-def entry_of(**keys: object) -> Entry:
-    """A variable of an EDS that is accepted."""
-    text = with_object(variable(**keys))  # type: ignore[arg-type]
-    eds = reader.load(text.encode("ascii"), "mine.eds")
-    return next(entry for entry in eds.entries if entry.index == 0x2200)
-
-
-def test_signed_limits_in_twos_complement_and_keys_without_a_value() -> None:
-    entry = entry_of(data_type=0x02, LowLimit="0x9C", HighLimit="0x64", DefaultValue="-100")
-    assert (entry.low, entry.high, entry.default) == (-100, 100, -100)
-    empty = dict.fromkeys(("ObjectType", "LowLimit", "HighLimit", "DefaultValue", "PDOMapping"), "")
-    entry = entry_of(data_type=0x06, **empty)
-    assert (entry.low, entry.high, entry.default, entry.mappable) == (None, None, None, False)

@@ -107,10 +107,15 @@ def problems(data: bytes, node_ids: tuple[int, ...] = (1,)) -> list[str]:
     return list(caught.value.problems)
 
 
-def test_a_cob_id_of_emergencies_that_are_not_in_the_eds_is_taken() -> None:
+def test_cob_ids_of_one_node_only_and_of_what_is_not_in_the_eds_are_judged() -> None:
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080")
     (said,) = problems(without(text.encode(), {0x1014}))
     assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in said
+    text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
+    check_eds(load(text.encode(), "my.eds"), [EscSettings()], [1])
+    said = problems(text.encode(), (3,))[0]
+    assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in said
+    check_eds(shipped_eds(), [EscSettings()], range(1, 128))
 
 
 def test_a_default_pdo_that_maps_nothing_is_named() -> None:
@@ -119,17 +124,6 @@ def test_a_default_pdo_that_maps_nothing_is_named() -> None:
     setup = CanopenSetup(data, (NodeSettings(5),), (Stored(),), (EscSettings(),))
     (said,) = without_objects(setup.nodes(setup.esc_settings((EscSettings(),))))
     assert said.startswith("TPDO 2 is never sent: 1A01h maps nothing, so 1801h:01 cannot be valid.")
-
-
-def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
-    check_eds(shipped_eds(), [EscSettings()], range(1, 128))
-
-
-def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
-    text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F").encode()
-    check_eds(load(text, "my.eds"), [EscSettings()], [1])
-    said = "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3"
-    assert said in problems(text, (3,))[0]
 
 
 def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:

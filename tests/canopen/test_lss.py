@@ -1,6 +1,5 @@
-"""LSS slaves: dialogues from lss_dialogues/*.txt, and a foreign master on a bus of several nodes (CiA 305)."""
+"""LSS slaves and a foreign master on a bus of several nodes (CiA 305). More: lss_dialogues/*.txt."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,32 +7,14 @@ import canopen
 import canopen.lss
 import pytest
 from dialogue import QUIET, Bench
-from lss_bench import Talk
-from script import Dialogue, play_lines, read_dialogues
-from wire import Wire
+from wire import wire_to
 
-FILES = Path(__file__).parent.glob("lss_dialogues/*.txt")
 UNCONFIGURED = 255
-
-
-@pytest.mark.parametrize(
-    "dialogue",
-    [each for path in sorted(FILES) for each in read_dialogues(path)],
-    ids=lambda dialogue: dialogue.name,
-)
-def test_dialogue(dialogue: Dialogue) -> None:
-    play_lines(Talk(dialogue.options), dialogue.lines)
 
 
 def master_of(bench: Bench) -> Any:
     """A foreign master whose requests all nodes hear."""
-
-    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
-        bench.put(cob_id, data, remote=remote)
-        bench.answer_saves()
-        return [(frame.can_id, frame.data) for frame in bench.take() if frame.can_id == 0x7E4]
-
-    master: Any = Wire(exchange).lss
+    master: Any = wire_to(bench).lss
     master.RESPONSE_TIMEOUT = 0.0002  # what is answered is there before it waits
     return master
 

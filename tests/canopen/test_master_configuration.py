@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dialogue import NO_HEARTBEAT, Bench, live
-from wire import Wire
+from wire import wire_to
 
 from kontronik_can_gw.config.keys import shipped
 
@@ -75,12 +75,7 @@ def test_each_object_of_dcfgens_concise_dcf_is_accepted_and_the_pdos_are_what_th
 
 def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
     bench = Bench(changes=NO_HEARTBEAT)
-
-    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
-        bench.put(cob_id, data, remote=remote)
-        return [(frame.can_id, frame.data) for frame in bench.take()]
-
-    node = Wire(exchange).add_node(1, str(EDS))
+    node = wire_to(bench).add_node(1, str(EDS))
     pdo = node.tpdo[5]
     pdo.cob_id, pdo.trans_type, pdo.event_timer = 0x1F1, 254, 100
     pdo.enabled = pdo.rtr_allowed = True

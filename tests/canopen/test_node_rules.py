@@ -1,6 +1,7 @@
 """Rules of a node that dialogues in files cannot show well: every value of a range, long traffic, the DBC beside, what is on disk."""
 
 import hashlib
+import itertools
 from pathlib import Path
 
 import pytest
@@ -53,15 +54,6 @@ def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
     assert sent == [(0x81 + 0x100 * number, speed) for speed in speeds for number in numbers]
 
 
-def test_the_live_counter_begins_again_at_0_after_255() -> None:
-    bench = Bench(changes={**QUIET, **tpdo(1, 254, 0, 0, 0x20200208)}).start()
-    for number in range(1, 300):
-        bench.wait(10)
-        bench.uart(live(electrical_speed=number))
-        assert [frame.data for frame in bench.take()] == [bytes((number % 256,))]
-    assert bench.number(0x2020, 2) == 299 % 256
-
-
 @pytest.mark.parametrize(("threshold", "link_status"), [(3, 3), (4, 2)])
 def test_2100h_8_is_how_many_crc_errors_in_a_second_make_a_link_degraded(
     threshold: int, link_status: int
@@ -86,7 +78,8 @@ def test_a_restricted_cob_id_is_refused_and_every_other_accepted() -> None:
 
 
 def test_ids_of_other_pdos_of_all_nodes_and_of_the_dbc_are_taken() -> None:
-    layout = Layout("", "", (message_plan("EscPower", 0x222, ()),))
+    ours = {0x705: 5, 0x606: 6, 0x587: 7, 0x88: 8, 0x18A: 10}
+    layout = Layout("", "", tuple(message_plan(f"M{i}", i, ()) for i in (0x222, *ours)))
     bench = Bench(2, changes={**NO_HEARTBEAT, **SPARE}, layout=layout)
     for cob_id in (0x181, 0x381, 0x182, 0x482, 0x81, 0x82, 0x80, 0x222):
         assert bench.write(0x1804, 1, 0x40000000 | cob_id) == TAKEN, hex(cob_id)
@@ -94,13 +87,7 @@ def test_ids_of_other_pdos_of_all_nodes_and_of_the_dbc_are_taken() -> None:
     assert bench.write(0x1804, 1, 0x40000223, node=2) == TAKEN
     assert bench.write(0x1800, 1, 0xC0000181) is None
     assert bench.write(0x1804, 1, 0x40000181, node=2) is None  # it is free now
-
-
-def test_a_node_id_whose_cob_ids_the_dbc_has_is_refused() -> None:
-    taken = {0x705: 5, 0x606: 6, 0x587: 7, 0x88: 8, 0x18A: 10}
-    layout = Layout("", "", tuple(message_plan(f"M{i}", i, ()) for i in taken))
-    bench = Bench(changes=NO_HEARTBEAT, layout=layout)
-    for node_id in taken.values():
+    for node_id in ours.values():
         assert bench.write(0x2101, 2, node_id, size=1) == TAKEN
     assert bench.write(0x2101, 2, 9, size=1) is None
 
@@ -128,13 +115,8 @@ def test_each_mappable_object_can_be_sent_and_carries_what_sdo_reads() -> None:
 
 
 def test_serial_numbers_differ_by_number_name_and_machine(tmp_path: Path) -> None:
-    made = {
-        serial_number(n, name, identity)
-        for n in (1, 2)
-        for name in ("left", "right")
-        for identity in (b"a", b"b")
-    }
-    assert len(made) == 8
+    whose = itertools.product((1, 2), ("left", "right"), (b"a", b"b"))
+    assert len({serial_number(*each) for each in whose}) == 8
     digest = hashlib.sha256(b"akontronik-can-gw 1 left").digest()
     assert serial_number(1, "left", b"a") == int.from_bytes(digest[:4], "big")  # as in 0.5.0
     assert serial_number(1, "left", b"") == 0

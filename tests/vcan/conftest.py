@@ -7,13 +7,11 @@ import itertools
 import os
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from vcan_tools import GatewayProcess, ip
-
-from kontronik_can_gw.desk.pty import PtyEsc
+from harness import PtyPort
+from vcan_tools import GatewayProcess, feeding, ip
 
 _numbers = itertools.count()
 
@@ -24,8 +22,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("vcan")
 
 
-@contextmanager
-def fresh_vcan() -> Iterator[str]:
+@pytest.fixture
+def vcan() -> Iterator[str]:
+    """The name of a fresh virtual CAN interface (CAN FD capable), up."""
     name = f"kcg{os.getpid() % 10000}n{next(_numbers)}"
     made = subprocess.run(
         ["ip", "link", "add", name, "type", "vcan"], capture_output=True, text=True, check=False
@@ -42,26 +41,10 @@ def fresh_vcan() -> Iterator[str]:
 
 
 @pytest.fixture
-def vcan() -> Iterator[str]:
-    """The name of a fresh virtual CAN interface (CAN FD capable), up."""
-    with fresh_vcan() as name:
-        yield name
-
-
-@pytest.fixture(scope="module")
-def module_vcan() -> Iterator[str]:
-    """One for all tests of a module."""
-    with fresh_vcan() as name:
-        yield name
-
-
-@pytest.fixture
-def esc() -> Iterator[PtyEsc]:
+def escs(tmp_path: Path) -> Iterator[list[PtyPort]]:
     """The port of an ESC, to which nothing may be sent."""
-    with PtyEsc() as terminal:
-        yield terminal
-        terminal.check()
-        assert terminal.received == 0, "something was transmitted to an ESC"
+    with feeding(tmp_path) as ports:
+        yield ports
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import queue
 import shutil
 import subprocess
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
@@ -31,6 +31,13 @@ class Refused(Exception):
     def __init__(self, text: str, code: int | None) -> None:
         super().__init__(text)
         self.code = code
+
+
+def refusal(transfer: Callable[..., object], *arguments: object, **more: object) -> int | None:
+    """The code of a transfer that is refused."""
+    with pytest.raises(Refused) as refused:
+        transfer(*arguments, **more)
+    return refused.value.code
 
 
 class NodeMaster:
@@ -91,9 +98,8 @@ class NodeMaster:
         self._process.stdin.close()
         try:
             self._process.wait(LIMIT_S)
-        except subprocess.TimeoutExpired:
+        finally:
             self._process.kill()
-            self._process.wait()
         self._thread.join(LIMIT_S)
         self._process.stdout.close()
 

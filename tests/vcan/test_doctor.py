@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from harness import PtyPort
 from slcan_adapters import Adapter, Bus
-from vcan_tools import Candump, configuration, ip, wait_for
+from vcan_tools import configuration, ip, recording, wait_for
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.desk.pty import PtyEsc
 
 
 @pytest.fixture
@@ -41,16 +41,16 @@ def doctor(file: Path) -> tuple[dict[str, dict[str, Any]], int]:
     return {f["check"]: f for f in findings if f["check"].startswith(("can.", "port."))}, code
 
 
-def configured(folder: Path, interface: str, port: str) -> Path:
+def configured(folder: Path, interface: str, ports: list[PtyPort]) -> Path:
     file = folder / "doctor.toml"
-    file.write_text(configuration(interface, [port]))
+    file.write_text(configuration(interface, ports))
     return file
 
 
 def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_nothing_is_sent(
-    vcan: str, tmp_path: Path, esc: PtyEsc
+    vcan: str, tmp_path: Path, escs: list[PtyPort]
 ) -> None:
-    file = configured(tmp_path, vcan, esc.path)
+    file = configured(tmp_path, vcan, escs)
     ip("link", "set", vcan, "down")
     for check, before in (("can.up", ["true"]), ("can.exists", ["ip", "link", "del", vcan])):
         subprocess.run(before, check=True)
@@ -58,9 +58,9 @@ def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_n
         assert code == 1
         assert found[check]["severity"] == "error"
         subprocess.run(found[check]["command"].replace("sudo ", ""), shell=True, check=True)
-        with Candump(vcan) as dump:
+        with recording(vcan) as watch:
             found, code = doctor(file)
-        assert dump.frames == []
+        assert watch.recorded == []
         assert code == 0
         assert found["can.kernel"]["severity"] == found["can.up"]["severity"] == "ok"
         assert "virtual interface" in found["can.exists"]["text"]
@@ -68,9 +68,9 @@ def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_n
 
 
 def test_bit_rate_and_state_of_a_real_driver_are_seen(
-    adapter: Adapter, tmp_path: Path, esc: PtyEsc
+    adapter: Adapter, tmp_path: Path, escs: list[PtyPort]
 ) -> None:
-    file = configured(tmp_path, adapter.name, esc.path)
+    file = configured(tmp_path, adapter.name, escs)
     found, code = doctor(file)
     assert code == 1
     assert found["can.up"]["severity"] == "error"

@@ -1,35 +1,26 @@
 """ESCs -> gateway process with DroneCAN nodes -> vcan -> the package ``dronecan`` as monitor, allocator and asker; 1 and 4 ESCs."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
-from vcan_tools import LIMIT_S, Bench, GatewayProcess, bench, wait_for
-
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Phase
-from kontronik_can_gw.esc.kontronik.states import OperatingState
+from harness import PtyPort
+from vcan_tools import LIMIT_S, GatewayProcess, configuration, feeding, sent_by, wait_for
 
 pytestmark = pytest.mark.extended
 dronecan: Any = import_module("dronecan")
 Start = Callable[..., GatewayProcess]
-LIVELY = (
-    Phase("up", 0.5, 80, OperatingState.Forward, 0.5),
-    Phase("down", 0.5, 20, OperatingState.Forward, 0.5),
-)
 
 
-def configuration(interface: str, run: Bench, more: str) -> str:
-    parts = [
-        f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n[dbc]\nenabled = false\n',
-        f"[dronecan]\nenabled = true\n{more}\n",
-    ]
-    parts += [
-        f'[[esc]]\nport = "{port.path}"\nname = "e{n}"\npole_pairs = 7\ntelemetry_timeout_ms = 60000\n'
-        for n, port in enumerate(run.ports)
-    ]
-    return "".join(parts)
+def started(interface: str, ports: list[PtyPort], start: Start, more: str) -> GatewayProcess:
+    """A gateway with DroneCAN only, once all is open."""
+    tables = f"[dbc]\nenabled = false\n[dronecan]\nenabled = true\nper_esc_nodes = true\n{more}"
+    gateway = start(configuration(interface, ports, tables))
+    gateway.wait_for_line(f"esc{len(ports)}: /")
+    return gateway
 
 
 class Peer:
@@ -62,69 +53,59 @@ class Peer:
         assert answers[0] is not None
         return answers[0].response
 
-
-@contextmanager
-def peer_on(interface: str) -> Iterator[Peer]:
-    peer = Peer(interface)
-    try:
-        yield peer
-    finally:
-        peer.node.close()
+    def close(self) -> None:
+        self.node.close()
 
 
-def check_statuses(run: Bench, peer: Peer, escs: Sequence[int]) -> None:
-    """Each that comes from now on is a reading that was sent."""
+def check_statuses(ports: list[PtyPort], peer: Peer) -> None:
+    """Telemetry begins, and each status from now on is a reading that was sent."""
+    for port in ports:
+        port.on = True
     peer.statuses.clear()
-    peer.until(lambda: len(peer.statuses) >= 60 * len(escs), "esc.Status")
+    peer.until(lambda: len(peer.statuses) >= 60 * len(ports), "esc.Status")
     for event in list(peer.statuses):
         got = event.message
-        sent = run.live(got.esc_index)
         assert any(
             (each.electrical_speed + 3) // 7 == got.rpm
             and abs(each.battery_voltage / 100 - got.voltage) < 0.032
             and abs(each.battery_current / 10 - got.current) < 0.126
             and abs(each.power_stage_temperature + 273.15 - got.temperature) < 0.126
-            for each in sent
+            for each in sent_by(ports[got.esc_index])
         ), got
     indices = [event.message.esc_index for event in peer.statuses]
-    assert set(indices) == set(escs)
+    assert set(indices) == set(range(len(ports)))
 
 
 @pytest.mark.parametrize("escs", [1, 4])
-def test_a_foreign_node_sees_asks_and_reads(vcan: str, start_gateway: Start, escs: int) -> None:
-    with bench(*[EscOptions(profile=LIVELY)] * escs) as run, peer_on(vcan) as peer:
-        more = "node_id = 20\nper_esc_nodes = true"
-        gateway = start_gateway(configuration(vcan, run, more))
-        gateway.wait_for_line(f"e{escs - 1}: /dev/pts")
+def test_a_foreign_node_sees_asks_and_reads(
+    vcan: str, start_gateway: Start, tmp_path: Path, escs: int
+) -> None:
+    with feeding(tmp_path, escs) as ports, closing(Peer(vcan)) as peer:
+        gateway = started(vcan, ports, start_gateway, "node_id = 20")
         nodes = set(range(20, 20 + escs))
         peer.until(lambda: peer.known() >= nodes, "GetNodeInfo")
-        run.start()
-        check_statuses(run, peer, range(escs))
+        check_statuses(ports, peer)
         for entry in peer.monitor.find_all(lambda e: e.node_id in nodes):
             assert entry.status.health == entry.status.HEALTH_OK
             assert entry.status.mode == entry.status.MODE_OPERATIONAL
         request = dronecan.uavcan.protocol.param.GetSet.Request()
-        name = f"e{escs - 1}.pole_pairs"
+        name = f"esc{escs}.pole_pairs"
         request.name.from_bytes(name.encode())
         answer = peer.ask(request, 20 + escs - 1)
         assert answer.value.integer_value == 7
         assert bytes(answer.name.to_bytes()).decode() == name
         assert gateway.end() == 0, gateway.log
         offline = dronecan.uavcan.protocol.NodeStatus().MODE_OFFLINE
-        peer.until(
-            lambda: all(
-                entry.status.mode == offline
-                for entry in peer.monitor.find_all(lambda e: e.node_id in nodes)
-            ),
-            "OFFLINE",
-        )
+        ours = list(peer.monitor.find_all(lambda e: e.node_id in nodes))
+        peer.until(lambda: all(entry.status.mode == offline for entry in ours), "OFFLINE")
 
 
 @pytest.mark.parametrize("escs", [1, 4])
-def test_a_foreign_allocator_gives_the_node_ids(vcan: str, start_gateway: Start, escs: int) -> None:
-    with bench(*[EscOptions(profile=LIVELY)] * escs) as run, peer_on(vcan) as peer:
-        gateway = start_gateway(configuration(vcan, run, "per_esc_nodes = true"))
-        gateway.wait_for_line(f"e{escs - 1}: /dev/pts")
+def test_a_foreign_allocator_gives_the_node_ids(
+    vcan: str, start_gateway: Start, tmp_path: Path, escs: int
+) -> None:
+    with feeding(tmp_path, escs) as ports, closing(Peer(vcan)) as peer:
+        gateway = started(vcan, ports, start_gateway, "")
         server = dronecan.app.dynamic_node_id.CentralizedServer(peer.node, peer.monitor)
         peer.until(lambda: len(peer.known()) == escs, "nodes")
         table = server._allocation_table
@@ -132,6 +113,5 @@ def test_a_foreign_allocator_gives_the_node_ids(vcan: str, start_gateway: Start,
             unique_id = bytes(entry.info.hardware_version.unique_id.to_bytes())
             assert table.get_node_id(unique_id) == entry.node_id
             gateway.wait_for_line(f"has node-ID {entry.node_id}")
-        run.start()
-        check_statuses(run, peer, range(escs))
+        check_statuses(ports, peer)
         assert gateway.end() == 0, gateway.log

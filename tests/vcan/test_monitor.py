@@ -3,52 +3,44 @@
 import re
 from collections.abc import Callable
 
-from vcan_tools import (
-    GatewayProcess,
-    bench,
-    configuration,
-    ip,
-    wait_for,
-)
-
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions
+from harness import PtyPort
+from vcan_tools import GatewayProcess, configuration, ip, wait_for
 
 Start = Callable[..., GatewayProcess]
 
 
 def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
-    vcan: str, start_gateway: Start
+    vcan: str, escs: list[PtyPort], start_gateway: Start
 ) -> None:
-    with bench(EscOptions()) as run:
-        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
-        gateway.wait_for_line("esc1: /dev/pts")
-        run.start()
-        shown = GatewayProcess(None, "--channel", vcan, command="monitor")
-        out = shown.out
-        try:
+    gateway = start_gateway(configuration(vcan, escs))
+    gateway.wait_for_line("esc1: /")
+    escs[0].on = True
+    shown = GatewayProcess(None, "--channel", vcan, command="monitor")
+    out = shown.out
+    try:
 
-            def is_shown() -> bool:
-                return any(re.match(r"esc1 .* ok .* \d\d\.\d\d ", line) for line in out[-2:])
+        def is_shown() -> bool:
+            return any(re.match(r"esc1 .* (ok|degraded) .* \d\d\.\d\d ", line) for line in out[-2:])
 
-            wait_for(is_shown, "values")
-            for act, undo, what in (
-                (("set", vcan, "down"), [("set", vcan, "up")], "is down. Start it"),
-                (
-                    ("del", vcan),
-                    [("add", vcan, "type", "vcan"), ("set", vcan, "up")],
-                    "there is none.",
-                ),
-            ):
-                before = len(out)
-                ip("link", *act)
-                wait_for(lambda b=before, w=what: w in " ".join(out[b:]), what)  # type: ignore[misc]
-                wait_for(lambda: "errors: -" in out[-1], "no old value")
-                assert shown.process.poll() is None
-                for words in undo:
-                    ip("link", *words)
-                wait_for(is_shown, "values again")
-            assert shown.end() == 0
-            assert shown.lines[-1].endswith(f"seen on {vcan}, none sent")
-            assert "Traceback" not in shown.log
-        finally:
-            shown.kill()
+        wait_for(is_shown, "values")
+        for act, undo, what in (
+            (("set", vcan, "down"), [("set", vcan, "up")], "is down. Start it"),
+            (
+                ("del", vcan),
+                [("add", vcan, "type", "vcan"), ("set", vcan, "up")],
+                "there is none.",
+            ),
+        ):
+            before = len(out)
+            ip("link", *act)
+            wait_for(lambda b=before, w=what: w in " ".join(out[b:]), what)  # type: ignore[misc]
+            wait_for(lambda: "errors: -" in out[-1], "no old value")
+            assert shown.process.poll() is None
+            for words in undo:
+                ip("link", *words)
+            wait_for(is_shown, "values again")
+        assert shown.end() == 0
+        assert shown.lines[-1].endswith(f"seen on {vcan}, none sent")
+        assert "Traceback" not in shown.log
+    finally:
+        shown.kill()
