@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.dbc import names, raw_values
 from kontronik_can_gw.dbc.bound_value import bound_plan
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.raw_values import exact, raw_range
+from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.settings import Compilation, UnfitSignal
 from kontronik_can_gw.esc.values import Group, Value, divisor_of_settings
@@ -27,7 +27,7 @@ class SignalCompiler:
         self.job = job
         self.copy = copy
         self.signal = signal
-        self.table = job.table(signal)
+        self.table = ValueTable(signal)
         self.start = attribute(signal, "GenSigStartValue", job.database)
         self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
         self.start_is_raw = raw_values.is_raw(self.start, signal)
