@@ -314,20 +314,19 @@ def test_after_a_loss_each_page_says_by_itself_that_its_value_is_gone(
     assert last == NOTHING
 
 
-def test_multiplexer_pages_take_turns() -> None:
-    for kind, cycle in ((CYCLIC, 10), (EVENT, 0)):
-        bench = paged(kind, cycle)
-        bench.until(15 * MS)
-        bench.forget()
-        bench.feed(300 * MS, 10 * MS, LIVE._replace(throttle=-3, bec_temperature=40))
-        pages = bench.raws(8)
-        assert len(pages) >= 28
-        assert all((a, b) in {(1, 5), (5, 9), (9, 1)} for a, b in pairwise(pages))
-        alive = bench.raws(8, 56)
-        assert all(b - a == 1 for a, b in pairwise(alive))
-        if kind == EVENT:
-            value = {1: 2442, 5: 0xFD, 9: 40}
-            assert all(get(f.data, 8, 16, True) == value[f.data[0]] for _, f in bench.sent)
+@pytest.mark.parametrize(("kind", "cycle"), [(CYCLIC, 10), (EVENT, 0)])
+def test_multiplexer_pages_take_turns(kind: int, cycle: int) -> None:
+    bench = paged(kind, cycle)
+    bench.until(15 * MS)
+    bench.forget()
+    bench.feed(300 * MS, 10 * MS, LIVE._replace(throttle=-3, bec_temperature=40))
+    pages = bench.raws(8)
+    assert len(pages) >= 28
+    assert all((a, b) in {(1, 5), (5, 9), (9, 1)} for a, b in pairwise(pages))
+    assert all(b - a == 1 for a, b in pairwise(bench.raws(8, 56)))
+    if kind == EVENT:
+        value = {1: 2442, 5: 0xFD, 9: 40}
+        assert bench.raws(16, 8) == [value[page] for page in pages]
 
 
 def test_of_multiplexed_pages_sent_on_change_the_changed_one_goes() -> None:
@@ -359,24 +358,20 @@ def test_a_cycle_adds_its_page_to_a_changed_one_that_had_to_wait() -> None:
 # --- the gateway itself -------------------------------------------------------------------------------------------------
 
 
-def health(kind: int, cycle: int = 0, delay: int = 0) -> Bench:
-    names = ("GatewayState", "CanState", "EscsOk", "EscCount")
-    message = Msg("Health", 0x300, 8, [Sig(name, 8 * n, 8) for n, name in enumerate(names)])
-    return Bench([(message, kind, cycle, delay)], ("left", "right"), start=True)
-
-
 @pytest.mark.parametrize("kind", [ON_CHANGE, EVENT, CYCLIC_AND_ON_CHANGE])
 def test_the_gateway_status_goes_when_it_changes(kind: int) -> None:
-    bench = health(kind, 10_000 if kind == CYCLIC_AND_ON_CHANGE else 0)
+    names = ("GatewayState", "CanState", "EscsOk", "EscCount")
+    message = Msg("Health", 0x100, 8, [Sig(name, 8 * n, 8) for n, name in enumerate(names)])
+    cycle = 10_000 if kind == CYCLIC_AND_ON_CHANGE else 0
+    bench = Bench([(message, kind, cycle, 0)], ("left", "right"), start=True)
     bench.until(5 * MS)
     bench.forget()
-    bench.gateway.set_can_state(CanState.ERROR_ACTIVE, 10 * MS)
-    bench.gateway.set_can_state(CanState.ERROR_ACTIVE, 20 * MS)
+    for at in (10, 20):
+        bench.gateway.set_can_state(CanState.ERROR_ACTIVE, at * MS)
     bench.take()
-    bench.now = 30 * MS
-    bench.live(esc=1)
-    bench.until(40 * MS)
-    bench.live(esc=1)
+    for at in (30, 40):
+        bench.until(at * MS)
+        bench.live(esc=1)
     bench.until(SECOND)
     bench.gateway.stop(bench.now)
     bench.take()
@@ -384,7 +379,7 @@ def test_the_gateway_status_goes_when_it_changes(kind: int) -> None:
     if kind == EVENT:  # without a cycle it comes each second, for its counters
         assert data.pop(3) == data[2]
     assert data == [(1, 1, 0, 2), (1, 1, 1, 2), (1, 1, 0, 2), (2, 1, 0, 2)]
-    assert bench.times(0x300)[2] == 290
+    assert bench.times()[2] == 290
 
 
 def test_the_last_word_is_every_page_that_changed_without_regard_to_the_minimum_distance() -> None:

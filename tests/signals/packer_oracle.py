@@ -348,40 +348,39 @@ class Msg:
         return [s for s in self.signals if not s.mux.startswith("m") or s.mux == f"m{number}"]
 
 
+ATTRIBUTES = """BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange","None","Wrong";
+BA_DEF_ SG_ "GenSigStartValue" FLOAT -9223372036854775808 18446744073709551615;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "GenMsgDelayTime" 0;
+BA_DEF_DEF_ "GenMsgSendType" "None";
+BA_DEF_DEF_ "GenSigStartValue" 0;"""
+
+
 def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
     """The messages as a DBC. ``more`` goes behind the attribute definitions."""
     messages = list(messages)
-    lines = ['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_: Gateway Logger Other", ""]
+    lines = ['VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Gateway Logger Other\n']
     for message in messages:
         lines.append(f"BO_ {message.dbc_id} {message.name}: {message.length} {message.sender}")
-        lines += [signal.line for signal in message.signals]
-        lines.append("")
+        lines += [*(signal.line for signal in message.signals), ""]
+    lines.append(ATTRIBUTES)
+    pairs = [(message.dbc_id, signal) for message in messages for signal in message.signals]
     lines += [
-        'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;',
-        'BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;',
-        'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange","None","Wrong";',
-        'BA_DEF_ SG_ "GenSigStartValue" FLOAT -9223372036854775808 18446744073709551615;',
-        'BA_DEF_DEF_ "GenMsgCycleTime" 0;',
-        'BA_DEF_DEF_ "GenMsgDelayTime" 0;',
-        'BA_DEF_DEF_ "GenMsgSendType" "None";',
-        'BA_DEF_DEF_ "GenSigStartValue" 0;',
-    ]
-    pairs = [(message, signal) for message in messages for signal in message.signals]
-    lines += [
-        f'BA_ "GenSigStartValue" SG_ {message.dbc_id} {signal.name} {signal.start_value};'
-        for message, signal in pairs
+        f'BA_ "GenSigStartValue" SG_ {can_id} {signal.name} {signal.start_value};'
+        for can_id, signal in pairs
         if signal.start_value is not None
     ]
-    lines += more.splitlines()
-    for message, signal in pairs:
+    lines.append(more)
+    for can_id, signal in pairs:
         if signal.texts:
             texts = " ".join(f'{number} "{text}"' for number, text in signal.texts.items())
-            lines.append(f"VAL_ {message.dbc_id} {signal.name} {texts} ;")
-    lines += [
-        f"SIG_VALTYPE_ {message.dbc_id} {signal.name} : {1 if signal.length == 32 else 2};"
-        for message, signal in pairs
-        if signal.is_float
-    ]
+            lines.append(f"VAL_ {can_id} {signal.name} {texts} ;")
+        if signal.is_float:
+            lines.append(
+                f"SIG_VALTYPE_ {can_id} {signal.name} : {1 if signal.length == 32 else 2};"
+            )
     return "\n".join(lines) + "\n"
 
 
