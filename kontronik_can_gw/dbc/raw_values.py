@@ -81,14 +81,6 @@ def raw_range(signal: "Signal") -> tuple[int, int]:
     return 0, (1 << length) - 1
 
 
-def is_raw(value: Any, signal: "Signal") -> bool:
-    """True for a whole number within the raw range."""
-    if not isinstance(value, (int, float)) or not math.isfinite(value) or value != int(value):
-        return False
-    low, high = raw_range(signal)
-    return low <= value <= high
-
-
 @lru_cache(maxsize=1024)
 def exact(number: Any) -> Fraction:
     """The decimal number in the file, not the float nearest to it."""

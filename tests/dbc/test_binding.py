@@ -56,21 +56,6 @@ def float_of(signal: Sig, bind: float | None = None, live: LiveData = LIVE) -> f
 # --- names --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("names", "signal", "raw"),
-    [
-        ("BatteryVoltage BATTERYVOLTAGE Battery_Voltage_ _BatteryVoltage ESC1_battery_voltage esc_1_BatteryVoltage",
-         Sig("", 0, 16, unit="V", factor="0.01"), 4442),
-        ("ThrottlePercent throttle_percent Throttle Esc1ThrottlePercent", Sig("", 0, 8, signed=True, unit="%"), -7),
-    ],
-)  # fmt: skip
-def test_a_name_is_found_whatever_its_case_underscores_prefix_and_percent(
-    names: str, signal: Sig, raw: int
-) -> None:
-    for name in names.split():
-        assert raw_of(replace(signal, name=name)) == raw
-
-
 def test_of_two_prefixes_the_longer_wins_and_a_source_before_a_prefix() -> None:
     binder = Binder([EscSettings("left"), EscSettings("left_rear"), EscSettings("l")], {})
     found = binder.by_name("LeftRearBatteryVoltage")

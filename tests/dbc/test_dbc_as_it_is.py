@@ -197,7 +197,6 @@ GATEWAYS: dict[str, Any] = {"node": "Gateway", "unbound": "start_value"}
 @pytest.mark.parametrize(
     ("patterns", "chosen"),
     [
-        (["Motor_1*"], ["Motor_11", "Motor_12"]),
         (["Brake_1", "Motor_?1"], ["Motor_11", "Brake_1", "Motor_21"]),
         ([], ["Motor_11", "Motor_12", "Brake_1", "Motor_20", "Motor_21"]),
     ],
@@ -209,17 +208,13 @@ def test_messages_are_chosen_by_patterns_of_their_names(
     assert [plan.name for plan in layout.messages] == chosen
 
 
-@pytest.mark.parametrize(
-    ("pattern", "words"),
-    [
-        ("Motr_11", "Did you mean Motor_11?"),
-        ("Motor_9*", "Motor_90 is sent by Other."),
-        ("qqq*", "in my_car.dbc."),
-    ],
-)
-def test_a_pattern_that_names_no_message_of_ours_is_refused(pattern: str, words: str) -> None:
-    (line,) = refused(ECU, messages=["Motor_11", pattern], **GATEWAYS)
-    assert line.startswith(f"dbc.messages: {pattern!r}") and line.endswith(words)
+def test_a_pattern_that_names_no_message_of_ours_is_refused() -> None:
+    lines = refused(ECU, messages=["Motr_11", "Motor_11", "Motor_9*", "qqq*"], **GATEWAYS)
+    assert lines == [
+        "dbc.messages: 'Motr_11' is no message of Gateway in my_car.dbc. Did you mean Motor_11?",
+        "dbc.messages: 'Motor_9*' is no message of Gateway in my_car.dbc. Motor_90 is sent by Other.",
+        "dbc.messages: 'qqq*' is no message of Gateway in my_car.dbc.",
+    ]
 
 
 def test_only_what_is_chosen_has_to_be_right_and_many_unbound_signals_come_with_advice() -> None:
@@ -240,15 +235,10 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
         read |= dict(theirs.decode_simple(packed(plan, gateway), decode_choices=False))
     expected = {"BatteryVoltage": 44.42, "Torque": -512.5, "Warm": 15, "Gear": 5}
     assert read == expected | {"Ratio": 1.5, "Cool": -2}
-    said = {
-        name: s["source"]
-        for m in check.messages(layout, ["esc1"])
-        for name, s in m["signals"].items()
-    }
-    held = {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}
-    assert {name: said[name] for name in held} == {
-        name: f"(nothing: always {value})" for name, value in held.items()
-    }
+    rows = check.messages(layout, ["esc1"])
+    said = {name: s["source"] for row in rows for name, s in row["signals"].items()}
+    for name, value in {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}.items():
+        assert said[name] == f"(nothing: always {value})"
     assert [line for line in layout.warnings if "sent once" in line] == [
         "my_car.dbc: sent once at the start, without a cycle and a value that changes: Motor_21"
     ]
@@ -443,10 +433,8 @@ STATES = signal("OperatingState", "8|8@1+") + 'VAL_ 256 OperatingState 7 "MotorO
         (signal("BatteryVoltage", "8|16@1+", "V", "0.01,0"), None),
         (signal("BatteryVoltage", "8|16@1+", "V", "0.01,0", "0|100"), "BatteryVoltage"),
         (signal("LinkState", "8|8@1+"), "LinkState"),
-        (
-            signal("Device", "8|8@1+", ends="0|5"),
-            None,
-        ),  # of the information, which outlives the link
+        # of the information, which outlives the link
+        (signal("Device", "8|8@1+", ends="0|5"), None),
         (signal("BecCurrent", "8|16@1+", "A", "0.01,0", "0|100"), None),  # never on a JIVEPro
         (percent("0|0"), "Throttle"),
         (signal("MessageAlive", "8|8@1+"), None),
