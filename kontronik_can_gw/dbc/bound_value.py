@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
-from functools import lru_cache
 
 from kontronik_can_gw.dbc import raw_values
 from kontronik_can_gw.dbc.raw_values import ValueTable
@@ -53,16 +52,8 @@ def _scale(plan: SignalPlan, value: Value) -> tuple[Fraction, Fraction]:
             f"{value.name} is in {value.unit or 'no unit'} and cannot be converted to "
             f"{plan.unit!r}. Possible: {can}; dbc.units says what other texts mean."
         )
-    return _slope_and_intercept(converted, value.per_unit, plan.factor, plan.offset)
-
-
-@lru_cache(maxsize=1024)
-def _slope_and_intercept(
-    converted: tuple[Fraction, Fraction], per_unit: int, factor: Fraction, offset: Fraction
-) -> tuple[Fraction, Fraction]:
-    """For signals alike one and the same object."""
     scale, shift = converted
-    return scale / per_unit / factor, (shift - offset) / factor
+    return scale / value.per_unit / plan.factor, (shift - plan.offset) / plan.factor
 
 
 def _notes_on_names(value: Value, numbers: Mapping[int, int]) -> Iterator[str]:

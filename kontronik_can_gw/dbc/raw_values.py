@@ -34,17 +34,11 @@ class ValueTable:
             if normalize(text) not in _NOT_AVAILABLE | _ERROR
         }
         """Entries that are values."""
-        self._numbers: dict[Value, dict[int, int]] = {}
 
     def numbers(self, value: Value) -> dict[int, int]:
         """Numbers of an enumeration to the raw values of their texts."""
-        if value not in self._numbers:
-            self._numbers[value] = {
-                number: self.codes[normalize(text)]
-                for number, text in value.names.items()
-                if normalize(text) in self.codes
-            }
-        return self._numbers[value]
+        keys = {number: normalize(text) for number, text in value.names.items()}
+        return {number: self.codes[key] for number, key in keys.items() if key in self.codes}
 
     def _first(self, texts: frozenset[str]) -> int | None:
         return next((raw for text, raw in self.codes.items() if text in texts), None)
@@ -85,14 +79,6 @@ def raw_range(signal: "Signal") -> tuple[int, int]:
     if signal.is_signed:
         return -(1 << length - 1), (1 << length - 1) - 1
     return 0, (1 << length) - 1
-
-
-def is_raw(value: Any, signal: "Signal") -> bool:
-    """True for a whole number within the raw range."""
-    if not isinstance(value, (int, float)) or not math.isfinite(value) or value != int(value):
-        return False
-    low, high = raw_range(signal)
-    return low <= value <= high
 
 
 @lru_cache(maxsize=1024)

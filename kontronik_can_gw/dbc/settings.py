@@ -5,10 +5,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.binding import Binder
-from kontronik_can_gw.dbc.raw_values import ValueTable
 
 if TYPE_CHECKING:
-    from cantools.database.can import Database, Signal
+    from cantools.database.can import Database
 
 
 @dataclass(frozen=True)
@@ -56,12 +55,3 @@ class Compilation:
     """Messages whose send type means: only while a signal is active."""
     unbound: set[str] = field(default_factory=set)
     """Signals without a source."""
-    _tables: dict[int, ValueTable] = field(default_factory=dict)
-    """By the address of what cantools read, which the database keeps."""
-
-    def table(self, signal: "Signal") -> ValueTable:
-        """The value table of a signal; of copies of a signal one and the same."""
-        key = id(signal.choices)
-        if key not in self._tables:
-            self._tables[key] = ValueTable(signal)
-        return self._tables[key]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.dbc import names, raw_values
 from kontronik_can_gw.dbc.bound_value import bound_plan
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.raw_values import exact, raw_range
+from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.settings import Compilation, UnfitSignal
 from kontronik_can_gw.esc.values import Group, Value, divisor_of_settings
@@ -27,10 +27,13 @@ class SignalCompiler:
         self.job = job
         self.copy = copy
         self.signal = signal
-        self.table = job.table(signal)
+        self.table = ValueTable(signal)
         self.start = attribute(signal, "GenSigStartValue", job.database)
         self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
-        self.start_is_raw = raw_values.is_raw(self.start, signal)
+        self.start_raw = None
+        """Raw bits of the start value; None for one that the signal cannot hold."""
+        if isinstance(self.start, (int, float)):
+            self.start_raw = raw_values.constant(signal, self.start, Fraction(1), Fraction(0))
 
     def plan(self, page: int | None) -> SignalPlan | None:
         """The plan on a page; None, with a line in the problems, where the signal cannot be sent."""
@@ -114,8 +117,8 @@ class SignalCompiler:
         if self.table.not_available is not None:
             return self.table.not_available
         # a start value that is a mere default does not mean "not available"; a flag has nothing better
-        if self.start_is_raw and (self.start_is_set or self.signal.length == 1):
-            return int(self.start)
+        if self.start_raw is not None and (self.start_is_set or self.signal.length == 1):
+            return self.start_raw
         low, high = raw_range(self.signal)
         return low if self.signal.is_signed else high
 
@@ -179,22 +182,18 @@ class SignalCompiler:
         """The raw bits of an unbound signal: its own start value, else NotAvailable, else the default or 0."""
         if not self.start_is_set and self.table.not_available is not None:
             return plan.not_available
-        start = self.start or 0
-        raw = None
-        if plan.is_float and isinstance(start, (int, float)):
-            raw = raw_values.constant(self.signal, start, Fraction(1), Fraction(0))
-        elif raw_values.is_raw(start, self.signal):
-            raw = int(start)
-        if raw is None:
+        if not self.start:
+            return 0
+        if self.start_raw is None:
             raise UnfitSignal(
-                f"its GenSigStartValue {start} is none of its raw values. Bind it to a constant."
+                f"its GenSigStartValue {self.start} is none of its raw values. Bind it to a constant."
             )
-        return raw
+        return self.start_raw
 
     def _flag_on_loss(self) -> int | None:
         """Value without telemetry, 0 or 1, of a flag that has no code for it; None: its own code or start value."""
         if self.table.not_available is not None:
             return None
         chosen = self.job.settings.flags_on_loss
-        own = self.start_is_set and self.start_is_raw
+        own = self.start_is_set and self.start_raw is not None
         return None if chosen is None and own else chosen or 0

@@ -55,9 +55,7 @@ def compile_pack(plan: MessagePlan) -> Pack:
     ) -> int:
         bits, sources = pages[at]
         for pieces, raw in sources:
-            found = raw(escs, gateway, now)
-            for shift, width, to in pieces:
-                bits |= (found >> shift & (1 << width) - 1) << to
+            bits |= place(pieces, raw(escs, gateway, now))
         for places, modulus in counters:
             bits |= place(places, alive % modulus)
         return bits

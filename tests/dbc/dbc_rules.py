@@ -75,24 +75,23 @@ class Message(NamedTuple):
 
 
 class Database:
-    """What a DBC says. Keys: ("",), ("BU_", name), ("BO_", id), ("SG_", id, name)."""
+    """What a DBC says. Owners of comments: ("",), ("BU_", name), ("BO_", id), ("SG_", id, name)."""
 
     def __init__(self, data: bytes) -> None:
         read: Any = cantools.database.load_string(
             data.decode("ascii"), "dbc", strict=True, sort_signals=None
         )
-        owners: list[tuple[tuple[str | int, ...], Any]] = [(("BU_", n.name), n) for n in read.nodes]
+        owners: dict[tuple[str | int, ...], Any] = {("BU_", node.name): node for node in read.nodes}
         for m in read.messages:
-            owners += [
-                (("BO_", m.frame_id), m),
-                *((("SG_", m.frame_id, s.name), s) for s in m.signals),
-            ]
+            owners["BO_", m.frame_id] = m
+            owners |= {("SG_", m.frame_id, s.name): s for s in m.signals}
         self.nodes: list[str] = [node.name for node in read.nodes]
         self.messages = [
             Message(m.frame_id, m.name, m.length, m.senders[0], [_signal(m, s) for s in m.signals])
             for m in read.messages
         ]
-        self.comments = [(key, str(owner.comment)) for key, owner in owners]
+        self.signals = [signal for message in self.messages for signal in message.signals]
+        self.comments = [(key, str(owner.comment)) for key, owner in owners.items()]
         self.comments.append((("",), read.buses[0].comment))
         self.tables = {
             (m.frame_id, s.name): {int(number): str(text) for number, text in s.choices.items()}
@@ -104,16 +103,7 @@ class Database:
         self.plain = not any(
             m.is_multiplexed() or s.is_float for m in read.messages for s in m.signals
         )
-        self._attributes = {
-            (name, *key): attribute.value
-            for key, owner in [(("",), read), *owners]
-            for name, attribute in (owner.dbc.attributes if owner.dbc else {}).items()
-        }
-        self._send_types = {m.frame_id: str(m.send_type) for m in read.messages}
-
-    @property
-    def signals(self) -> list[Signal]:
-        return [signal for message in self.messages for signal in message.signals]
+        self._owners = owners | {("",): read}
 
     def named(self, signal: Signal) -> dict[int, str]:
         """Texts of a signal's values, without the codes."""
@@ -122,14 +112,16 @@ class Database:
 
     def attribute(self, name: str, *key: str | int) -> Any:
         """An attribute's value; None where it is not given."""
-        return self._attributes.get((name, *(key or ("",))))
+        owner = self._owners[key or ("",)]
+        found = owner.dbc.attributes.get(name) if owner.dbc else None
+        return None if found is None else found.value
 
     def number(self, name: str, message: Message) -> int:
         """A whole-number attribute of a message; 0 where it is not given."""
         return int(self.attribute(name, "BO_", message.id) or 0)
 
     def send_type(self, message: Message) -> str:
-        return self._send_types[message.id]
+        return str(self._owners["BO_", message.id].send_type)
 
 
 def _signal(message: Any, signal: Any) -> Signal:

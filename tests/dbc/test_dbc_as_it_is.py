@@ -11,11 +11,9 @@ from dbc_bench import compiled, gateway_with, packed, refused
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
 from kontronik_can_gw.dbc.loss import unreported
-from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.timing import SEND_TYPES
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES
@@ -52,9 +50,11 @@ def test_comments_and_value_texts_are_not_touched() -> None:
 
 
 def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> None:
-    text = 'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event";\nBA_ "GenMsgSendType" BO_ 256 "Sometimes";\n'
-    with pytest.raises(UserError, match='"GenMsgSendType": "Sometimes" is none of'):
-        parse_database((STATE + text).encode(), "my.dbc")
+    text = (
+        'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic";\nBA_ "GenMsgSendType" BO_ 256 "Sometimes";\n'
+    )
+    (line,) = refused(STATE + text)
+    assert '"GenMsgSendType": "Sometimes" is none of' in line
 
 
 @pytest.mark.parametrize(
@@ -162,11 +162,11 @@ def test_dbc_units_says_what_a_text_means_whatever_it_means_elsewhere() -> None:
     ]
 
 
-def test_degrees_and_micro_are_read_in_either_encoding_of_a_file() -> None:
-    text = MESSAGE + signal("BecTemperature", "0|8@1-", "°C") + signal("PwmInput", "8|16@1+", "µs")
+def test_a_degree_is_read_in_either_encoding_of_a_file() -> None:
+    text = MESSAGE + signal("BecTemperature", "0|8@1-", "°C")
     for encoding in ("utf-8", "cp1252"):
         (message,) = parse_database(text.encode(encoding), "my.dbc").messages
-        assert [s.unit for s in message.signals] == ["°C", "µs"]
+        assert message.signals[0].unit == "°C"
 
 
 # --- which messages, and signals bound to nothing ----------------------------------------------------------------------
@@ -197,7 +197,6 @@ GATEWAYS: dict[str, Any] = {"node": "Gateway", "unbound": "start_value"}
 @pytest.mark.parametrize(
     ("patterns", "chosen"),
     [
-        (["Motor_1*"], ["Motor_11", "Motor_12"]),
         (["Brake_1", "Motor_?1"], ["Motor_11", "Brake_1", "Motor_21"]),
         ([], ["Motor_11", "Motor_12", "Brake_1", "Motor_20", "Motor_21"]),
     ],
@@ -209,17 +208,13 @@ def test_messages_are_chosen_by_patterns_of_their_names(
     assert [plan.name for plan in layout.messages] == chosen
 
 
-@pytest.mark.parametrize(
-    ("pattern", "words"),
-    [
-        ("Motr_11", "Did you mean Motor_11?"),
-        ("Motor_9*", "Motor_90 is sent by Other."),
-        ("qqq*", "in my_car.dbc."),
-    ],
-)
-def test_a_pattern_that_names_no_message_of_ours_is_refused(pattern: str, words: str) -> None:
-    (line,) = refused(ECU, messages=["Motor_11", pattern], **GATEWAYS)
-    assert line.startswith(f"dbc.messages: {pattern!r}") and line.endswith(words)
+def test_a_pattern_that_names_no_message_of_ours_is_refused() -> None:
+    lines = refused(ECU, messages=["Motr_11", "Motor_11", "Motor_9*", "qqq*"], **GATEWAYS)
+    assert lines == [
+        "dbc.messages: 'Motr_11' is no message of Gateway in my_car.dbc. Did you mean Motor_11?",
+        "dbc.messages: 'Motor_9*' is no message of Gateway in my_car.dbc. Motor_90 is sent by Other.",
+        "dbc.messages: 'qqq*' is no message of Gateway in my_car.dbc.",
+    ]
 
 
 def test_only_what_is_chosen_has_to_be_right_and_many_unbound_signals_come_with_advice() -> None:
@@ -240,15 +235,10 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
         read |= dict(theirs.decode_simple(packed(plan, gateway), decode_choices=False))
     expected = {"BatteryVoltage": 44.42, "Torque": -512.5, "Warm": 15, "Gear": 5}
     assert read == expected | {"Ratio": 1.5, "Cool": -2}
-    said = {
-        name: s["source"]
-        for m in check.messages(layout, ["esc1"])
-        for name, s in m["signals"].items()
-    }
-    held = {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}
-    assert {name: said[name] for name in held} == {
-        name: f"(nothing: always {value})" for name, value in held.items()
-    }
+    rows = check.messages(layout, ["esc1"])
+    said = {name: s["source"] for row in rows for name, s in row["signals"].items()}
+    for name, value in {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}.items():
+        assert said[name] == f"(nothing: always {value})"
     assert [line for line in layout.warnings if "sent once" in line] == [
         "my_car.dbc: sent once at the start, without a cycle and a value that changes: Motor_21"
     ]
@@ -258,7 +248,6 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
     ("place", "fits", "beyond"),
     [
         ("0|8@1+", (0, 255), (-1, 256, 0.5)),
-        ("0|8@1-", (-128, 127), (-129, 128)),
         ("0|1@1-", (-1, 0), (-2, 1)),
         ("7|12@0-", (-2048, 2047), (-2049, 2048)),
     ],
@@ -346,7 +335,7 @@ def test_a_counter_of_frames_is_known_by_its_name(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["ErrorCounter", "AliveCnt2", "FaultCnt", "COUNTER_PEDAL", "Counter1", "Alive_1"]
+    "name", ["ErrorCounter", "AliveCnt2", "COUNTER_PEDAL", "Alive_1", "ABZ", "Brebz", "Gas_CSX"]
 )
 def test_what_may_count_something_else_is_refused_unless_it_is_bound(name: str) -> None:
     (line,) = refused(MESSAGE + signal(name))
@@ -444,10 +433,8 @@ STATES = signal("OperatingState", "8|8@1+") + 'VAL_ 256 OperatingState 7 "MotorO
         (signal("BatteryVoltage", "8|16@1+", "V", "0.01,0"), None),
         (signal("BatteryVoltage", "8|16@1+", "V", "0.01,0", "0|100"), "BatteryVoltage"),
         (signal("LinkState", "8|8@1+"), "LinkState"),
-        (
-            signal("Device", "8|8@1+", ends="0|5"),
-            None,
-        ),  # of the information, which outlives the link
+        # of the information, which outlives the link
+        (signal("Device", "8|8@1+", ends="0|5"), None),
         (signal("BecCurrent", "8|16@1+", "A", "0.01,0", "0|100"), None),  # never on a JIVEPro
         (percent("0|0"), "Throttle"),
         (signal("MessageAlive", "8|8@1+"), None),
@@ -492,11 +479,6 @@ def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
     for key in later:
         del header["dbc"][key]
     assert CaptureSetup.of(header).dbc_settings == old
-
-
-@pytest.mark.parametrize("name", ["ABZ", "Jazz", "Brebz", "Kompass", "Physics", "Gas_CSX"])
-def test_a_word_that_only_ends_alike_is_neither(name: str) -> None:
-    assert protection(name) is None
 
 
 def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_that_advice() -> (

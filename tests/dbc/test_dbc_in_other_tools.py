@@ -8,31 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dbc_rules import Database, Message, Signal, parse
+from dbc_rules import parse
+from packer_oracle import get, put, read
 
-SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
+FILES = sorted((Path(__file__).parents[2] / "dbc").glob("*.dbc"))
 FRAMES_PER_MESSAGE = 100
-BOTH = pytest.mark.parametrize(
-    "file", [SHIPPED, SHIPPED.with_name("kontronik_canopen.dbc")], ids=lambda path: path.stem
-)
-
-
-def layout(file: Path = SHIPPED) -> Database:
-    return parse(file.read_bytes())
-
-
-def raw_value(signal: Signal, data: bytes) -> int:
-    """The raw value of an Intel signal, from the definition of the format alone."""
-    raw = int.from_bytes(data, "little") >> signal.start & ((1 << signal.length) - 1)
-    return raw - (1 << signal.length) if signal.signed and raw >> (signal.length - 1) else raw
-
-
-def frame(message: Message, raw: dict[str, int]) -> bytes:
-    """The bytes of a message from raw values, the inverse of `raw_value`."""
-    bits = 0
-    for signal in message.signals:
-        bits |= (raw[signal.name] & ((1 << signal.length) - 1)) << signal.start
-    return bits.to_bytes(message.dlc, "little")
+BOTH = pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
 
 
 # --- cantools -------------------------------------------------------------------------------------------------------
@@ -65,7 +46,7 @@ def matrix_of(file: Path, caplog: pytest.LogCaptureFixture) -> Any:
 
 @BOTH
 def test_canmatrix_sees_what_the_lines_say(file: Path, caplog: pytest.LogCaptureFixture) -> None:
-    matrix, db = matrix_of(file, caplog), layout(file)
+    matrix, db = matrix_of(file, caplog), parse(file.read_bytes())
     comments = dict(db.comments)
     assert [ecu.name for ecu in matrix.ecus] == db.nodes
     assert matrix.attributes == {"LayoutVersion": db.attribute("LayoutVersion"), "BusType": "CAN"}
@@ -88,58 +69,42 @@ def test_canmatrix_sees_what_the_lines_say(file: Path, caplog: pytest.LogCapture
             assert its.initial_value == start * signal.factor
 
 
-ON_OLDER_PYTHON = pytest.mark.skipif(
-    sys.version_info >= (3, 13), reason="opendbc refuses Python 3.13: run it by an older one"
-)
-
-
-# --- opendbc --------------------------------------------------------------------------------------------------------
-
-
-@ON_OLDER_PYTHON
-@BOTH
-def test_opendbc_reads_every_signal_from_the_path_of_the_file(file: Path) -> None:
-    """It takes a path where one exists, else the name of a packaged file. What it does not understand it skips."""
-    from opendbc.can.dbc import DBC
-
-    db = layout(file)
-    seen = DBC(str(file))
-    assert {address: message.name for address, message in seen.msgs.items()} == {
-        m.id: m.name for m in db.messages
-    }
-    for message in db.messages:
-        signals = seen.msgs[message.id].sigs
-        assert list(signals) == [signal.name for signal in message.signals]
-        for signal in message.signals:
-            its = signals[signal.name]
-            assert (its.factor, its.offset, its.type) == (float(signal.factor), 0.0, 0)
-
-
 # --- the same bits for all ------------------------------------------------------------------------------------------
 
 
-@ON_OLDER_PYTHON
+@pytest.mark.skipif(
+    sys.version_info >= (3, 13), reason="opendbc refuses Python 3.13: run it by an older one"
+)
 @BOTH
 def test_all_readers_find_the_same_raw_values_in_any_bytes(
     file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    import cantools
+    """opendbc takes a path where one exists, else the name of a packaged file, and skips what it does not understand."""
     from opendbc.can.dbc import DBC
     from opendbc.can.parser import get_raw_value
 
-    opendbc, matrix = DBC(str(file)), matrix_of(file, caplog)
-    database: Any = cantools.database.load_file(file)
+    opendbc, matrix = DBC(str(file)).msgs, matrix_of(file, caplog)
+    database = read(file.read_text())
     choice = random.Random(1)
-    for message in layout(file).messages:
+    messages = parse(file.read_bytes()).messages
+    assert {number: found.name for number, found in opendbc.items()} == {
+        message.id: message.name for message in messages
+    }
+    for message in messages:
+        theirs = opendbc[message.id].sigs
+        scales = {s.name: (float(s.factor), 0.0, 0) for s in message.signals}
+        assert {name: (s.factor, s.offset, s.type) for name, s in theirs.items()} == scales
         frames = [bytes(message.dlc), b"\xff" * message.dlc]
         for data in frames + [choice.randbytes(message.dlc) for _ in range(FRAMES_PER_MESSAGE)]:
-            expected = {signal.name: raw_value(signal, data) for signal in message.signals}
+            expected = {
+                s.name: get(data, s.start, s.length, True, s.signed) for s in message.signals
+            }
             assert expected == database.decode_message(
                 message.id, data, decode_choices=False, scaling=False
             )
             decoded = matrix.frame_by_name(message.name).decode(data)
             assert {name: seen.raw_value for name, seen in decoded.items()} == expected
-            for name, its in opendbc.msgs[message.id].sigs.items():
+            for name, its in theirs.items():
                 raw = get_raw_value(data, its)
                 raw -= (raw >> (its.size - 1) << its.size) if its.is_signed else 0
                 assert raw == expected[name], name
@@ -157,8 +122,10 @@ def recorded(path: Path, file: Path, moments: list[dict[str, int]]) -> Any:
 
     with can.MF4Writer(path) as writer:
         for number, moment in enumerate(moments):
-            for message in layout(file).messages:
-                at, data = 1_700_000_000 + number / 10, frame(message, moment)
+            for message in parse(file.read_bytes()).messages:
+                at, data = 1_700_000_000 + number / 10, bytearray(message.dlc)
+                for signal in message.signals:
+                    put(data, moment[signal.name], signal.start, signal.length, True)
                 writer.on_message_received(
                     can.Message(at, arbitration_id=message.id, is_extended_id=False, data=data)
                 )
@@ -172,7 +139,7 @@ def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path, file: Path) -> None
     import numpy as np
 
     choice = random.Random(2)
-    db = layout(file)
+    db = parse(file.read_bytes())
     raw: list[dict[str, int]] = [{} for _ in range(30)]
     for signal in db.signals:
         table = db.tables.get(signal.key, {})

@@ -13,23 +13,15 @@ from dronecan_bench import Transfer
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 
 
-@dataclass
-class Shown:
-    """What is held of one ESC; each value with the time at which it came."""
-
-    rpm: tuple[int, float] | None = None
-    volts: tuple[int, float] | None = None
-    amperes: tuple[int, float] | None = None
-    celsius: tuple[int, float] | None = None
-
-
 class ArduPilot:
     """Time-outs: rpm 1 s, telemetry 5 s, the check that motors run 210 ms. Pre-arm: every node well, operational and known."""
 
     RPM_NS, TELEMETRY_NS, RUNNING_NS = SECOND, 5 * SECOND, 210 * MS
 
     def __init__(self, offset: int = 0) -> None:
-        self.escs: dict[int, Shown] = {}
+        self.speeds: dict[int, tuple[int, float]] = {}
+        """Of each ESC when it came, and what."""
+        self.voltages: dict[int, tuple[int, float]] = {}
         self.nodes: dict[int, tuple[int, int, int]] = {}
         self._offset = offset
 
@@ -37,34 +29,22 @@ class ArduPilot:
         got, at = transfer.payload, transfer.at
         if transfer.name == "NodeStatus":
             self.nodes[transfer.source] = at, got.health, got.mode
-        if transfer.name != "Status" or got.esc_index + self._offset >= 32:
-            return
-        shown = self.escs.setdefault(got.esc_index + self._offset, Shown())
-        shown.rpm = at, got.rpm
-        if not math.isnan(got.voltage):
-            shown.volts = at, got.voltage
-        if not math.isnan(got.current):
-            shown.amperes = at, got.current
-        if not math.isnan(got.temperature):
-            shown.celsius = at, got.temperature - 273.15
+        if transfer.name == "Status" and (esc := got.esc_index + self._offset) < 32:
+            self.speeds[esc] = at, got.rpm
+            if not math.isnan(got.voltage):
+                self.voltages[esc] = at, got.voltage
 
-    def rpm(self, esc: int, now: int) -> float | None:
-        shown = self.escs.get(esc)
-        if shown is None or shown.rpm is None or now - shown.rpm[0] >= self.RPM_NS:
-            return None
-        return shown.rpm[1]
+    def rpm(self, esc: int, now: int, life_ns: int = RPM_NS) -> float | None:
+        at, speed = self.speeds.get(esc, (now - life_ns, 0))
+        return speed if now - at < life_ns else None
 
     def runs(self, esc: int, now: int) -> bool:
         """The check that a motor turns, before a take-off."""
-        shown = self.escs.get(esc)
-        is_new = shown and shown.rpm and now - shown.rpm[0] < self.RUNNING_NS
-        return bool(is_new and self.rpm(esc, now))
+        return bool(self.rpm(esc, now, self.RUNNING_NS))
 
     def volts(self, esc: int, now: int) -> float | None:
-        shown = self.escs.get(esc)
-        if shown is None or shown.volts is None or now - shown.volts[0] >= self.TELEMETRY_NS:
-            return None
-        return shown.volts[1]
+        at, volts = self.voltages.get(esc, (now - self.TELEMETRY_NS, 0))
+        return volts if now - at < self.TELEMETRY_NS else None
 
     def refuses_to_arm(self, now: int) -> list[str]:
         """Pre-arm messages."""

@@ -1,6 +1,5 @@
 """A gateway with DroneCAN nodes, without a clock; the package ``dronecan`` reads what it sends, and asks."""
 
-import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -237,10 +236,3 @@ def peers_frames(payload: Any, source: int, to: int | None = None, **more: Any) 
 def intervals(transfers: Sequence[Transfer]) -> Iterator[int]:
     times = [each.at for each in transfers]
     return (after - before for before, after in pairwise(times))
-
-
-def answers_of(rng: random.Random) -> list[CanFrame]:
-    """SDO uploads that a CANopen node answers."""
-    index = rng.choice([0x1000, 0x1018, 0x2000, 0x2011])
-    request = bytes((0x40, index & 0xFF, index >> 8, rng.randrange(3), 0, 0, 0, 0))
-    return [CanFrame(0x601, request)]

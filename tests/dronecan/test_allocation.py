@@ -104,10 +104,9 @@ def test_an_allocator_that_dies_in_between_is_asked_anew() -> None:
     firsts = [each.payload.first_part_of_unique_id for each in bench.of("Allocation")]
     assert firsts[:3] == [True, False, True]
     assert all(firsts[2:])
-    bench.receive(*answers(0, own[:6]))
-    bench.run(0.41)
-    bench.receive(*answers(0, own[:12]))
-    bench.run(0.41)
+    for known in (6, 12):
+        bench.receive(*answers(0, own[:known]))
+        bench.run(0.41)
     bench.receive(*answers(3, own))
     assert node_ids(bench) == [3]
 
@@ -168,7 +167,6 @@ def test_others_that_ask_go_first() -> None:
 
 
 def test_the_seed_decides_when_it_asks() -> None:
-    first = waiting()
-    again = Bench(given=first.loaded)
-    assert first.run(9).frames == again.run(9).frames
+    first = waiting().run(9)
+    assert Bench(given=first.loaded).run(9).frames == first.frames
     assert waiting().run(9).frames != first.frames

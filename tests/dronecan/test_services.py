@@ -14,10 +14,8 @@ def test_node_info_says_who_it_is() -> None:
     bench = Bench(2, per_esc_nodes=True, name="com.example.gw").run(2.2)
     peer = Peer(bench)
     infos = [peer.ask(protocol.GetNodeInfo.Request(), node_id) for node_id in (42, 43)]
-    assert [bytes(info.name.to_bytes()) for info in infos] == [
-        b"com.example.gw.e0",
-        b"com.example.gw.e1",
-    ]
+    names = [bytes(info.name.to_bytes()) for info in infos]
+    assert names == [b"com.example.gw.e0", b"com.example.gw.e1"]
     ids = [bytes(info.hardware_version.unique_id.to_bytes()) for info in infos]
     assert len({each[:6] for each in ids}) == 2  # what allocators are given first
     assert infos[0].status.uptime_sec == 2

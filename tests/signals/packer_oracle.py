@@ -50,7 +50,7 @@ def get(data: bytes, start: int, length: int, little: bool, signed: bool = False
 
 # --- what can be published, typed from the sheet ------------------------------------------------------------------------
 
-Reader = Callable[[EscTelemetry, GatewayStatus, int], "Fraction | None"]
+Reader = Callable[[EscTelemetry, GatewayStatus, int], "int | Fraction | None"]
 
 
 @dataclass(frozen=True)
@@ -91,129 +91,92 @@ TEST_BITS = [
 JIVEPRO = 3
 
 
-def _live(name: str, step: str = "1") -> Reader:
-    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
-        return None if esc.live is None else getattr(esc.live, name) * Fraction(step)
+def _of(part: str, reckon: Callable[[EscTelemetry, Any], "int | Fraction | None"]) -> Reader:
+    """What is reckoned of an ESC's ``live`` or ``info`` data; not available without it."""
+
+    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | Fraction | None:
+        data = getattr(esc, part)
+        return None if data is None else reckon(esc, data)
 
     return read
 
 
-def _info(name: str, step: str = "1") -> Reader:
-    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
-        return None if esc.info is None else getattr(esc.info, name) * Fraction(step)
+def _fields(part: str, fields: Sequence[sheet.Field]) -> dict[str, Known]:
+    """Fields whose number is the value."""
+    spelled = str.maketrans({"µ": "u", "°": "deg"})
 
-    return read
+    def reader(name: str, steps: int) -> Reader:
+        return _of(part, lambda _, data: Fraction(getattr(data, name), steps))
 
-
-def _bit(word: str, number: int) -> Reader:
-    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
-        data: Any = esc.live if word == "operating_errors" else esc.info
-        return None if data is None else Fraction(getattr(data, word) >> number & 1)
-
-    return read
+    return {f.name: Known(f.unit.translate(spelled), reader(f.name, f.steps)) for f in fields}
 
 
-def _calculated(reckon: Callable[[EscTelemetry, LiveData], "Fraction | None"]) -> Reader:
-    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
-        return None if esc.live is None else reckon(esc, esc.live)
+def _bits(part: str, word: str, names: Sequence[str]) -> dict[str, Known]:
+    def reader(bit: int) -> Reader:
+        return _of(part, lambda _, data: getattr(data, word) >> bit & 1)
 
-    return read
-
-
-def _of_esc(reckon: Callable[[EscTelemetry], "int | Fraction | None"]) -> Reader:
-    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
-        value = reckon(esc)
-        return None if value is None else Fraction(value)
-
-    return read
-
-
-def _of_gateway(reckon: Callable[[GatewayStatus, int], "int | Fraction"]) -> Reader:
-    def read(_esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction | None:
-        return Fraction(reckon(gateway, now))
-
-    return read
-
-
-def _device_word(reckon: Callable[[int], int], word: str = "device_and_variant") -> Reader:
-    return _of_esc(lambda esc: None if esc.info is None else reckon(getattr(esc.info, word)))
+    return {name: Known("", reader(bit)) for bit, name in enumerate(names)}
 
 
 def _bec_current(esc: EscTelemetry, live: LiveData) -> Fraction | None:
-    if esc.info is None:
-        was_jive = esc.last_info is not None and esc.last_info.device_and_variant >> 10 == JIVEPRO
-        return Fraction(live.bec_current, 1000) if live.bec_current and not was_jive else None
-    return (
-        None if esc.info.device_and_variant >> 10 == JIVEPRO else Fraction(live.bec_current, 1000)
-    )
-
-
-def _max_bec_current(esc: EscTelemetry) -> Fraction | None:
-    if esc.info is None or esc.info.device_and_variant >> 10 == JIVEPRO:
+    known = esc.info or esc.last_info
+    is_jive = known is not None and known.device_and_variant >> 10 == JIVEPRO
+    if is_jive or (esc.info is None and not live.bec_current):
         return None
-    return Fraction(esc.info.max_bec_current, 1000)
+    return Fraction(live.bec_current, 1000)
 
 
-def _age(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> Fraction | None:
-    return None if esc.live_ns is None else Fraction(max(0, now - esc.live_ns) // 1_000_000)
-
-
-def _plain(fields: Sequence[sheet.Field], reader: Callable[[str, str], Reader]) -> dict[str, Known]:
-    """Fields whose number is the value."""
-    spelled = str.maketrans({"µ": "u", "°": "deg"})
-    return {
-        f.name: Known(f.unit.translate(spelled), reader(f.name, f"1/{f.steps}")) for f in fields
-    }
+def _max_bec_current(_esc: EscTelemetry, info: InfoData) -> Fraction | None:
+    is_jive = info.device_and_variant >> 10 == JIVEPRO
+    return None if is_jive else Fraction(info.max_bec_current, 1000)
 
 
 def _counters(
-    names: str,
-    read: Callable[[Any], Any],
-    of: Callable[[Callable[..., Any]], Reader],
-    gateway: bool = False,
+    names: str, owner: Callable[[EscTelemetry, GatewayStatus], Any], gateway: bool = False
 ) -> dict[str, Known]:
     def reader(path: str) -> Reader:
-        return of(lambda owner, *_: getattr(read(owner), path))
+        return lambda esc, of_gateway, _: getattr(owner(esc, of_gateway), path)
 
     pairs = [pair.split("=") for pair in names.split()]
     return {pair[0]: Known("", reader(pair[-1]), rolls=True, gateway=gateway) for pair in pairs}
 
 
 KNOWN: dict[str, Known] = {
-    **_plain(sheet.LIVE_FIELDS, _live),
-    "bec_current": Known("A", _calculated(_bec_current)),
-    "operating_state": Known("", _live("operating_state"), STATES),
-    "operating_state_raw": Known("", _live("operating_state")),
-    **{name: Known("", _bit("operating_errors", number)) for number, name in enumerate(ERROR_BITS)},
-    **{name: Known("", _bit("selftest_errors", number)) for number, name in enumerate(TEST_BITS)},
-    **_plain(sheet.INFO_FIELDS[2:], _info),
-    "max_bec_current": Known("A", _of_esc(_max_bec_current)),
-    "device": Known("", _device_word(lambda word: word >> 10), DEVICES),
-    "device_raw": Known("", _device_word(lambda word: word >> 10)),
-    "variant": Known("", _device_word(lambda word: word & 1023)),
-    "firmware_main": Known("", _device_word(lambda word: word >> 8, "firmware_word")),
-    "firmware_sub": Known("", _device_word(lambda word: word & 255, "firmware_word")),
-    "motor_speed": Known("1/min", _calculated(lambda e, v: Fraction(v.electrical_speed, e.settings.pole_pairs))),
-    "output_speed": Known("1/min", _calculated(lambda e, v: v.electrical_speed / (e.settings.pole_pairs * e.settings.gear))),
-    "battery_power": Known("W", _calculated(lambda _e, v: Fraction(v.battery_voltage * v.battery_current, 1000))),
+    **_fields("live", sheet.LIVE_FIELDS),
+    "bec_current": Known("A", _of("live", _bec_current)),
+    "operating_state": Known("", _of("live", lambda _, v: v.operating_state), STATES),
+    "operating_state_raw": Known("", _of("live", lambda _, v: v.operating_state)),
+    **_bits("live", "operating_errors", ERROR_BITS),
+    **_bits("info", "selftest_errors", TEST_BITS),
+    **_fields("info", sheet.INFO_FIELDS[2:]),
+    "max_bec_current": Known("A", _of("info", _max_bec_current)),
+    "device": Known("", _of("info", lambda _, i: i.device_and_variant >> 10), DEVICES),
+    "device_raw": Known("", _of("info", lambda _, i: i.device_and_variant >> 10)),
+    "variant": Known("", _of("info", lambda _, i: i.device_and_variant & 1023)),
+    "firmware_main": Known("", _of("info", lambda _, i: i.firmware_word >> 8)),
+    "firmware_sub": Known("", _of("info", lambda _, i: i.firmware_word & 255)),
+    "motor_speed": Known("1/min", _of("live", lambda e, v: Fraction(v.electrical_speed, e.settings.pole_pairs))),
+    "output_speed": Known(
+        "1/min", _of("live", lambda e, v: v.electrical_speed / (e.settings.pole_pairs * e.settings.gear))),
+    "battery_power": Known("W", _of("live", lambda _, v: Fraction(v.battery_voltage * v.battery_current, 1000))),
     "mean_cell_voltage": Known(
-        "V", _calculated(lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None)),
-    "energy_used": Known("Wh", _of_esc(lambda e: Fraction(e.energy_mw_ns // 10**9, 3600 * 1000))),
-    "motor_run_time": Known("s", _of_esc(lambda e: Fraction(e.run_time_ns, 10**9))),
-    "link_state": Known("", _of_esc(lambda e: int(e.link)), LINKS),
-    "layout": Known("", _of_esc(lambda e: e.layout), LAYOUTS),
-    "data_age": Known("ms", _age),
-    "frame_rate": Known("Hz", _of_esc(lambda e: None if e.frame_rate is None else Fraction(e.frame_rate, 10))),
-    **_counters("losses suspect_frames", lambda esc: esc, _of_esc),
-    **_counters("crc_errors dropped_bytes live_frames=live info_frames=info received_bytes=bytes", lambda esc: esc.counters, _of_esc),
-    "gateway_state": Known("", _of_gateway(lambda g, _: int(g.state)), GATEWAY_STATES, gateway=True),
-    "can_state": Known("", _of_gateway(lambda g, _: int(g.can_state)), CAN_STATES, gateway=True),
-    "esc_count": Known("", _of_gateway(lambda g, _: g.esc_count), gateway=True),
-    "escs_ok": Known("", _of_gateway(lambda g, _: g.escs_ok), gateway=True),
-    "uptime": Known("s", _of_gateway(lambda g, now: Fraction((now - g.started_ns) // 10**6, 1000)), gateway=True),
+        "V", _of("live", lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None)),
+    "energy_used": Known("Wh", lambda e, _g, _n: Fraction(e.energy_mw_ns // 10**9, 3600 * 1000)),
+    "motor_run_time": Known("s", lambda e, _g, _n: Fraction(e.run_time_ns, 10**9)),
+    "link_state": Known("", lambda e, _g, _n: int(e.link), LINKS),
+    "layout": Known("", lambda e, _g, _n: e.layout, LAYOUTS),
+    "data_age": Known("ms", lambda e, _g, now: None if e.live_ns is None else max(0, now - e.live_ns) // 10**6),
+    "frame_rate": Known("Hz", lambda e, _g, _n: None if e.frame_rate is None else Fraction(e.frame_rate, 10)),
+    **_counters("losses suspect_frames", lambda e, _: e),
+    **_counters("crc_errors dropped_bytes live_frames=live info_frames=info received_bytes=bytes", lambda e, _: e.counters),
+    "gateway_state": Known("", lambda _e, g, _n: int(g.state), GATEWAY_STATES, gateway=True),
+    "can_state": Known("", lambda _e, g, _n: int(g.can_state), CAN_STATES, gateway=True),
+    "esc_count": Known("", lambda _e, g, _n: g.esc_count, gateway=True),
+    "escs_ok": Known("", lambda _e, g, _n: g.escs_ok, gateway=True),
+    "uptime": Known("s", lambda _e, g, now: Fraction((now - g.started_ns) // 10**6, 1000), gateway=True),
     **_counters(
         "sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames id_conflicts",
-        lambda gateway: gateway, _of_gateway, True),
+        lambda _, gateway: gateway, True),
 }  # fmt: skip
 
 # unit -> other units: (text, factor, shift), value in other = value * factor + shift
@@ -322,32 +285,22 @@ class Sig:
             else value * Fraction(self.conversion[0]) + Fraction(self.conversion[1])
         )
 
-    def allowed(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> set[int]:
+    def right(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int:
         """The raw value that is right: the nearest, halves up."""
-        known = KNOWN[self.source]
-        value = self.physical(esc, gateway, now)
+        known, value = KNOWN[self.source], self.physical(esc, gateway, now)
         if value is None:
-            return {self.not_available}
-        by_text = {
-            n: c
-            for n, t in known.names.items()
-            for c, name in self.texts.items()
-            if plain(name) == plain(t)
-        }
+            return self.not_available
+        codes = {plain(name): code for code, name in self.texts.items()}
+        by_text = {n: codes[plain(t)] for n, t in known.names.items() if plain(t) in codes}
         if by_text:
-            return {by_text.get(int(value), self.error)}
+            return by_text.get(int(value), self.error)
         low, high = self.limits
         if known.rolls:
-            return {int(value) % (high + 1)}
+            return int(value) % (high + 1)
         exact = (value - Fraction(self.offset)) / Fraction(self.factor)
-        return {self._sent(math.floor(exact + Fraction(1, 2)), low, high)}
-
-    def _sent(self, raw: int, low: int, high: int) -> int:
-        if not low <= raw <= high:
-            return self.error
-        one_bit_flag = self.length == 1
-        hides = raw == self.not_available and self.error != self.not_available and not one_bit_flag
-        return self.error if hides else raw
+        raw = math.floor(exact + Fraction(1, 2))
+        looks_like_none = raw == self.not_available and self.length > 1
+        return raw if low <= raw <= high and not looks_like_none else self.error
 
     def float_is_right(self, raw: int, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> bool:
         """True if the IEEE 754 bits are the value within the rounding of a double and of the type; NaN for not available."""
@@ -359,17 +312,10 @@ class Sig:
         exact = (value - Fraction(self.offset)) / Fraction(self.factor)
         if math.isnan(sent) or math.isinf(sent):
             return math.isnan(sent) and self.length == 32 and abs(exact) > Fraction(3.4028234e38)
-        size = max(
-            abs(exact),
-            abs(Fraction(self.offset) / Fraction(self.factor)),
-            abs(Fraction(self.conversion[1])),
-        )
-        tolerance = (
-            abs(exact) * Fraction(2) ** (-24 if self.length == 32 else -52)
-            + size / 10**14
-            + Fraction(1, 10**40)
-        )
-        return abs(Fraction(sent) - exact) <= tolerance
+        shifts = (Fraction(self.offset) / Fraction(self.factor), Fraction(self.conversion[1]))
+        size = max(abs(each) for each in (exact, *shifts))
+        rounding = abs(exact) * Fraction(2) ** (-24 if self.length == 32 else -52)
+        return abs(Fraction(sent) - exact) <= rounding + size / 10**14 + Fraction(1, 10**40)
 
 
 def plain(name: str) -> str:
@@ -402,40 +348,39 @@ class Msg:
         return [s for s in self.signals if not s.mux.startswith("m") or s.mux == f"m{number}"]
 
 
+ATTRIBUTES = """BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange","None","Wrong";
+BA_DEF_ SG_ "GenSigStartValue" FLOAT -9223372036854775808 18446744073709551615;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "GenMsgDelayTime" 0;
+BA_DEF_DEF_ "GenMsgSendType" "None";
+BA_DEF_DEF_ "GenSigStartValue" 0;"""
+
+
 def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
     """The messages as a DBC. ``more`` goes behind the attribute definitions."""
     messages = list(messages)
-    lines = ['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_: Gateway Logger Other", ""]
+    lines = ['VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Gateway Logger Other\n']
     for message in messages:
         lines.append(f"BO_ {message.dbc_id} {message.name}: {message.length} {message.sender}")
-        lines += [signal.line for signal in message.signals]
-        lines.append("")
+        lines += [*(signal.line for signal in message.signals), ""]
+    lines.append(ATTRIBUTES)
+    pairs = [(message.dbc_id, signal) for message in messages for signal in message.signals]
     lines += [
-        'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;',
-        'BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;',
-        'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange","None","Wrong";',
-        'BA_DEF_ SG_ "GenSigStartValue" FLOAT -9223372036854775808 18446744073709551615;',
-        'BA_DEF_DEF_ "GenMsgCycleTime" 0;',
-        'BA_DEF_DEF_ "GenMsgDelayTime" 0;',
-        'BA_DEF_DEF_ "GenMsgSendType" "None";',
-        'BA_DEF_DEF_ "GenSigStartValue" 0;',
-    ]
-    pairs = [(message, signal) for message in messages for signal in message.signals]
-    lines += [
-        f'BA_ "GenSigStartValue" SG_ {message.dbc_id} {signal.name} {signal.start_value};'
-        for message, signal in pairs
+        f'BA_ "GenSigStartValue" SG_ {can_id} {signal.name} {signal.start_value};'
+        for can_id, signal in pairs
         if signal.start_value is not None
     ]
-    lines += more.splitlines()
-    for message, signal in pairs:
+    lines.append(more)
+    for can_id, signal in pairs:
         if signal.texts:
             texts = " ".join(f'{number} "{text}"' for number, text in signal.texts.items())
-            lines.append(f"VAL_ {message.dbc_id} {signal.name} {texts} ;")
-    lines += [
-        f"SIG_VALTYPE_ {message.dbc_id} {signal.name} : {1 if signal.length == 32 else 2};"
-        for message, signal in pairs
-        if signal.is_float
-    ]
+            lines.append(f"VAL_ {can_id} {signal.name} {texts} ;")
+        if signal.is_float:
+            lines.append(
+                f"SIG_VALTYPE_ {can_id} {signal.name} : {1 if signal.length == 32 else 2};"
+            )
     return "\n".join(lines) + "\n"
 
 
@@ -491,11 +436,9 @@ class LayoutMaker:
         while (can_id, extended) in self.ids:
             can_id = rng.randrange(1 << 29 if extended else 1 << 11)
         self.ids.add((can_id, extended))
-        length = (
-            rng.choice((12, 16, 20, 24, 32, 48, 64))
-            if self.fd and rng.random() < 0.15
-            else rng.randint(1, 8)
-        )
+        length = rng.randint(1, 8)
+        if self.fd and rng.random() < 0.15:
+            length = rng.choice((12, 16, 20, 24, 32, 48, 64))
         message = Msg(f"M{self.count}", can_id, length, [], extended)
         common: set[tuple[int, int]] = set()
         wanted = rng.randint(1, 8)
@@ -534,31 +477,21 @@ class LayoutMaker:
         rng = self.rng
         source = rng.choice(list(KNOWN))
         known = KNOWN[source]
-        is_float = rng.random() < 0.12 and not known.rolls and not known.names
+        is_number = not known.rolls and not known.names
+        is_float = rng.random() < 0.12 and is_number
         signed = is_float or (rng.random() < 0.5 and not known.rolls)
-        length = (
-            rng.choice((32, 64))
-            if is_float
-            else rng.choice((1, 2, 4, 7, 8, 8, 12, 15, 16, 16, 17, 24, 32, 33, 48, 63, 64))
-        )
-        if length == 1 and (signed or known.rolls or known.names):
+        lengths = (1, 2, 4, 7, 8, 8, 12, 15, 16, 16, 17, 24, 32, 33, 48, 63, 64)
+        length = rng.choice((32, 64) if is_float else lengths)
+        if length == 1 and (signed or not is_number):
             length = 8
         if (place := self._position(taken, length, message.length)) is None:
             return
-        signal = Sig(
-            f"S{len(message.signals)}",
-            place[0],
-            length,
-            place[1],
-            signed,
-            is_float,
-            mux=mux,
-            source=source,
-        )
+        name = f"S{len(message.signals)}"
+        signal = Sig(name, place[0], length, place[1], signed, is_float, mux=mux, source=source)
         signal.esc = rng.randrange(len(self.escs))
-        unit, scale, shift = rng.choice(UNITS[known.unit])
-        signal.unit, signal.conversion = unit, (scale, shift)
-        if not known.rolls and not known.names and length > 1:
+        signal.unit, *conversion = rng.choice(UNITS[known.unit])
+        signal.conversion = conversion[0], conversion[1]
+        if is_number and length > 1:
             signal.factor, signal.offset = rng.choice(FACTORS), rng.choice(OFFSETS)
         if not is_float and length > 1:
             self._codes(signal, known)
@@ -566,14 +499,11 @@ class LayoutMaker:
                 self._limits(signal, known)
         prefix = "" if known.gateway else self.escs[signal.esc].name
         if rng.random() < 0.3:
-            name = (
-                pascal(f"{prefix}_{source}")
-                if rng.random() < 0.5
-                else spelled(rng, f"{prefix}_{source}".strip("_"))
-            )
-            if unit == "%" and rng.random() < 0.5:
+            own = f"{prefix}_{source}".strip("_")
+            name = pascal(own) if rng.random() < 0.5 else spelled(rng, own)
+            if signal.unit == "%" and rng.random() < 0.5:
                 name += "Percent"
-            if all(s.name != name for s in message.signals) and name[0].isalpha():
+            if all(s.name != name for s in message.signals):
                 signal.name = name
         if signal.name == f"S{len(message.signals)}":
             signal.bind = f"{prefix}.{source}" if prefix else source
@@ -591,7 +521,7 @@ class LayoutMaker:
                     signal.texts[code] = spelled(rng, text)
         if rng.random() < 0.5:
             signal.texts[usual[0]] = "NotAvailable"
-        elif rng.random() < 0.3 and not known.rolls and length_is_enough(signal):
+        elif rng.random() < 0.3 and not known.rolls and signal.length >= 7:
             middle = [code for code in free if code not in signal.texts]
             if middle:
                 signal.texts[rng.choice(middle)] = "NotAvailable"
@@ -616,11 +546,6 @@ class LayoutMaker:
         signal.minimum, signal.maximum = str(least), str(most)
 
 
-def length_is_enough(signal: Sig) -> bool:
-    """Codes amid the values make sense only where there are many values."""
-    return signal.length >= 7
-
-
 # --- random telemetry ---------------------------------------------------------------------------------------------------
 
 
@@ -636,11 +561,7 @@ def random_integer(rng: random.Random, low: int, high: int) -> int:
 
 
 def random_fields(rng: random.Random, types: str) -> list[int]:
-    values = []
-    for code in types:
-        low, high = sheet.TYPE_RANGES[code]
-        values.append(random_integer(rng, low, high))
-    return values
+    return [random_integer(rng, *sheet.TYPE_RANGES[code]) for code in types]
 
 
 def random_live(rng: random.Random) -> LiveData:
@@ -687,23 +608,11 @@ def random_escs(
 
 
 def random_gateway(rng: random.Random, now: int) -> GatewayStatus:
-    status = GatewayStatus(
-        rng.choice(list(GatewayState)),
-        rng.choice(list(CanState)),
-        rng.randint(0, 9),
-        rng.randint(0, 9),
-    )
-    status.started_ns, status.sent_frames, status.replaced_frames = (
-        now - rng.randrange(10**14),
-        rng.randrange(10**10),
-        rng.randrange(1000),
-    )
-    for name in (
-        "send_failures",
-        "received_frames",
-        "bus_off_count",
-        "dropped_frames",
-        "id_conflicts",
-    ):
-        setattr(status, name, rng.randrange(100000))
+    states = rng.choice(list(GatewayState)), rng.choice(list(CanState))
+    status = GatewayStatus(*states, rng.randint(0, 9), rng.randint(0, 9))
+    status.started_ns = now - rng.randrange(10**14)
+    status.sent_frames = rng.randrange(10**10)
+    for name in (name for name, known in KNOWN.items() if known.gateway and known.rolls):
+        if name != "sent_frames":
+            setattr(status, name, rng.randrange(100000))
     return status

@@ -17,23 +17,18 @@ from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.signals.plan import SignalPlan
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 
-def wanted(plan: Any, raw: Any, bits: int) -> Any:
+def wanted(plan: SignalPlan, raw: Any, bits: int) -> Any:
     """The value that cantools' raw number means."""
+    codes = (plan.not_available, plan.error)
     if plan.is_float:
-        if bits in (plan.not_available, plan.error) or raw != raw:
-            return None
-        return raw * float(plan.factor) + float(plan.offset)
-    is_flag = (
-        plan.length == 1
-        and not plan.signed
-        and plan.numbers is None
-        and plan.factor == 1
-        and plan.offset == 0
-    )
-    if not is_flag and raw in (plan.not_available, plan.error):
+        is_none = bits in codes or raw != raw
+        return None if is_none else raw * float(plan.factor) + float(plan.offset)
+    as_it_stands = plan.numbers is None and plan.factor == 1 and plan.offset == 0
+    if raw in codes and not (plan.length == 1 and not plan.signed and as_it_stands):
         return None
     if plan.numbers is not None:
         return plan.texts.get(raw)
@@ -50,18 +45,13 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
     database = read(dbc_text(messages))
     layout = prepare(database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True)
     reader = SignalReader(layout)
-    plans = {plan.name: plan for plan in layout.messages}
     compared = 0
-    for message in messages:
+    for message, plan in zip(messages, layout.messages, strict=True):
         theirs = database.get_message_by_name(message.name)
         key = message.can_id | (EXTENDED if message.extended else 0)
         for _ in range(8):
-            data = bytearray(
-                rng.choice(
-                    [rng.randbytes(message.length), bytes(message.length), b"\xff" * message.length]
-                )
-            )
-            page = rng.choice(message.pages)
+            fills = rng.randbytes(message.length), bytes(message.length), b"\xff" * message.length
+            data, page = bytearray(rng.choice(fills)), rng.choice(message.pages)
             selector = next((s for s in message.signals if s.mux == "M"), None)
             if selector is not None:
                 for byte, bit in bit_places(selector.start, selector.length, selector.little):
@@ -72,61 +62,44 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
                 for first, values in reader.read(key, bytes(data)) or ()
                 for n, value in enumerate(values)
             }
-            assert set(got) == {s.name for s in message.page_of(page) if s is not selector}
-            raws = theirs.decode(bytes(data), decode_choices=False, scaling=False)
-            assert isinstance(raws, dict)
-            lost_flags = {name for name, value in got.items() if value is None}
+            made = {s.name: s for s in message.page_of(page) if s is not selector}
+            assert set(got) == set(made)
+            raws: Any = theirs.decode(bytes(data), decode_choices=False, scaling=False)
+            planned = {s.name: s for s in plan.signals if s.page in (None, page)}
             for name, value in got.items():
-                plan = next(
-                    s
-                    for s in plans[message.name].signals
-                    if s.name == name and s.page in (None, page)
-                )
-                made = next(s for s in message.signals if s.name == name)
-                bits = get(bytes(data), made.start, made.length, made.little, False)
-                expected = wanted(plan, raws[name], bits)
-                if value is None and plan.length == 1 and expected is not None:
+                own, place = planned[name], made[name]
+                bits = get(bytes(data), place.start, place.length, place.little)
+                expected = wanted(own, raws[name], bits)
+                if value is None and own.length == 1 and expected is not None:
                     # the others of its ESC's frame say that there was none
-                    beside = [
-                        s
-                        for s in plans[message.name].signals
-                        if s.page == plan.page
-                        and s.source
-                        and plan.source
-                        and (s.esc, s.source.group) == (plan.esc, plan.source.group)
-                    ]
-                    assert any(s.length > 1 and s.name in lost_flags for s in beside)
+                    beside = [planned[n] for n, v in got.items() if v is None and n != name]
+                    assert any(s.length > 1 and same_frame(s, own) for s in beside)
                 elif isinstance(expected, float) and isinstance(value, float):
-                    assert value == expected or math.isclose(value, expected, rel_tol=1e-12), (
-                        message.name,
-                        name,
-                    )
+                    assert math.isclose(value, expected, rel_tol=1e-12), (message.name, name)
                 else:
                     assert value == expected, (message.name, name)
                 compared += 1
     assert compared > 300
 
 
-def shipped_reader() -> SignalReader:
-    return SignalReader(layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout)
+def same_frame(one: SignalPlan, other: SignalPlan) -> bool:
+    """Whether both come with the same page and the same frame of an ESC."""
+    assert one.source is not None
+    assert other.source is not None
+    mine, its = (one.page, one.esc, one.source.group), (other.page, other.esc, other.source.group)
+    return mine == its
 
 
 def test_an_error_code_beside_them_does_not_hide_flags() -> None:
     """Undervoltage at a voltage that does not fit: the flag is what matters then."""
-    reader = shipped_reader()
-    names = {c.name: i for i, c in enumerate(reader.columns)}
-
-    def status(state: int, raw: int, temperature: int) -> list[Any]:
-        data = bytes((1, 0, 0, state, raw, temperature, 0, 0))
-        values: list[Any] = [None] * len(reader.columns)
-        for first, found in reader.read(1664, data) or ():
-            values[first : first + len(found)] = found
-        return values
-
-    assert status(254, 254, 0x81)[names["Undervoltage"]] == 1
-    assert status(254, 255, 0x80)[names["Undervoltage"]] == 1
-    assert status(255, 255, 0x80)[names["Undervoltage"]] is None
-    assert status(12, 12, 30)[names["Undervoltage"]] == 1
+    reader = SignalReader(layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout)
+    flag = next(n for n, column in enumerate(reader.columns) if column.name == "Undervoltage")
+    rows = {(254, 254, 0x81): 1, (254, 255, 0x80): 1, (255, 255, 0x80): None, (12, 12, 30): 1}
+    for (state, raw, temperature), expected in rows.items():
+        chunks = reader.read(1664, bytes((1, 0, 0, state, raw, temperature, 0, 0)))
+        assert chunks is not None
+        ((first, values),) = chunks
+        assert values[flag - first] == expected
 
 
 def view_of(tmp_path: Path, *messages: tuple[str, int, str]) -> View:
