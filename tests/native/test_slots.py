@@ -1,26 +1,15 @@
 """With the core in C the PDOs of ESCs' values are its slots: frames of ESCs do not reach Python."""
 
-from collections.abc import Iterator
-
 import pytest
 from dialogue import QUIET, Bench, info, live, tpdo
 
 from kontronik_can_gw.core import Follower
 from kontronik_can_gw.esc.telemetry import MS, Event
-from kontronik_can_gw.native import load
-from kontronik_can_gw.native.objects import shared_object
 
 ERROR_CODE = 0x603F0010
 
 
-@pytest.fixture(autouse=True)
-def in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    if not shared_object().exists():
-        pytest.skip("no core in C: sudo apt-get install gcc libc6-dev, and install again")
-    monkeypatch.delenv(load.PURE, raising=False)
-    load.library.cache_clear()
-    yield
-    load.library.cache_clear()
+pytestmark = pytest.mark.parametrize("core_language", ["C"], indirect=True)
 
 
 def followed(bench: Bench) -> list[int]:
