@@ -264,7 +264,7 @@ class Judge:
             esc.passed.append(esc.state)
         return esc
 
-    def received(self, frame: drive.Frame) -> None:
+    def received(self, frame: drive.CanFrame) -> None:
         """A frame from the bus: what a master writes by itself, or resets, is not followed."""
         if frame.data[1:3] == b"\x00\x21" or (frame.can_id == 0 and frame.data[:1] == b"\x81"):
             for esc in self.escs:
@@ -287,7 +287,7 @@ class Judge:
         elif entry == 7:
             esc.cells = value
 
-    def sent(self, now: int, frame: drive.Frame) -> None:
+    def sent(self, now: int, frame: drive.CanFrame) -> None:
         """A frame of the gateway."""
         for esc in self.escs:
             self._at(now, esc)
@@ -300,7 +300,7 @@ class Judge:
             self._message(now, frame, self.database, frame.can_id, None)
 
     def _message(
-        self, now: int, frame: drive.Frame, database: Database, can_id: int, owner: Esc | None
+        self, now: int, frame: drive.CanFrame, database: Database, can_id: int, owner: Esc | None
     ) -> None:
         message = _by_id(database).get((can_id, frame.extended))
         if message is None:
