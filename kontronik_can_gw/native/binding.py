@@ -8,16 +8,13 @@ from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.native.header import functions, structure
+from kontronik_can_gw.native.header import KCG, functions, structure
 from kontronik_can_gw.native.objects import source_number
 from kontronik_can_gw.native.rows import NotInCore, Settings
 from kontronik_can_gw.native.settings import held_settings
 from kontronik_can_gw.native.tables import END_OF_TIME, Tables
 
 _MAX_FRAMES = 256
-_AGAIN = 1 << 30
-_MAX_READ = 16384
-"""Bytes that the core is given at once: not more frames than it can keep."""
 Frame, Plan, Esc = structure("kcg_frame"), structure("kcg_plan"), structure("kcg_esc")
 _Core = structure("kcg")
 _FRAME_SIZE = c.sizeof(Frame)
@@ -112,10 +109,10 @@ class Handle:
         """As Core.receive."""
         self._check(esc, now)
         receive, core = self.library.kcg_receive, self.core
-        for begin in range(0, len(data) or 1, _MAX_READ):
-            part = data[begin : begin + _MAX_READ] if len(data) > _MAX_READ else data
-            while (found := receive(core, esc, part, len(part), now, since)) >= _AGAIN:
-                self.follow_all(found & ~_AGAIN, now)
+        for begin in range(0, len(data) or 1, KCG.MAX_READ):
+            part = data[begin : begin + KCG.MAX_READ] if len(data) > KCG.MAX_READ else data
+            while (found := receive(core, esc, part, len(part), now, since)) >= KCG.AGAIN:
+                self.follow_all(found & ~KCG.AGAIN, now)
             self.follow_all(found, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:

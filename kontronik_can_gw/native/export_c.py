@@ -11,9 +11,10 @@ from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.objects import FOLDER
 from kontronik_can_gw.native.rows import NotInCore, Settings
-from kontronik_can_gw.native.tables import HAS_CRC, REAL, Tables
+from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.plan import Layout
 
 MARK = "made by kontronik-can-gw export c"
@@ -69,9 +70,9 @@ def _options(layout: Layout, tables: Tables) -> dict[str, int]:
     longest = max((plan.length for plan in layout.messages), default=0)
     return {
         "KCG_DATA": _CLASSIC if longest <= _CLASSIC else 64,
-        "KCG_FLOATS": int(any(row.flags & REAL for row in tables.signals)),
+        "KCG_FLOATS": int(any(row.flags & KCG.REAL for row in tables.signals)),
         "KCG_PAGED": int(any(row.pages > 1 for row in tables.messages)),
-        "KCG_E2E": int(any(row.flags & HAS_CRC for row in tables.messages)),
+        "KCG_E2E": int(any(row.flags & KCG.HAS_CRC for row in tables.messages)),
     }
 
 

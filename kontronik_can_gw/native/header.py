@@ -4,6 +4,7 @@ import ctypes as c
 import re
 from collections.abc import Container, Iterator
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 from kontronik_can_gw.native.objects import FOLDER, OPTIONS
@@ -75,6 +76,8 @@ def _enumerations() -> list[list[str]]:
 
 
 _ENUMERATIONS = _enumerations()
+KCG: Any = SimpleNamespace(**{n.removeprefix("KCG_"): value for n, value in CONSTANTS.items()})
+"""The same as attributes, without the prefix."""
 
 
 def enumeration(first: str, prefix: str = "KCG_") -> list[str]:

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.esc.values import Divisor, Value
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
-from kontronik_can_gw.native.header import structure
+from kontronik_can_gw.native.header import KCG, structure
 
 ROWS = 1 << 13
 _TEXT = 1 << 20
-_WHOLE, _DIVIDED, _ROUNDED = range(3)
 _Word, _Cell = structure("kcg_word"), structure("kcg_cell")
 Style: Any = structure("kcg_style")
 """Of lines: what stands before the time, before and after the Unix time (None: none), at the end, for what is not available."""
@@ -84,15 +83,15 @@ class ColumnOf(NamedTuple):
     esc: int | None
 
     @property
-    def form(self) -> int:
+    def form(self) -> Any:
         """How steps become a number of its unit."""
-        value = self.value
-        if value.divisor is Divisor.ONE:
-            if value.names or value.per_unit == 1:
-                return _WHOLE
-            if 10**6 % value.per_unit == 0:
-                return _DIVIDED
-        return _ROUNDED
+        per_unit = self.value.per_unit
+        if self.value.divisor is Divisor.ONE:
+            if self.value.names or per_unit == 1:
+                return KCG.WHOLE
+            if 10**6 % per_unit == 0:
+                return KCG.DIVIDED
+        return KCG.ROUNDED
 
 
 class Rows:
@@ -104,7 +103,7 @@ class Rows:
         self._times = bytearray(8 * ROWS)
         self._values = [bytearray(8 * ROWS) for _ in columns]
         self.valid = [bytearray(ROWS // 8) for _ in columns]
-        self.is_real = [column.form != _WHOLE for column in columns]
+        self.is_real = [column.form != KCG.WHOLE for column in columns]
 
     @property
     def times(self) -> memoryview:

@@ -11,16 +11,13 @@ from collections.abc import Sequence
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.core import NativeCore
-from kontronik_can_gw.native.header import structure
+from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows
 from kontronik_can_gw.native.state import NativeEsc
-from kontronik_can_gw.native.tables import OF_AGE, Tables, bind, places_of
+from kontronik_can_gw.native.tables import Tables, bind, places_of
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals.plan import Layout
 
-_DONE, _FULL, _OTHER_ENTRY = range(3)
-_MAX_ROWS = 1024
-"""That one call of the core can make."""
 _FRAMES = 1 << 12
 _u32 = c.c_uint32
 
@@ -75,7 +72,7 @@ class Player(Output):
             bind(row.of, value, where, esc)
             row.of.esc = 255 if esc is None else esc
             row.per_unit, row.form = value.per_unit, columns[number].form
-            if row.of.kind == OF_AGE:
+            if row.of.kind == KCG.OF_AGE:
                 ages.append(at)
         places = [place(number) for number in order]
         begins = [bisect_left(places, (n, is_info)) for n in range(count + 1) for is_info in (0, 1)]
@@ -125,7 +122,7 @@ class Player(Output):
         state = self._state
         state.last = last_ns
         why = self._library.kcg_play(c.byref(state), self._payload, len(self._payload))
-        return why == _OTHER_ENTRY, state.last
+        return why == KCG.OTHER_ENTRY, state.last
 
     # --- plain bytes of one ESC
 
@@ -143,7 +140,7 @@ class Player(Output):
         state.base = begin
         why = self._library.kcg_play_bytes(c.byref(state), data, len(data), ended)
         state.sure = state.count
-        return bool(why == _FULL)
+        return bool(why == KCG.IS_FULL)
 
     @property
     def position(self) -> int:
@@ -181,7 +178,7 @@ class Player(Output):
     @property
     def is_full(self) -> bool:
         """True where rows must be taken before more is played."""
-        return bool(self._state.rows + _MAX_ROWS > self._state.room)
+        return bool(self._state.rows + KCG.MAX_ROWS > self._state.room)
 
     def take_rows(self, final: bool = False) -> Rows:
         """The rows that are complete; ``final``: also the one that is open."""

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.binding import Handle
+from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
-from kontronik_can_gw.native.tables import EVENT, MAX_ROWS, PACED, SILENT, TRANSFER, Tables
+from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import PythonSlot, SlotPlan, SlotSettings
 
@@ -178,8 +179,8 @@ class NativeSlot:
         message.crc_at, message.data_id = settings.page, plan.seed or 0
         for word in range(2):
             handle.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
-        message.flags = EVENT * settings.by_event | SILENT * plan.needs_live
-        message.flags |= TRANSFER * is_transfer | PACED * plan.paced
+        message.flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live
+        message.flags |= KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
         message.triggers, message.signals = plan.triggers, len(rows.signals)
         message.cycle, message.delay = settings.timer_ns, settings.inhibit_ns
         return True

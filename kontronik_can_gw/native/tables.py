@@ -21,6 +21,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
     GATEWAY,
@@ -34,24 +35,20 @@ from kontronik_can_gw.native.settings import MAX_GEAR, MAX_POLES, settings_of
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
-(
-    OF_LIVE, OF_INFO, OF_LAST, OF_POWER, OF_COUNT, OF_ENERGY, OF_RUN_TIME, OF_AGE, OF_RATE, OF_GATEWAY, OF_UPTIME, OF_ALIVE,
-    OF_STATUS,
-) = range(13)  # fmt: skip
-WIRE = {"B": 0, "b": 1, "H": 2, "h": 3, "I": 4}
+WIRE = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32}
 _TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
-ROLLS, CODE_AMID, PLAIN, TABLE, REAL, DIRECT = 1, 2, 4, 8, 16, 32
-EVENT, ON_CHANGE, SILENT, HAS_CRC, OF_THE_GATEWAY, FREE, TRANSFER, PACED = (
-    1 << n for n in range(8)
-)
-ALL_PAGES = 64
 ALL_ESCS = 255
 MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""
 MAX_ROWS = 0xFFFF
 """Of a table that is addressed by 16 bits."""
 MAX_ALIVE, MAX_BITS = 1 << 16, 64
-_DIVISORS = {Divisor.ONE: 0, Divisor.POLE_PAIRS: 1, Divisor.OUTPUT: 2, Divisor.CELLS: 3}
+_DIVISORS = {
+    Divisor.ONE: KCG.BY_ONE,
+    Divisor.POLE_PAIRS: KCG.BY_POLES,
+    Divisor.OUTPUT: KCG.BY_OUTPUT,
+    Divisor.CELLS: KCG.BY_CELLS,
+}
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
     Divisor.POLE_PAIRS: (MAX_POLES, 1),
@@ -67,11 +64,9 @@ _piece = lru_cache(1024)(Piece)
 
 
 class Tables:
-    """Rows of each table, in the order of their fields. ``longest``: data bytes that the core is built for."""
+    """Rows of each table, in the order of their fields."""
 
-    def __init__(
-        self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False, longest: int = 64
-    ) -> None:
+    def __init__(self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False) -> None:
         self._plans = layout.messages
         self.signals: list[Any] = []
         self.messages: list[Any] = []
@@ -95,7 +90,7 @@ class Tables:
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
             raise NotInCore(f"{len(escs)} ESCs, {len(layout.messages)} messages")
         for index, plan in enumerate(layout.messages):
-            if plan.length > longest or len(plan.pages) > ALL_PAGES:
+            if plan.length > KCG.DATA or len(plan.pages) > KCG.PAGES:
                 raise NotInCore(f"{plan.name}: {plan.length} bytes, {len(plan.pages)} pages")
             if max(plan.cycle_ns, plan.delay_ns) >= END_OF_TIME:
                 raise NotInCore(
@@ -154,9 +149,13 @@ class Tables:
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
         traits = Traits(plan, silent)
-        flags = EVENT * traits.by_event | ON_CHANGE * traits.on_change | HAS_CRC * (crc is not None)
-        flags |= SILENT * traits.silent_able | OF_THE_GATEWAY * traits.follows_gateway
-        flags |= FREE * traits.is_free
+        flags = (
+            KCG.EVENT * traits.by_event
+            | KCG.ON_CHANGE * traits.on_change
+            | KCG.HAS_CRC * (crc is not None)
+        )
+        flags |= KCG.SILENT * traits.silent_able | KCG.OF_THE_GATEWAY * traits.follows_gateway
+        flags |= KCG.FREE * traits.is_free
         first, words = len(self.signals), max(1, -(-plan.length // 8))
         first_word = len(self.constants)
         for page in plan.pages:
@@ -190,12 +189,12 @@ class Tables:
                     _piece(piece.shift + width, piece.width - width, piece.at + width)
                 )
         row = Signal(first_piece=first_piece, pieces=len(self.pieces) - first_piece)
-        row.page = ALL_PAGES if signal.page is None else plan.pages.index(signal.page)
+        row.page = KCG.PAGES if signal.page is None else plan.pages.index(signal.page)
         row.esc = ALL_ESCS if signal.esc is None else signal.esc
         row.length = signal.length
         row.error, row.not_available = signal.error & _M64, signal.not_available & _M64
         if signal.role is Role.ALIVE:
-            row.kind, row.div = OF_ALIVE, alive_modulus(signal, has_crc)
+            row.kind, row.div = KCG.OF_ALIVE, alive_modulus(signal, has_crc)
             if row.div > MAX_ALIVE:
                 raise NotInCore(
                     f"{plan.name}.{signal.name}: an alive counter of {signal.length} bits"
@@ -214,21 +213,21 @@ class Tables:
         if signal.numbers is not None:
             row.first_pair, row.pairs = len(self.pairs), len(signal.numbers)
             self.pairs += [Pair(int(number), raw & _M64) for number, raw in signal.numbers.items()]
-            flags |= TABLE
+            flags |= KCG.TABLE
         if signal.is_float:
-            row.flags = flags | REAL
+            row.flags = flags | KCG.REAL
             _scale_float(row, signal, value)
             return
         if value.rolls:
-            flags |= ROLLS
+            flags |= KCG.ROLLS
         if (
             signal.low <= signal.not_available <= signal.high
             and signal.error != signal.not_available
         ):
-            flags |= CODE_AMID
+            flags |= KCG.CODE_AMID
         row.low, row.high = max(signal.low, -_LIMIT), min(signal.high, _LIMIT - 1)
         if value.divisor is Divisor.ONE and signal.slope == 1 and signal.intercept == 0:
-            flags |= PLAIN
+            flags |= KCG.PLAIN
         elif signal.numbers is None:
             common = signal.slope.denominator * signal.intercept.denominator
             mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
@@ -240,10 +239,10 @@ class Tables:
 Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
 """Offset after the header and wire type of each word of live data and of info."""
 _KINDS = {
-    Kind.INTEGRAL: OF_ENERGY,
-    Kind.RUN_TIME: OF_RUN_TIME,
-    Kind.AGE: OF_AGE,
-    Kind.RATE: OF_RATE,
+    Kind.INTEGRAL: KCG.OF_ENERGY,
+    Kind.RUN_TIME: KCG.OF_RUN_TIME,
+    Kind.AGE: KCG.OF_AGE,
+    Kind.RATE: KCG.OF_RATE,
 }
 _NAME_OF = {"received_bytes": "bytes", "live_counter": "live_frames"}
 """Of values that are one of COUNTS under another name."""
@@ -257,25 +256,25 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         if not value.supplied or esc is None:
             raise NotInCore("not supplied by this ESC's protocol")
         is_info = value.group is Group.INFO or value.last
-        row.kind = OF_LAST if value.last else OF_INFO if is_info else OF_LIVE
+        row.kind = KCG.OF_LAST if value.last else KCG.OF_INFO if is_info else KCG.OF_LIVE
         row.place, row.wire = places[is_info][value.words[0]]
         row.not_on = sum(1 << device for device in value.not_on)
         if value.mask != -1:
             row.shift, row.mask = value.shift, value.mask
-        if row.kind == OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
-            row.flags = DIRECT
+        if row.kind == KCG.OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
+            row.flags = KCG.DIRECT
     elif value.kind is Kind.PRODUCT:
-        row.kind = OF_POWER
+        row.kind = KCG.OF_POWER
     elif value.name == "uptime":
-        row.kind = OF_UPTIME
+        row.kind = KCG.OF_UPTIME
     elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
-        row.kind, row.place = OF_GATEWAY, GATEWAY.index(value.name)
+        row.kind, row.place = KCG.OF_GATEWAY, GATEWAY.index(value.name)
     elif value.kind in _KINDS:
         row.kind = _KINDS[value.kind]
     elif value.kind is Kind.OBJECT and value.name == "link_status":
-        row.kind, row.place = OF_STATUS, GatewayState.REPLAY
+        row.kind, row.place = KCG.OF_STATUS, GatewayState.REPLAY
     elif name in COUNTS and (value.kind is not Kind.OBJECT or value.name in _NAME_OF):
-        row.kind, row.place = OF_COUNT, COUNTS.index(name)
+        row.kind, row.place = KCG.OF_COUNT, COUNTS.index(name)
     else:
         raise NotInCore(f"no source {value.name}")
 
@@ -311,7 +310,7 @@ def _reduced(mul: int, add: int, div: int) -> tuple[int, int, int]:
 
 def _range(row: Any, value: Value) -> tuple[int, int]:
     """Of the steps, before any divisor."""
-    if row.kind in (OF_LIVE, OF_INFO, OF_LAST):
+    if row.kind in (KCG.OF_LIVE, KCG.OF_INFO, KCG.OF_LAST):
         return _TYPE_RANGES[row.wire]
     low = 0 if value.low is None else value.low
     if value.high is not None:
@@ -339,7 +338,7 @@ def _scale_float(row: Any, signal: SignalPlan, value: Value) -> None:
     row.mul, row.div = slope.numerator, slope.denominator
     row.add = struct.unpack("<q", struct.pack("<d", float(signal.intercept)))[0]
     if signal.intercept == 0:
-        row.flags |= PLAIN
+        row.flags |= KCG.PLAIN
     greatest = max(map(abs, _range(row, value))) * abs(row.mul) * over
     if signal.numbers is None and max(greatest, row.div * by) >= _LIMIT // 2:
         raise NotInCore("factor leaves 63 bits")

@@ -8,12 +8,11 @@ from typing import Any
 
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
-from kontronik_can_gw.native.header import CONSTANTS, structure
+from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.output import NEVER
 
 OUTPUTS = 1 << 29
 """Found: time is to pass for the outputs."""
-_MADE, _MAX_FDS = CONSTANTS["KCG_MADE"], CONSTANTS["KCG_FDS"]
 _ENTRY = struct.Struct("=qqIBBxx")
 _CLASSIC = struct.Struct("=IB3x8s")
 _FRAME_SIZE = c.sizeof(Frame)
@@ -47,7 +46,7 @@ class Turns:
 
     def watch(self, descriptors: Sequence[tuple[int, int, int | None]]) -> bool:
         """(descriptor, what to wait for, ESC whose port it is) from now on. False: that cannot be."""
-        if len(descriptors) > _MAX_FDS:
+        if len(descriptors) > KCG.FDS:
             return False
         state = self.state
         state.count = len(descriptors)
@@ -65,7 +64,7 @@ class Turns:
         state, raw = self.state, self._raw
         waiting = state.unsent
         count = waiting + len(frames)
-        if waiting != state.spoken or count > _MADE:
+        if waiting != state.spoken or count > KCG.MADE:
             return False
         at = _FRAMES + waiting * _FRAME_SIZE
         for can_id, data, extended, fd, _, remote, _ in frames:

@@ -110,7 +110,9 @@ seeds = st.integers(0, 1 << 32)
 pieces = st.one_of(
     st.sampled_from(FRAGMENTS),
     st.binary(max_size=50),
-    st.sampled_from([sheet.RECORDED_LIVE, sheet.RECORDED_INFO]),
-    st.integers(0, 1 << 32).map(lambda seed: random_piece(random.Random(seed))),
+    seeds.map(lambda seed: random_piece(random.Random(seed))),
 )
-streams = st.lists(pieces, max_size=12).map(b"".join)
+streams = st.one_of(
+    st.lists(pieces, max_size=12).map(b"".join),
+    seeds.map(lambda seed: random_stream(random.Random(seed), 12)),
+)

@@ -1,17 +1,31 @@
-"""Frame bytes <-> data. Recorded frames are named so; every other vector here is synthetic."""
+"""Fields, names and frame bytes, held against sheet.py, which was typed a second time from the description of the wire.
 
-import random
+Recorded frames are named so; every other vector here is synthetic.
+"""
+
 import struct
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.esc.kontronik import Deframer, Frame, InfoData, Layout, LiveData, encode
-from kontronik_can_gw.esc.kontronik.fields import Data, DataType
+from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
+from kontronik_can_gw.esc.kontronik import (
+    Deframer,
+    Frame,
+    InfoData,
+    Layout,
+    LiveData,
+    OperatingError,
+    SelfTestError,
+    encode,
+    rows,
+)
+from kontronik_can_gw.esc.kontronik.fields import Data, DataType, device_and_variant
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 
 from . import reference, sheet
-from .sheet import FORM_ROWS, Field, FormRow
+from .sheet import FORM_ROWS, Bit, Field, FormRow
 from .streams import form_of
 
 RECORDED: dict[bytes, LiveData | InfoData] = {
@@ -69,10 +83,14 @@ def test_all_raw_values_survive_the_round_trip_whatever_is_in_the_reserved_bytes
     ranges = [st.integers(*sheet.TYPE_RANGES[field.code]) for field in fields]
     data = data_type(*choice.draw(st.tuples(*ranges)))
     size = row.crc_at - row.body_end
-    body = struct.pack(sheet.LIVE_STRUCT if row.kind == "live" else sheet.INFO_STRUCT, *data)
+    body = b"".join(struct.pack("<" + f.code, getattr(data, f.name)) for f in fields)
     sent = encode(data, Layout(row.layout))
     assert sent == reference.seal(row, body + bytes(size))
     assert frame_in(sent).form is form_of(row)
+    for field in fields:
+        assert sent.startswith(
+            struct.pack("<" + field.code, getattr(data, field.name)), field.offset
+        )
     other = reference.seal(row, body + choice.draw(st.binary(min_size=size, max_size=size)))
     assert frame_in(other).data == frame_in(sent).data == data
 
@@ -85,18 +103,6 @@ def test_a_value_that_does_not_fit_is_refused_by_the_name_of_its_field(row: Form
         for value in (low - 1, high + 1):
             with pytest.raises(ValueError, match=f"^{field.name}: {value} is outside {low}\\.\\."):
                 encode(data_type(**{field.name: value}), Layout(row.layout))
-
-
-@form_rows
-def test_every_flipped_bit_under_the_crc_is_found(row: FormRow) -> None:
-    frame = reference.random_frame(row, random.Random(7))
-    for offset in range(row.length):
-        unprotected = row.covered <= offset < row.crc_at
-        for bit in range(8):
-            flipped = bytearray(frame)
-            flipped[offset] ^= 1 << bit
-            found = [each.form for each in Deframer().feed(bytes(flipped))]
-            assert found == [form_of(row)] * unprotected, f"byte {offset} bit {bit}"
 
 
 @pytest.mark.parametrize(
@@ -116,3 +122,49 @@ def test_an_altered_unprotected_byte_is_delivered_and_suspect_where_no_such_stat
         assert found.data == RECORDED[frame]._replace(**{name: expected})
         assert found.suspect == (name == "operating_state" and value > 26)
     assert not frame_in(encode(LiveData(operating_state=255), Layout.V4)).suspect
+
+
+def test_a_field_has_the_type_unit_and_step_of_the_sheet_and_the_device_that_lacks_it() -> None:
+    for data, fields in ((LiveData, sheet.LIVE_FIELDS), (InfoData, sheet.INFO_FIELDS)):
+        for (name, row), field in zip(rows(data).items(), fields, strict=True):
+            found = name, row.wire, row.unit, row.per_unit, row.type_range
+            limits = sheet.TYPE_RANGES[field.code]
+            assert found == (field.name, field.code, field.unit, field.steps, limits)
+            assert row.not_on == ({3} if name in ("bec_current", "max_bec_current") else set())
+
+
+def test_devices_and_states_have_the_names_of_the_sheet_and_no_others() -> None:
+    assert KONTRONIK.devices == sheet.DEVICES
+    states = {number: state.text for number, state in KONTRONIK.states.items()}
+    assert states == sheet.OPERATING_STATES
+    assert KONTRONIK.peak_current_of == sheet.PEAK_CURRENT_OF
+
+
+@pytest.mark.parametrize(
+    ("names", "bits"),
+    [(OperatingError, sheet.OPERATING_BITS), (SelfTestError, sheet.SELFTEST_BITS)],
+    ids=["operating", "selftest"],
+)
+def test_an_error_bit_means_what_the_sheet_says(names: type[ErrorBit], bits: list[Bit]) -> None:
+    for found, bit in zip(names, bits, strict=True):
+        text = f"{found.text} {found.meaning}".lower()
+        assert found.value == bit.number
+        assert [word for word in bit.words if word not in text] == []
+        assert bit.severity in (None, found.severity.value)
+        assert found.remedy.endswith(".") and found.remedy != found.meaning
+        assert KONTRONIK.bits[found.text] is found
+    texts = [bit.text for bit in names] + [f"bit{number}" for number in range(len(names), 32)]
+    assert bit_texts(0xFFFFFFFF, names) == texts
+
+
+def test_parts_of_a_word_are_read_by_name_and_written_together() -> None:
+    for device, variant, word in ((3, 120, 0x0C78), (63, 1023, 0xFFFF), (1, 0, 0x400)):
+        assert device_and_variant(device, variant) == word
+        info = InfoData(device_and_variant=word)
+        found = [KONTRONIK.value(name, info) for name in ("device_raw", "variant")]
+        assert found == [device, variant]
+    for device, variant in ((64, 0), (-1, 0), (0, 1024)):
+        with pytest.raises(ValueError, match=f"device {device} or variant {variant}"):
+            device_and_variant(device, variant)
+    for word, text in ((0x010E, "1.14"), (0x0300, "3.0"), (0xFFFF, "255.255")):
+        assert KONTRONIK.firmware_text(InfoData(firmware_word=word)) == text

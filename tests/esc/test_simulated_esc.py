@@ -73,9 +73,8 @@ def test_whatever_the_profile_every_frame_decodes_to_what_was_meant(
     frames = esc.frames_until(100 * options.period_ns)
     assert all(sent.intact and sent.wire == sent.frame for sent in frames)
     assert [frame.data for frame in received(frames)] == [sent.data for sent in frames]
-    assert {frame.layout for frame in received(frames)} == {
-        options.layout or usual_layout(options.device)
-    }
+    layout = options.layout or usual_layout(options.device)
+    assert {frame.layout for frame in received(frames)} == {layout}
 
 
 @given(cuts=st.lists(st.integers(0, 20 * S), max_size=20), seed=st.integers(0, 5))
@@ -87,64 +86,46 @@ def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(
     options = EscOptions(faults=faults)
     esc = SimulatedEsc(options, seed=seed)
     pieces = [esc.frames_until(cut) for cut in [*sorted(cuts), 20 * S]]
-    assert list(itertools.chain.from_iterable(pieces)) == SimulatedEsc(
-        options, seed=seed
-    ).frames_until(20 * S)
+    whole = SimulatedEsc(options, seed=seed).frames_until(20 * S)
+    assert [*itertools.chain.from_iterable(pieces)] == whole
 
 
 @pytest.mark.parametrize("device", Device)
 def test_the_flight_is_physically_plausible(device: Device) -> None:
-    frames = sends(101, EscOptions(device=device))
-    flight = lives(frames)
-    voltages = [live.battery_voltage / 100 for live in flight]
-    assert all(6 * 3.0 < voltage < 6 * 4.3 for voltage in voltages)
-    assert all(-100 <= live.throttle <= 100 and 0 <= live.output_opening <= 100 for live in flight)
-    assert all(900 < live.pwm_input < 2000 for live in flight)
-    assert all(15 <= live.power_stage_temperature < 90 for live in flight)
-    assert {OperatingState(live.operating_state) for live in flight} >= {
-        phase.state for phase in FLIGHT
-    }
+    flight = lives(sends(101, EscOptions(device=device)))
+    ranges = {"battery_voltage": (1800, 2580), "throttle": (-100, 100), "output_opening": (0, 100)}
+    ranges |= {"pwm_input": (900, 2000), "power_stage_temperature": (15, 90)}
+    for name, (low, high) in ranges.items():
+        assert all(low <= getattr(live, name) <= high for live in flight), name
+    assert {live.operating_state for live in flight} >= {phase.state for phase in FLIGHT}
     for before, live in itertools.pairwise(flight):
         assert 0 <= live.consumed_charge - before.consumed_charge <= 1
         assert live.peak_current >= before.peak_current
         assert abs(live.power_stage_temperature - before.power_stage_temperature) <= 1
     assert all(live.bec_current == 0 for live in flight) == (device is Device.JIVEPRO)
-
     charge = sum(max(live.battery_current, 0) / 10 * 0.01 / 3.6 for live in flight)
     assert flight[-1].consumed_charge == pytest.approx(charge, rel=0.02, abs=2)
-    idle = max(live.battery_voltage for live in flight[100:400])
     climb = min(flight, key=lambda live: live.battery_voltage)
-    assert climb.battery_voltage < idle - 50
-    assert climb.battery_current > 500
-    assert climb.motor_current >= climb.battery_current
-    held = max(
-        live.battery_current if device is Device.JIVEPRO else live.motor_current for live in flight
-    )
+    assert climb.battery_voltage < flight[250].battery_voltage - 50
+    assert climb.motor_current >= climb.battery_current > 500
+    kind = "battery_current" if device is Device.JIVEPRO else "motor_current"
+    held = max(getattr(live, kind) for live in flight)
     assert held <= flight[-1].peak_current <= held * 1.2
     assert flight[-1].electrical_speed == 0  # the peak is held though the motor stands
-    hottest = max(live.power_stage_temperature for live in flight)
-    assert flight[0].power_stage_temperature + 5 < hottest
-    assert flight[4900].power_stage_temperature < hottest
 
 
 @pytest.mark.parametrize("layout", Layout)
-@pytest.mark.parametrize("seed", range(3))
-def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(
-    layout: Layout, seed: int
-) -> None:
+def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(layout: Layout) -> None:
+    """In the legacy layout, besides, those with flips that its CRC does not cover."""
     faults = Faults(noise=3, lost_bytes=0.002, flipped_bits=0.0002)
-    frames = sends(20, EscOptions(layout=layout, faults=faults), seed)
+    frames = sends(60, EscOptions(layout=layout, faults=faults))
     intact = [sent.data for sent in frames if sent.intact]
     assert len(frames) * 0.5 < len(intact) < len(frames)
     found = [frame.data for frame in received(frames)]
-    unprotected = [  # legacy: flips behind the CRC's reach are accepted by any receiver
-        sent
-        for sent in frames
-        if not sent.intact
-        and layout is Layout.LEGACY
-        and sent.wire[-len(sent.frame) :][:32] == sent.frame[:32]
-    ]
-    assert len(intact) <= len(found) <= len(intact) + len(unprotected)
+    covered = 36 if layout is Layout.V4 else 32
+    spoiled = [sent for sent in frames if not sent.intact]
+    same = [s for s in spoiled if s.wire[-len(s.frame) :][:covered] == s.frame[:covered]]
+    assert len(intact) <= len(found) <= len(intact) + len(same)
     rest = iter(found)
     assert all(data in rest for data in intact)  # in order
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from esc.reference import SHORTEST_FIRST, fits
-from esc.streams import decoded, form_of
+from esc.streams import decoded, form_of, random_stream
 from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
@@ -25,7 +25,7 @@ from kontronik_can_gw.esc.telemetry import (
     Event,
     LinkState,
 )
-from kontronik_can_gw.esc.values import MWS_PER_WH, VALUES, Value, divisor, steps
+from kontronik_can_gw.esc.values import MWS_PER_WH, VALUES, steps
 from kontronik_can_gw.gateway_status import GatewayStatus
 
 NS_PER_BYTE = KONTRONIK.byte_ns
@@ -67,16 +67,7 @@ def alive(now: int = SECOND) -> EscStream:
     """An ESC whose first live frame was read at ``now``."""
     telemetry = esc()
     read(telemetry, live(), now)
-    assert link_of(telemetry) is LinkState.OK
     return telemetry
-
-
-def link_of(telemetry: EscStream) -> LinkState:
-    return telemetry.link
-
-
-def info_of(telemetry: EscStream) -> InfoData | None:
-    return telemetry.info
 
 
 def stream(
@@ -97,12 +88,11 @@ def stream(
     return now - period
 
 
-def value(source: Value, telemetry: EscStream, now: int = 0) -> float:
-    """A value in its unit."""
-    found, parts = steps(source, telemetry, GatewayStatus(), now), divisor(source, telemetry)
+def value(name: str, telemetry: EscStream) -> float:
+    """One without a divisor, in its unit."""
+    found = steps(VALUES[name], telemetry, GatewayStatus(), 0)
     assert found is not None
-    assert parts is not None
-    return found * parts[1] / parts[0] / source.per_unit
+    return found / VALUES[name].per_unit
 
 
 # --- link states
@@ -111,88 +101,77 @@ def value(source: Value, telemetry: EscStream, now: int = 0) -> float:
 @pytest.mark.parametrize("layout", list(Layout))
 def test_the_first_live_frame_makes_the_link_ok(layout: Layout) -> None:
     telemetry = esc()
-    telemetry.advance(SECOND)
-    assert link_of(telemetry) is LinkState.NEVER_SEEN
+    states = [telemetry.link]
     read(telemetry, NOISE, SECOND)
-    assert (telemetry.link, telemetry.live, telemetry.age_ms(SECOND)) == (
-        *(LinkState.SEARCHING, None, None),
-    )
+    assert (telemetry.live, telemetry.age_ms(SECOND)) == (None, None)
+    states.append(telemetry.link)
     events = read(telemetry, live(7, layout), SECOND)
     assert events & Event.LINK and events & Event.LIVE
-    assert (telemetry.link, telemetry.age_ms(SECOND)) == (LinkState.OK, 0)
+    assert [*states, telemetry.link] == [LinkState.NEVER_SEEN, LinkState.SEARCHING, LinkState.OK]
     assert telemetry.live is not None and telemetry.live.electrical_speed == 7
+    assert telemetry.age_ms(SECOND) == 0
     assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[layout]
 
 
-@pytest.mark.parametrize(("errors", "state"), [(4, LinkState.OK), (5, LinkState.DEGRADED)])
-def test_five_crc_errors_in_a_second_degrade_the_link_and_a_clean_second_mends_it(
-    errors: int, state: LinkState
+@pytest.mark.parametrize(
+    ("broken", "noise", "state"),
+    [
+        *((4, 0, LinkState.OK), (5, 0, LinkState.DEGRADED)),
+        *((0, 4, LinkState.OK), (0, 5, LinkState.DEGRADED)),  # 9 % and 11 % of the bytes
+    ],
+)
+def test_crc_errors_or_dropped_bytes_in_a_second_degrade_the_link_and_a_clean_second_mends_it(
+    broken: int, noise: int, state: LinkState
 ) -> None:
     telemetry = alive(SECOND)
-    for n in range(errors):
+    for n in range(broken):
         read(telemetry, BROKEN + live(), SECOND + (n + 1) * 10 * MS)
-    now = stream(telemetry, SECOND + 60 * MS, 1)
-    assert link_of(telemetry) is state
+    now = stream(telemetry, SECOND + 60 * MS, 1.1, extra=b"\x55" * noise)
+    states = [telemetry.link]
     assert telemetry.live is not None
-    stream(telemetry, now + 10 * MS, 1.2)
-    assert link_of(telemetry) is LinkState.OK
+    stream(telemetry, now + 10 * MS, 2.2)
+    assert [*states, telemetry.link] == [state, LinkState.OK]
 
 
-@pytest.mark.parametrize(("noise", "state"), [(4, LinkState.OK), (5, LinkState.DEGRADED)])
-def test_more_than_a_tenth_of_dropped_bytes_degrades_the_link(noise: int, state: LinkState) -> None:
+@pytest.mark.parametrize("advanced", [True, False])
+def test_a_silent_line_is_lost_and_a_frame_brings_it_back(advanced: bool) -> None:
+    """The loss counts, too, where only the next frame shows it."""
     telemetry = alive(SECOND)
-    # 4 of 44 bytes are 9 %, 5 of 45 are 11 %
-    stream(telemetry, SECOND + 10 * MS, 1.1, extra=b"\x55" * noise)
-    assert link_of(telemetry) is state
-
-
-def test_a_silent_line_is_lost_and_a_frame_brings_it_back() -> None:
-    telemetry = alive(SECOND)
-    events = telemetry.advance(SECOND + TIMEOUT + 1)
-    assert events & Event.LINK
-    assert events & Event.LIVE
-    assert (telemetry.link, telemetry.losses, telemetry.frame_rate) == (LinkState.LOST, 1, 0)
-    read(telemetry, NOISE, 2 * SECOND)
-    read(telemetry, info(), 2 * SECOND + 5 * MS)
-    assert link_of(telemetry) is LinkState.LOST
+    if advanced:
+        events = telemetry.advance(SECOND + TIMEOUT + 1)
+        assert events & Event.LINK and events & Event.LIVE
+        read(telemetry, NOISE, 2 * SECOND)
+        read(telemetry, info(), 2 * SECOND + 5 * MS)
+        found = telemetry.link, telemetry.losses, telemetry.frame_rate
+        assert found == (LinkState.LOST, 1, 0)
     assert read(telemetry, live(), 3 * SECOND) & Event.LINK
-    assert (telemetry.link, telemetry.losses) == (LinkState.OK, 1)
-
-
-def test_a_loss_that_is_seen_by_the_next_frame_counts_too() -> None:
-    telemetry = alive(SECOND)
-    assert read(telemetry, live(5), SECOND + TIMEOUT + 1) & Event.LINK
     assert (telemetry.link, telemetry.losses) == (LinkState.OK, 1)
 
 
 @pytest.mark.parametrize("seen", [False, True])
 def test_a_lost_port_is_an_error_until_it_is_open_again(seen: bool) -> None:
+    """And no frame is put together from before and after."""
     telemetry = esc()
     if seen:
         read(telemetry, info() + live(), SECOND)
+    read(telemetry, live()[:30], SECOND)
     events = telemetry.port_lost()
     assert events & Event.LINK
     assert bool(events & Event.LIVE) is seen
-    assert (telemetry.link, telemetry.live, telemetry.info) == (LinkState.PORT_ERROR, None, None)
+    assert (telemetry.live, telemetry.info) == (None, None)
+    states = [telemetry.link]
     telemetry.advance(3 * SECOND)
-    assert link_of(telemetry) is LinkState.PORT_ERROR
     assert telemetry.port_lost() == Event.NONE
+    states.append(telemetry.link)
     assert telemetry.port_opened() == Event.LINK
-    assert link_of(telemetry) is (LinkState.LOST if seen else LinkState.NEVER_SEEN)
-    read(telemetry, NOISE, 4 * SECOND)
-    assert link_of(telemetry) is (LinkState.LOST if seen else LinkState.SEARCHING)
-    read(telemetry, live(), 5 * SECOND)
-    assert link_of(telemetry) is LinkState.OK
-
-
-def test_a_frame_is_not_put_together_from_before_and_after_a_lost_port() -> None:
-    telemetry = esc()
-    frame = live()
-    read(telemetry, frame[:30], SECOND)
-    telemetry.port_lost()
-    telemetry.port_opened()
-    read(telemetry, frame[30:], SECOND + MS)
+    states.append(telemetry.link)
+    read(telemetry, live()[30:], 4 * SECOND)
+    states.append(telemetry.link)
     assert telemetry.live is None
+    read(telemetry, live(), 5 * SECOND)
+    lost = [LinkState.LOST] * 2 if seen else [LinkState.NEVER_SEEN, LinkState.SEARCHING]
+    error = LinkState.PORT_ERROR
+    assert [*states, telemetry.link] == [error, error, *lost, LinkState.OK]
 
 
 # --- freshness
@@ -280,7 +259,7 @@ def test_an_info_frame_is_late_by_its_own_time_out() -> None:
         read(telemetry, info(), now, now - waited)
         if waited == INFO_TIMEOUT_NS:
             assert telemetry.info_bound_ns == telemetry.last_info_ns == now - waited + length
-    assert (info_of(telemetry), telemetry.late_frames) == (None, 1)
+    assert (telemetry.info, telemetry.late_frames) == (None, 1)
 
 
 # --- derived values
@@ -301,10 +280,8 @@ def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight()
         run_seconds += seconds if before.data.electrical_speed else 0
     for each in sent:
         read(telemetry, each.wire, SECOND + each.time_ns)
-    assert value(VALUES["energy_used"], telemetry) == pytest.approx(
-        watt_seconds / 3600, abs=1 / MWS_PER_WH
-    )
-    assert value(VALUES["motor_run_time"], telemetry) == pytest.approx(run_seconds, rel=1e-9)
+    assert value("energy_used", telemetry) == pytest.approx(watt_seconds / 3600, abs=1 / MWS_PER_WH)
+    assert value("motor_run_time", telemetry) == pytest.approx(run_seconds, rel=1e-9)
     assert watt_seconds > 10_000
     assert 30 < run_seconds < 50
 
@@ -320,24 +297,6 @@ def test_energy_is_not_counted_over_a_gap_and_is_kept_over_a_loss() -> None:
     telemetry.port_opened()
     read(telemetry, live(), 20 * SECOND + 10 * MS)
     assert (telemetry.energy_mw_ns, telemetry.run_time_ns) == (kept, 100 * MS)
-
-
-@pytest.mark.parametrize(
-    ("override", "told", "cells"), [(0, 6, 6), (12, 6, 12), (12, 0, 12), (0, 0, 0)]
-)
-def test_the_mean_cell_voltage_is_that_of_the_configured_cells_else_of_the_cells_told(
-    override: int, told: int, cells: int
-) -> None:
-    telemetry = esc(cell_count=override)
-    source = VALUES["mean_cell_voltage"]
-    read(telemetry, live(), SECOND)
-    assert telemetry.cells == override
-    read(telemetry, info(cells=told), SECOND + 10 * MS)
-    assert telemetry.cells == cells
-    if cells:
-        assert value(source, telemetry) == pytest.approx(24.0 / cells)
-    else:
-        assert divisor(source, telemetry) is None
 
 
 @pytest.mark.parametrize("rate", [100, 20])
@@ -358,40 +317,22 @@ def test_the_frame_rate_is_known_after_a_second_in_tenths_of_hertz(rate: int) ->
 # --- what the device supplies
 
 
-@pytest.mark.parametrize(
-    ("device", "raw", "supplied"),
-    [
-        *((None, 0, False), (None, 1, True)),
-        *((Device.JIVEPRO, 0, False), (Device.JIVEPRO, 500, False)),
-        *((Device.KOSMIK, 0, True), (63, 0, True)),
-    ],
-)
-def test_bec_current_is_supplied_by_all_but_a_jivepro_and_at_0_only_by_a_known_device(
-    device: int | None, raw: int, supplied: bool
-) -> None:
-    telemetry = alive()
-    if device is not None:
-        read(telemetry, info(device), SECOND + 10 * MS)
-    assert telemetry.supplies(VALUES["bec_current"].not_on, raw) is supplied
-
-
 @pytest.mark.parametrize(("old", "new"), list(permutations(Layout)))
-@pytest.mark.parametrize("kind", ["live", "info"])
+@pytest.mark.parametrize("is_info", [False, True])
 def test_another_layout_is_another_device_of_which_nothing_is_known(
-    old: Layout, new: Layout, kind: str
+    old: Layout, new: Layout, is_info: bool
 ) -> None:
     telemetry = esc()
     read(telemetry, live(1, old) + info(Device.KOSMIK, old), SECOND)
-    frame = live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3)
+    frame = info(Device.JIVEPRO, new, 3) if is_info else live(2, new)
     events = read(telemetry, frame, SECOND + 10 * MS)
     assert events & Event.LINK and events & Event.INFO
     assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[new]
-    if kind == "live":
-        assert (info_of(telemetry), telemetry.device, telemetry.cells) == (None, None, 0)
-        assert telemetry.live is not None and telemetry.live.electrical_speed == 2
-    else:
-        assert (telemetry.device, telemetry.cells) == (Device.JIVEPRO, 3)
-    assert link_of(telemetry) is LinkState.OK
+    known = telemetry.info is not None, telemetry.device, telemetry.cells
+    assert known == ((True, Device.JIVEPRO, 3) if is_info else (False, None, 0))
+    assert telemetry.link is LinkState.OK
+    assert telemetry.live is not None
+    assert telemetry.live.electrical_speed == (1 if is_info else 2)
 
 
 def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_device_is_not() -> None:
@@ -408,35 +349,18 @@ def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_devi
 # --- deadlines
 
 
-def chunks_of(seed: int, most: int = 40) -> list[tuple[bytes, int]]:
+GAPS = (0, 1, MS, 10 * MS, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1)
+
+
+def chunks_of(seed: int) -> list[tuple[bytes, int]]:
     """Bytes with the times of their reads: frames of both layouts, damaged ones, noise, cut anywhere, gaps of all sizes."""
     source = random.Random(seed)
-    out = bytearray()
-    for number in range(source.randrange(1, 20)):
-        layout = source.choice(list(Layout))
-        frame = bytearray(
-            source.choice([live(number + 1, layout), live(number + 1, layout), info(3, layout)])
-        )
-        kind = source.randrange(10)
-        if kind == 0:
-            frame[source.randrange(len(frame))] ^= 1 << source.randrange(8)
-        elif kind == 1:
-            del frame[source.randrange(len(frame))]
-        elif kind == 2:
-            out += source.randbytes(source.randrange(60))
-        elif kind == 3:
-            out += source.choice([b"K", b"KO", b"KOD", b"KODL", b"KODI", b"KODX", b"KODLKODI"])
-        elif kind == 4:
-            out += b"\x55" * source.randrange(3000)
-        out += frame
-    cuts = sorted(source.choices(range(len(out) + 1), k=source.randrange(most)))
-    pieces = [bytes(out[a:b]) for a, b in pairwise([0, *cuts, len(out)])]
+    out = random_stream(source, source.randrange(1, 20))
+    cuts = sorted(source.choices(range(len(out) + 1), k=source.randrange(40)))
     now, timed = source.randrange(SECOND), []
-    for piece in pieces:
-        now += source.choice(
-            [0, 1, MS, 10 * MS, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, source.randrange(3 * SECOND)]
-        )
-        timed.append((piece, now))
+    for begin, end in pairwise([0, *cuts, len(out)]):
+        now += source.choice([*GAPS, source.randrange(3 * SECOND)])
+        timed.append((out[begin:end], now))
     return timed
 
 
@@ -489,12 +413,16 @@ def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_dead
     """An EscStream that is advanced at its deadlines only shows, at any time, what one advanced all the time shows."""
     seldom, often = esc(), esc()
     source = random.Random(seed)
+
+    def same() -> None:
+        assert (seldom.live, seldom.info, seldom.link) == (often.live, often.info, often.link)
+
     for piece, now in chunks_of(seed):
         while (due := seldom.next_deadline()) <= now:
             seldom.advance(due)
             assert seldom.next_deadline() > due
             often.advance(due)
-            assert (seldom.live, seldom.info, seldom.link) == (often.live, often.info, often.link)
+            same()
         read(seldom, piece, now)
         read(often, piece, now)
         often.advance(now)
@@ -502,6 +430,6 @@ def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_dead
         assert seldom.next_deadline() > now
         between = source.randrange(now, seldom.next_deadline())
         often.advance(between)
-        assert (seldom.live, seldom.info, seldom.link) == (often.live, often.info, often.link)
+        same()
         if between > now:
             break  # from here on time would run backwards for one of them

@@ -6,7 +6,7 @@ The formats of the files are described in README.md; scenario.py and commands.py
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import kontronik_can_gw
 from kontronik_can_gw.canopen.storage import encode
@@ -16,7 +16,7 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import CanFrame as CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.transmit_queue import TransmitQueue
@@ -26,19 +26,11 @@ FOLDERS = {str(shipped("dbc").parent): "SHIPPED"}
 """Folders of this machine that may be named in texts, and what is written instead."""
 
 
-class Frame(NamedTuple):
-    """A CAN frame. ``received``: from the bus."""
-
-    can_id: int
-    data: bytes
-    extended: bool = False
-    fd: bool = False
-    remote: bool = False
-    received: bool = False
-
-
-def _frame(frame: CanFrame, received: bool = False) -> Frame:
-    return Frame(frame.can_id, bytes(frame.data), frame.extended, frame.fd, frame.remote, received)
+def frame(
+    can_id: int, data: bytes, extended: bool = False, fd: bool = False, remote: bool = False
+) -> CanFrame:
+    """One on the bus."""
+    return CanFrame(can_id, data, extended, fd, remote=remote)
 
 
 def command(words: Sequence[str]) -> int:
@@ -54,12 +46,12 @@ def shipped_eds() -> str:
     return shipped("eds/kontronik_esc.eds").read_bytes().decode("latin-1")
 
 
-def replayed(path: Path) -> Iterator[tuple[int, Frame]]:
-    """The frames that a capture's gateway received and sent, with the recorded clock in ns."""
+def replayed(path: Path) -> Iterator[tuple[int, CanFrame, bool]]:
+    """The frames that a capture's gateway received (True) and sent, with the recorded clock in ns."""
     with open_input(path) as recording:
         assert isinstance(recording, CaptureInput)
         for item in recording.frames():
-            yield item.time_ns, _frame(item.frame, item.received)
+            yield item.time_ns, item.frame, item.received
 
 
 class Drive:
@@ -96,13 +88,12 @@ class Drive:
             self._looked = now
         self._gateway.receive_bytes(esc, data, now, self._looked)
 
-    def put(self, frame: Frame, now: int) -> None:
+    def put(self, frame: CanFrame, now: int) -> None:
         """A frame from the bus. What no filter lets pass the gateway is never given."""
         self._now = now
-        can = CanFrame(frame.can_id, frame.data, frame.extended, frame.fd, remote=frame.remote)
-        if can.key in self._gateway.receive_ids:
+        if frame.key in self._gateway.receive_ids:
             self._gateway.status.received_frames += 1
-            self._gateway.receive_frame(can, now, now)
+            self._gateway.receive_frame(frame, now, now)
 
     def happen(self, verb: str, words: Sequence[str], now: int) -> None:
         """Anything else: see README.md."""
@@ -135,13 +126,13 @@ class Drive:
             case _:
                 raise ValueError(f"what is {verb!r}?")
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """What was sent since the last call."""
         frames = in_order(self._gateway.take_frames(self._now), self._waiting)
         if not self._open:
             return []
         self._gateway.status.sent_frames += len(frames)
-        return [_frame(frame) for frame in frames]
+        return frames
 
     def news(self) -> list[str]:
         """What the gateway wants stored, or reports beside its frames, since the last call."""

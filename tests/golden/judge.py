@@ -227,17 +227,13 @@ def fits(signal: Signal, raw: float, value: Fraction | int | None, unit: str) ->
 class Judge:
     """One golden file. ``wrong``: what does not agree; ``count``: what was judged."""
 
-    def __init__(
-        self, escs: list[Esc], database: Database | None, node_ids: list[int], steady: bool
-    ) -> None:
+    def __init__(self, escs: list[Esc], database: Database | None, node_ids: list[int]) -> None:
         self.escs = escs
         self.database = database
         self.node_ids = node_ids
-        self.steady = steady
         self.wrong: list[str] = []
         self.count: Counter[str] = Counter()
         self._now = -1
-        self._last: dict[str, tuple[int, int]] = {}
         self._pdos = _canopen_database()
         self._flags = _flags()
 
@@ -264,7 +260,7 @@ class Judge:
             esc.passed.append(esc.state)
         return esc
 
-    def received(self, frame: drive.Frame) -> None:
+    def received(self, frame: drive.CanFrame) -> None:
         """A frame from the bus: what a master writes by itself, or resets, is not followed."""
         if frame.data[1:3] == b"\x00\x21" or (frame.can_id == 0 and frame.data[:1] == b"\x81"):
             for esc in self.escs:
@@ -287,7 +283,7 @@ class Judge:
         elif entry == 7:
             esc.cells = value
 
-    def sent(self, now: int, frame: drive.Frame) -> None:
+    def sent(self, now: int, frame: drive.CanFrame) -> None:
         """A frame of the gateway."""
         for esc in self.escs:
             self._at(now, esc)
@@ -300,7 +296,7 @@ class Judge:
             self._message(now, frame, self.database, frame.can_id, None)
 
     def _message(
-        self, now: int, frame: drive.Frame, database: Database, can_id: int, owner: Esc | None
+        self, now: int, frame: drive.CanFrame, database: Database, can_id: int, owner: Esc | None
     ) -> None:
         message = _by_id(database).get((can_id, frame.extended))
         if message is None:
@@ -314,8 +310,6 @@ class Judge:
                 named = (e for e in self.escs if e.prefix and signal.name.startswith(e.prefix))
                 esc = owner or next(named, self.escs[0])
                 self._signal(now, message.name, signal, raw[signal.name], esc, owner is not None)
-        if owner is None:
-            self._rhythm(now, message, raw)
 
     def _signal(
         self, now: int, message: str, signal: Signal, raw: float, esc: Esc, pdo: bool
@@ -342,23 +336,6 @@ class Judge:
         self.count["values"] += 1
         if not good:
             self._note(now, f"{message}.{signal.name} = {raw} with {states}")
-
-    def _rhythm(self, now: int, message: Any, raw: Mapping[str, Any]) -> None:
-        counters = (s for s in message.signals if s.name.endswith(("Alive", "AliveCounter")))
-        alive = next(counters, None)
-        counter = -1 if alive is None else int(raw[alive.name])
-        before, last = self._last.get(message.name, (-1, now))
-        self._last[message.name] = counter, now
-        if not self.steady or now == last:
-            return
-        self.count["distances"] += 1
-        if alive is not None and before >= 0 and counter != (before + 1) % 15:
-            self._note(now, f"{message.name}: alive counter {before} -> {counter}")
-        attributes = message.dbc.attributes
-        delay = attributes["GenMsgDelayTime"].value if "GenMsgDelayTime" in attributes else 0
-        distance_ms = (now - last) / 1e6
-        if distance_ms > (message.cycle_time or 1e9) + 1 or distance_ms < delay:
-            self._note(now, f"{message.name}: {distance_ms} ms after the one before")
 
 
 @cache
@@ -440,10 +417,8 @@ def judge(file: Path) -> Judge:
         plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
         database = _dbc_of(plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"'))
     steps: list[tuple[int, str, Any]] = []
-    steady = dbc.get("on_loss") != "silent"
     for time, verb, *words in filter(None, (line.partition(";")[0].split() for line in lines)):
         now = scenario.nanoseconds(time)
-        steady = steady and verb not in ("held", "can_state", "can_opened")
         if verb in ("uart", "port_lost"):
             data = scenario.uart_bytes(words[1:]) if verb == "uart" else None
             steps.append((now, "bytes", (int(words[0]) - 1, data)))
@@ -452,7 +427,7 @@ def judge(file: Path) -> Judge:
         elif verb == "write" and words[1].startswith("2100:") and "!" not in words:
             setting = int(words[0]), int(words[1][5:], 16), bytes.fromhex(words[2])
             steps.append((now, verb, setting))
-    return follow(Judge(escs, database, node_ids, steady), steps)
+    return follow(Judge(escs, database, node_ids), steps)
 
 
 def files() -> list[Path]:

@@ -38,12 +38,8 @@ def made(file: Path) -> str:
 
 
 def changes(file: Path, new: str) -> list[str]:
-    """What is different, for people; empty where nothing is."""
-    return differences(file, file.read_text(encoding="utf-8") if file.exists() else "", new)
-
-
-def differences(file: Path, old: str, new: str) -> list[str]:
-    """The same of two texts for a file: of each case its title, and lines."""
+    """What is different, for people: of each case its title, and lines; empty where nothing is."""
+    old = file.read_text(encoding="utf-8") if file.exists() else ""
     before, after = commands.cases(old), commands.cases(new)
     found = []
     for title in dict.fromkeys([*before, *after]):

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from drive import Drive, Frame, replayed, shipped_eds
+from drive import CanFrame, Drive, frame, replayed, shipped_eds
 from esc import reference, sheet
 
 SECOND = 10**9
@@ -26,25 +26,19 @@ def nanoseconds(text: str) -> int:
     return int(whole) * SECOND + int(part.ljust(9, "0"))
 
 
-def frame_text(frame: Frame) -> str:
+def frame_text(of: CanFrame) -> str:
     """As in a candump log: 8 digits for 29 bits, ## and flags for CAN FD, R for a remote frame."""
-    can_id = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
-    if frame.remote:
+    can_id = f"{of.can_id:08X}" if of.extended else f"{of.can_id:03X}"
+    if of.remote:
         return f"{can_id}#R"
-    return f"{can_id}{'##1' if frame.fd else '#'}{frame.data.hex().upper()}"
+    return f"{can_id}{'##1' if of.fd else '#'}{of.data.hex().upper()}"
 
 
-def read_frame(text: str) -> Frame:
+def read_frame(text: str) -> CanFrame:
     can_id, _, data = text.partition("#")
-    fd = data.startswith("#")
-    remote = data.startswith("R")
-    return Frame(
-        int(can_id, 16),
-        b"" if remote else bytes.fromhex(data[2 if fd else 0 :]),
-        len(can_id) > 3,
-        fd,
-        remote,
-    )
+    fd, remote = data.startswith("#"), data.startswith("R")
+    content = b"" if remote else bytes.fromhex(data[2 if fd else 0 :])
+    return frame(int(can_id, 16), content, len(can_id) > 3, fd, remote)
 
 
 def uart_bytes(words: list[str]) -> bytes:
@@ -79,7 +73,7 @@ class Player:
         self.drive = drive
         self.now = 0
         self.out: list[str] = []
-        self._heard: list[Frame] = []
+        self._heard: list[CanFrame] = []
 
     def pass_time(self, until: int) -> None:
         """Advance at each deadline before ``until``."""
@@ -109,7 +103,7 @@ class Player:
         return found
 
     def write_down(self) -> None:
-        self.out += [f"{seconds(self.now)} -> {frame_text(frame)}" for frame in self._heard]
+        self.out += [f"{seconds(self.now)} -> {frame_text(sent)}" for sent in self._heard]
         self._heard = []
         self.out += [f"{seconds(self.now)} => {news}" for news in self.drive.news()]
 
@@ -118,7 +112,7 @@ class Player:
 
     def _ask(self, node: int, request: bytes) -> bytes | None:
         """One SDO request; its answer, taken out of what was heard."""
-        self.drive.put(Frame(0x600 + node, request), self.now)
+        self.drive.put(frame(0x600 + node, request), self.now)
         self._collect()
         answers = [f.data for f in self._heard if f.can_id == 0x580 + node]
         self._heard = [f for f in self._heard if f.can_id != 0x580 + node]
@@ -126,38 +120,37 @@ class Player:
         return answers[0] if answers else None
 
     def _sdo(self, verb: str, node: int, entry: str, data: bytes) -> str:
+        """A transfer, expedited or in segments: ``= data`` of a read, ``! abort code``, nothing without an answer."""
         index, _, sub = entry.partition(":")
         multiplexer = int(index, 16).to_bytes(2, "little") + bytes((int(sub, 16),))
+        size = len(data)
+        parts: list[bytes] = []
         if verb == "read":
-            answer = self._ask(node, b"\x40" + multiplexer + bytes(4))
-        elif 1 <= len(data) <= 4:
-            answer = self._ask(
-                node, bytes((0x23 | 4 - len(data) << 2,)) + multiplexer + data.ljust(4, b"\0")
-            )
+            request = b"\x40" + multiplexer + bytes(4)
+        elif 1 <= size <= 4:
+            head = bytes((0x23 | 4 - size << 2,))
+            request = head + multiplexer + data.ljust(4, b"\0")
         else:
-            answer = self._ask(node, b"\x21" + multiplexer + len(data).to_bytes(4, "little"))
-        if answer is None:
+            request = b"\x21" + multiplexer + size.to_bytes(4, "little")
+            parts = [data[at : at + 7] for at in range(0, size, 7)]
+        if (answer := self._ask(node, request)) is None:
             return ""
-        if answer[0] == 0x80:
-            return f" ! {int.from_bytes(answer[4:], 'little'):08X}"
-        if verb == "read" and answer[0] & 2:
+        if verb == "read" and answer[0] & 0xE2 == 0x42:
             return f" = {answer[4 : 8 - (answer[0] >> 2 & 3)].hex().upper()}"
-        parts = [data[at : at + 7] for at in range(0, len(data), 7)] or [b""]
-        found, toggle, number = b"", 0, 0
-        while verb == "read" or (len(data) > 4 and number < len(parts)):
+        found, toggle = b"", 0
+        while answer[0] != 0x80 and (parts or verb == "read"):
             request = bytes((0x60 | toggle,)) + bytes(7)
             if verb == "write":
-                part = parts[number]
-                request = bytes(
-                    (toggle | (7 - len(part)) << 1 | (number == len(parts) - 1),)
-                ) + part.ljust(7, b"\0")
-            answer = self._ask(node, request)
-            if answer is None or answer[0] == 0x80:
-                return f" ! {int.from_bytes((answer or bytes(8))[4:], 'little'):08X}"
+                part = parts.pop(0)
+                head = bytes((toggle | (7 - len(part)) << 1 | (not parts),))
+                request = head + part.ljust(7, b"\0")
+            answer = self._ask(node, request) or b"\x80" + bytes(7)
             found += answer[1 : 8 - (answer[0] >> 1 & 7)]
-            toggle, number = toggle ^ 0x10, number + 1
+            toggle ^= 0x10
             if verb == "read" and answer[0] & 1:
                 break
+        if answer[0] == 0x80:
+            return f" ! {int.from_bytes(answer[4:], 'little'):08X}"
         return f" = {found.hex().upper()}" if verb == "read" else ""
 
 
@@ -235,8 +228,8 @@ def replay(capture: Path) -> str:
 
 def _replay(capture: Path) -> Iterator[str]:
     start = None
-    for time, frame in replayed(capture):
+    for time, item, received in replayed(capture):
         if start is None:
             start = time
             yield f"; capture {capture.name}, time 0 is {time} ns of its clock"
-        yield f"{seconds(time - start)} {'<-' if frame.received else '->'} {frame_text(frame)}"
+        yield f"{seconds(time - start)} {'<-' if received else '->'} {frame_text(item)}"

@@ -61,14 +61,6 @@ def test_the_judge_sees_what_is_wrong(tmp_path: Path, name: str, old: str, new: 
     assert judge.judge(file).wrong
 
 
-def test_a_change_is_said_in_words() -> None:
-    old = "## one\n$ check\n! old\n=> 2\n\n## two\n$ check\n=> 0\n"
-    file = record.HERE / "commands/none.txt"
-    assert record.differences(file, old, old) == []
-    found = record.differences(file, old, old.replace("old", "new"))
-    assert found == ["commands/none.txt: one", "    -! old", "    +! new"]
-
-
 def test_only_the_adapter_knows_the_product() -> None:
     knowing = re.compile(r"^\s*(from|import) kontronik_can_gw", re.MULTILINE)
     assert [

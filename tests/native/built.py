@@ -1,21 +1,20 @@
-"""The core in C, compiled for a test."""
+"""The core in C, compiled for a test; and Python with one under AddressSanitizer and UndefinedBehaviorSanitizer."""
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from kontronik_can_gw.native.compile import compile_core, compiler
+from kontronik_can_gw.native.objects import OPTIONS
 
-STRICT = [
-    "-pedantic",
-    "-Wall",
-    "-Wextra",
-    "-Wconversion",
-    "-Wdouble-promotion",
-    "-Wshadow",
-    "-Werror",
-]
+WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror")
+STRICT = ["-pedantic", *WARNINGS]
+SANITIZERS = "-g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all -fno-wrapv"
+SANITIZED = tuple(SANITIZERS.split())
 COMPILERS = ["gcc", pytest.param("clang", marks=pytest.mark.extended)]
 
 
@@ -31,3 +30,19 @@ def built(target: Path, *options: str, program: str | None = None) -> Path:
     """The core as a shared object."""
     assert compile_core(target, options, there(program)) is None
     return target
+
+
+def run_sanitized(folder: Path, *command: str) -> str:
+    """What Python prints with these arguments and the core's path. The sanitizers' libraries must be loaded before all others."""
+    target = built(folder / "core.so", *SANITIZED, *OPTIONS)
+    asked = [[there(), f"-print-file-name=lib{name}.so"] for name in ("asan", "ubsan")]
+    found = [subprocess.run(each, capture_output=True, text=True, check=True) for each in asked]
+    environment = os.environ | {
+        "LD_PRELOAD": " ".join(each.stdout.strip() for each in found),
+        "ASAN_OPTIONS": "detect_leaks=0",
+        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+    }
+    words = [sys.executable, *command, str(target)]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+    return done.stdout

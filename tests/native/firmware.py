@@ -54,19 +54,12 @@ class Case:
     def inputs(self) -> list[str]:
         return [f"uart{number}.bin" for number in range(len(self.lines))]
 
-    def build(self, compiler: str, *options: str) -> Path:
-        """The example, compiled in the folder. AssertionError with what the compiler said."""
-        target = self.folder / f"example-{Path(compiler).name}"
-        command = [compiler, "-std=c99", *STRICT, *options, "-o", str(target), *SOURCES]
-        done = subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr[:3000]
-        return target
-
-    def run(self, *command: str) -> str:
-        """What the example prints."""
+    def output(self, *command: str) -> str:
+        """What a program prints that runs in the folder. AssertionError with what it said if it failed."""
         done = subprocess.run(
-            [*command, *self.inputs],
+            command,
             cwd=self.folder,
+            stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
             check=False,
@@ -74,6 +67,16 @@ class Case:
         )
         assert done.returncode == 0, done.stderr[:3000]
         return done.stdout
+
+    def build(self, compiler: str, *options: str) -> Path:
+        """The example, compiled in the folder."""
+        target = self.folder / f"example-{Path(compiler).name}"
+        self.output(compiler, "-std=c99", *STRICT, *options, "-o", str(target), *SOURCES)
+        return target
+
+    def run(self, *command: str) -> str:
+        """What the example prints."""
+        return self.output(*command, *self.inputs)
 
     def expected(self) -> str:
         """The frames of the core in Python, by the same clock, as candump logs them."""

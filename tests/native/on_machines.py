@@ -4,7 +4,6 @@ A step of `make release` (tests/run.py): python -m pytest -s tests/native/on_mac
 """
 
 import re
-import subprocess
 import zlib
 from pathlib import Path
 
@@ -18,13 +17,7 @@ from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 HERE = Path(__file__).parent
 FIVE = HERE.parent / "benchmarks" / "five.dbc"
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-Os", "-ffunction-sections", "-fdata-sections")
-BARE = (
-    "--specs=rdimon.specs",
-    "-nostartfiles",
-    "-Wl,--gc-sections",
-    "-T",
-    str(HERE / "cortex_m4.ld"),
-)
+BARE = ("--specs=rdimon.specs", "-nostartfiles", "-Wl,--gc-sections", "-T", f"{HERE}/cortex_m4.ld")
 QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting", "-kernel")
 MACHINES = {
     "arm-linux-gnueabihf-gcc": "qemu-arm",
@@ -65,82 +58,34 @@ def test_it_sends_the_same_on_a_cortex_m4(cases: list[tuple[Case, str]]) -> None
         inputs = "-DINPUTS=" + ",".join(f'"{name}"' for name in case.inputs)
         start = str(HERE / "cortex_m4.c")
         program = case.build("arm-none-eabi-gcc", *CORTEX_M4, *BARE, "-Wno-pedantic", inputs, start)
-        done = subprocess.run(
-            [*QEMU, str(program)],
-            cwd=case.folder,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=300,
-        )
-        assert _crc(done.stdout) == _crc(text)
+        assert _crc(case.output(*QEMU, str(program))) == _crc(text)
 
 
-@pytest.fixture
-def five(tmp_path: Path) -> Case:
-    """One ESC and five messages."""
-    bus = layout_of_dbc(FIVE)
-    return Case(tmp_path, 1, bus.layout, bus.escs)
-
-
-def objects(case: Case, *options: str) -> dict[str, tuple[int, int, int]]:
-    """Bytes of text, data and bss of each object for a Cortex-M4."""
-    command = ["arm-none-eabi-gcc", "-std=c99", *STRICT, *CORTEX_M4, *options, "-c", *SOURCES]
-    subprocess.run(command, cwd=case.folder, check=True)
-    found = {}
-    for source in SOURCES:
-        name = source.replace(".c", ".o")
-        done = subprocess.run(
-            ["arm-none-eabi-size", name],
-            cwd=case.folder,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        text, data, bss = map(int, done.stdout.splitlines()[1].split()[:3])
-        found[source] = text, data, bss
-    print(f"Cortex-M4 {' '.join(options)}: text, data, bss: {found}")
-    return found
+INTEGERS = {"__aeabi_ldivmod", "__aeabi_uldivmod"}
+MEMORY = {"memcpy", "memset", "memmove", "memchr", "memcmp"}
 
 
 @pytest.mark.parametrize(
-    ("options", "flash"),
+    ("dbc", "options", "flash", "ram"),
     [
-        (("-DKCG_DATA=64", "-DKCG_PAGED=1", "-DKCG_E2E=1"), 8 * KB),
-        (("-DKCG_LEGACY=0",), 7 * KB),
+        (FIVE, ("-DKCG_DATA=64", "-DKCG_PAGED=1", "-DKCG_E2E=1"), 8 * KB, None),
+        (FIVE, ("-DKCG_LEGACY=0",), 7 * KB, 2 * KB),
+        (shipped("dbc/kontronik_esc.dbc"), (), 7 * KB, None),
     ],
 )
-def test_how_much_of_a_cortex_m4_it_needs(five: Case, options: tuple[str, ...], flash: int) -> None:
-    sizes = objects(five, *options)
-    text, *ram = sizes["core.c"]
-    assert text <= flash
-    assert ram == [0, 0]
-    assert sizes["tables.c"][1:] == (0, 0), "tables are not in flash"
-    if "-DKCG_DATA=64" not in options:
-        assert sizes["example_main.c"][1] + sizes["example_main.c"][2] <= 2 * KB
-
-
-def helpers(case: Case) -> set[str]:
-    """What core.o needs of the compiler's library."""
-    done = subprocess.run(
-        ["arm-none-eabi-nm", "-u", "core.o"],
-        cwd=case.folder,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return set(re.findall(r"U (\w+)", done.stdout))
-
-
-def test_without_floats_it_needs_a_64_bit_division_and_no_more(five: Case) -> None:
-    objects(five)
-    integers = {"__aeabi_ldivmod", "__aeabi_uldivmod"}
-    assert helpers(five) <= integers | {"memcpy", "memset", "memmove", "memchr", "memcmp"}
-    objects(five, "-DKCG_FLOATS=1")
-    assert "__aeabi_ddiv" in helpers(five)
-
-
-def test_the_shipped_dbc_fits_too(tmp_path: Path) -> None:
-    bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    assert objects(Case(tmp_path, 1, bus.layout, bus.escs))["core.c"][0] <= 7 * KB
+def test_how_much_of_a_cortex_m4_it_needs(
+    tmp_path: Path, dbc: Path, options: tuple[str, ...], flash: int, ram: int | None
+) -> None:
+    """One ESC. Of the compiler's library a 64-bit division and no more; tables are in flash."""
+    bus = layout_of_dbc(dbc)
+    case = Case(tmp_path, 1, bus.layout, bus.escs)
+    case.output("arm-none-eabi-gcc", "-std=c99", *STRICT, *CORTEX_M4, *options, "-c", *SOURCES)
+    names = [source.replace(".c", ".o") for source in SOURCES]
+    lines = case.output("arm-none-eabi-size", *names).splitlines()[1:]
+    core, tables, example = (tuple(map(int, line.split()[:3])) for line in lines)
+    print(f"Cortex-M4 {' '.join(options)}: text, data, bss: {core}, {tables}, {example}")
+    assert core[0] <= flash
+    assert (*core[1:], *tables[1:]) == (0, 0, 0, 0)
+    assert ram is None or sum(example[1:]) <= ram
+    needed = set(re.findall(r"U (\w+)", case.output("arm-none-eabi-nm", "-u", "core.o")))
+    assert needed <= INTEGERS | MEMORY

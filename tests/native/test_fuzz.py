@@ -7,9 +7,8 @@ from pathlib import Path
 
 import equality
 import pytest
-from built import there
+from built import run_sanitized, there
 from firmware import Case
-from sanitized import run_sanitized
 
 SECONDS = int(os.environ.get("KCG_FUZZ_SECONDS", "30"))
 SEED = random.Random().randrange(1 << 30) if SECONDS > 30 else 1
@@ -31,28 +30,17 @@ def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
         calls = [b"\0"]
         for _ in range(20):
             data = equality.stream(chance)[:127]
-            calls.append(
-                bytes((6 | chance.randrange(16) << 4, chance.randrange(256), len(data), 0))
-            )
-            calls.append(data + bytes((3,)))
+            head = 6 | chance.randrange(16) << 4, chance.randrange(256), len(data), 0
+            calls += [bytes(head), data, b"\3"]
         (corpus / str(number)).write_bytes(b"".join(calls))
     program = tmp_path / "fuzz"
     sanitizers = "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"
     command = [there("clang"), "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
-    sources = [
-        str(case.folder / "core.c"),
-        str(case.folder / "tables.c"),
-        str(HERE / "fuzz_bytes.c"),
-    ]
+    sources = [case.folder / "core.c", case.folder / "tables.c", HERE / "fuzz_bytes.c"]
     subprocess.run([*command, "-o", str(program), *sources], check=True)
     limits = f"-max_total_time={max(1, SECONDS // len(FUZZED))}", f"-seed={SEED}", "-max_len=4096"
-    done = subprocess.run(
-        [str(program), *limits, "-timeout=10", "-print_final_stats=1", str(corpus)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = [str(program), *limits, "-timeout=10", "-print_final_stats=1", str(corpus)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-6000:]
     print(done.stderr[-600:])
 

@@ -1,26 +1,12 @@
 """With the core in C the PDOs of ESCs' values are its slots: frames of ESCs do not reach Python."""
 
-from collections.abc import Iterator
-
 import pytest
-from dialogue import QUIET, Bench, info, live, tpdo
+from dialogue import Bench, info, live
 
 from kontronik_can_gw.core import Follower
 from kontronik_can_gw.esc.telemetry import MS, Event
-from kontronik_can_gw.native import load
-from kontronik_can_gw.native.objects import shared_object
 
-ERROR_CODE = 0x603F0010
-
-
-@pytest.fixture(autouse=True)
-def in_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    if not shared_object().exists():
-        pytest.skip("no core in C: sudo apt-get install gcc libc6-dev, and install again")
-    monkeypatch.delenv(load.PURE, raising=False)
-    load.library.cache_clear()
-    yield
-    load.library.cache_clear()
+pytestmark = pytest.mark.parametrize("core_language", ["C"], indirect=True)
 
 
 def followed(bench: Bench) -> list[int]:
@@ -55,18 +41,3 @@ def test_frames_make_the_default_pdos_and_no_event_but_for_other_errors() -> Non
     assert {frame.can_id for frame in bench.take()} >= {0x181 + esc for esc in range(8)}
     bench.uart(live(operating_errors=1), 3)
     assert found == [Event.LIVE | Event.STATE]
-
-
-def test_a_pdo_with_an_object_that_c_does_not_know_is_filled_in_python_while_it_is_sent() -> None:
-    changes = {**QUIET, **tpdo(1, 254, 0, 0, 0x20000120), **tpdo(2, 254, 0, 0, ERROR_CODE)}
-    bench = Bench(changes=changes)
-    seen: list[bool] = []
-    for command in (1, 0x80, 1, 2):  # start, enter PRE-OPERATIONAL, start, stop
-        bench.put(0, bytes((command, 0)))
-        seen.append(bench.gateway.core.reports_live)  # type: ignore[attr-defined]
-        bench.now += 10 * MS
-        bench.take()
-        bench.uart(live(electrical_speed=5, operating_errors=1 << 8 * seen[-1]))
-        pdos = {f.can_id: f.data.hex() for f in bench.take() if f.can_id in (0x181, 0x281)}
-        assert pdos == ({0x181: "05000000", 0x281: "2022"} if seen[-1] else {}), command
-    assert seen == [True, False, True, False]

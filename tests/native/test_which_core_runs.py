@@ -1,15 +1,13 @@
 """The core in C runs where it can; where it cannot, the one in Python does, and the gateway says why."""
 
-import builtins
 import os
-import stat
 import struct
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
 
@@ -44,10 +42,10 @@ def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     load.library.cache_clear()
 
 
-@pytest.fixture
-def built() -> None:
-    if not objects.shared_object().exists():
-        pytest.skip("no core in C: sudo apt-get install gcc libc6-dev, and install again")
+needs_c = pytest.mark.skipif(
+    not objects.shared_object().exists(),
+    reason="no core in C: sudo apt-get install gcc libc6-dev, and install again",
+)
 
 
 def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
@@ -63,7 +61,7 @@ def why(layout: Layout = EMPTY, **settings: object) -> str:
     return gateway.why_python
 
 
-@pytest.mark.usefixtures("built")
+@needs_c
 @pytest.mark.parametrize(
     ("pure", "said"), [(None, ""), ("", ""), ("0", ""), ("1", "KONTRONIK_PURE is set")]
 )
@@ -75,15 +73,7 @@ def test_it_is_the_one_in_c_unless_the_other_is_asked_for(
     assert why() == said
 
 
-def of_another_machine(whole: bytes) -> bytes:
-    return sealed(whole[:18] + b"\xfe\xca" + whole[20:-4])
-
-
-def in_another_word_length(whole: bytes) -> bytes:
-    return sealed(whole[:4] + bytes((whole[4] ^ 3,)) + whole[5:-4])
-
-
-@pytest.mark.usefixtures("built")
+@needs_c
 @pytest.mark.parametrize(
     ("made_of", "said"),
     [
@@ -91,8 +81,8 @@ def in_another_word_length(whole: bytes) -> bytes:
         (lambda _: None, "there was no C compiler at the installation"),
         (lambda whole: whole[:-1], "core-other.so: cut off or damaged"),
         (lambda whole: whole[:4096] + bytes(4096) + whole[8192:], "core-other.so: cut off or damaged"),
-        (of_another_machine, "core-other.so: built for another machine"),
-        (in_another_word_length, "core-other.so: built for another machine"),
+        (lambda whole: sealed(whole[:18] + b"\xfe\xca" + whole[20:-4]), "core-other.so: built for another machine"),
+        (lambda whole: sealed(whole[:4] + bytes((whole[4] ^ 3,)) + whole[5:-4]), "core-other.so: built for another machine"),
         (lambda whole: sealed(whole[:64] + bytes(9)), "core-other.so: "),
     ],
 )  # fmt: skip
@@ -102,13 +92,13 @@ def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_p
     made_of: Callable[[bytes], bytes | None],
     said: str,
 ) -> None:
-    path = tmp_path / "core-other.so"
+    path, not_built = tmp_path / "core-other.so", tmp_path / "not_built.txt"
     if (content := made_of(objects.shared_object().read_bytes())) is not None:
         path.write_bytes(content)
     monkeypatch.setattr(load, "shared_object", lambda: path)
-    monkeypatch.setattr(objects, "NOT_BUILT", tmp_path / "not_built.txt")
+    monkeypatch.setattr(objects, "NOT_BUILT", not_built)
     if said.startswith("there was"):
-        (tmp_path / "not_built.txt").write_text(f"{said}\n")
+        not_built.write_text(f"{said}\n")
     found = why()
     assert load.in_words("Python", found) == f"core: Python ({found})"
     assert found.startswith(said) and "\n" not in found and len(found) < 200
@@ -131,25 +121,18 @@ def test_a_process_of_32_bits_has_an_object_of_its_own(
     assert objects.shared_object().name == name
 
 
-@pytest.mark.usefixtures("built")
+@needs_c
 def test_where_ctypes_may_not_load_the_one_in_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """As under a unit that forbids memory to be executed, on some machines."""
-    real = builtins.__import__
-
-    def refused(name: str, *more: object) -> ModuleType:
-        if name == "kontronik_can_gw.native.binding":
-            raise MemoryError("no closure")
-        return real(name, *more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(builtins, "__import__", refused)
-    assert why() == "ctypes cannot be used here: no closure"
+    monkeypatch.setitem(sys.modules, "kontronik_can_gw.native.binding", None)
+    assert why().startswith("ctypes cannot be used here: ")
 
 
 SPEEDS = 'MotorSpeed : 0|32@1+ (1,0) [0|0] "rpm" Car\n SG_ OutputSpeed : 32|32@1+ (1,0) [0|0] "rpm"'
 NOT_AVAILABLE = 0xFFFF_FFFF
 
 
-@pytest.mark.usefixtures("built")
+@needs_c
 def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available() -> None:
     gateway = Gateway([EscSettings(pole_pairs=7)], layout_of(SPEEDS), 0)
     assert gateway.core.language == "C"
@@ -172,7 +155,7 @@ def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available(
         assert struct.unpack("<2I", frame.data) == (motor, output), given
 
 
-@pytest.mark.usefixtures("built")
+@needs_c
 def test_what_the_core_in_c_cannot_express_runs_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
     other = replace(protocols.PROTOCOLS[0], name="other", wire=None)
     monkeypatch.setattr(protocols, "PROTOCOLS", (*protocols.PROTOCOLS, other))
@@ -181,7 +164,7 @@ def test_what_the_core_in_c_cannot_express_runs_in_python(monkeypatch: pytest.Mo
     assert f"parts above {MAX_GEAR}" in why(gear=Fraction(MAX_GEAR + 1))
 
 
-@pytest.mark.usefixtures("built")
+@needs_c
 @pytest.mark.parametrize(
     ("signal", "more", "said"),
     [
@@ -205,12 +188,10 @@ def test_a_compiler_that_fails_is_said_in_one_line(
 ) -> None:
     program, target = tmp_path / "cc", tmp_path / "core.so"
     program.write_text("#!/bin/sh\nprintf 'In file:\\nfatal error: \\377' >&2\nexit 1\n")
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setattr(compiling, "compiler", lambda: str(program))
-    said = f"at the installation {program} failed: "
-    assert compile_core(target) == f"{said}fatal error: \ufffd"
-    program.unlink()
-    assert "No such file" in str(compile_core(target))
+    program.chmod(0o755)
+    said = f"at the installation {program} failed: fatal error: \ufffd"
+    assert compile_core(target, program=str(program)) == said
+    assert "No such file" in str(compile_core(target, program=f"{program}2"))
     monkeypatch.setattr(compiling, "compiler", lambda: None)
     assert compile_core(target) == "there was no C compiler at the installation"
     assert not target.exists()
