@@ -24,24 +24,16 @@ STANDIN = Path(__file__).resolve().parent / "benchmarks"
 CANTOOLS = {"cantools", "argparse_addons", "bitstruct", "textparser", "crccheck", "diskcache"}
 ALWAYS = {"kontronik_can_gw", "serial"}
 """Libraries that every gateway may have."""
-OWN = {
-    "cli": {"run", "common", "arguments", "recording"},
-    "desk": set[str](),
-}
+OWN = {"cli": {"run", "common", "arguments", "recording"}, "desk": set[str]()}
 """Of our own rooms that are large, what may be there; the others are the gateway itself."""
 NEVER = {"tkinter", "curses", "multiprocessing", "unittest", "pydoc", "doctest", "asyncio", "ssl"}
 NEVER |= {"sqlite3", "email"}
 """Of the standard library."""
+NODES = '[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nstore = "store"\n'
 CONFIGURATIONS = {
     "DBC": ("", CANTOOLS),
-    "CANopen only": (
-        '[dbc]\nenabled = false\n[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\nself_start = true\n',
-        set(),
-    ),
-    "DBC and CANopen": (
-        '[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\n',
-        CANTOOLS,
-    ),
+    "CANopen only": (f"[dbc]\nenabled = false\n{NODES}", set[str]()),
+    "DBC and CANopen": (NODES, CANTOOLS),
     "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS),
     "status": ('[statistics]\nfile = "status.json"\n', CANTOOLS),
 }

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from programs import FIVE, median
-from registry import Context, Figure, benchmark, judged
+from registry import Context, Figure, benchmark
 
 FLIGHT_S, SEED = 240, 6
 _MB = 1_000_000
@@ -148,11 +148,11 @@ def captures(context: Context) -> list[Figure]:
             for _ in range(context.rounds)
         ]
         spent = median([one.cpu_s for one, _ in rounds]) * 3600 / seconds
-        figures.append(judged(f"{name}, an hour", spent, "s", "<= 2", rounds[0][0].written))
+        figures.append(Figure(f"{name}, an hour", spent, "s", "<= 2", rounds[0][0].written))
         noise = median([noisy.cpu_s / one.cpu_s for one, noisy in rounds])
-        figures.append(judged(f"{name}, with noise / without", noise, "x", "<= 1.5"))
+        figures.append(Figure(f"{name}, with noise / without", noise, "x", "<= 1.5"))
         rows = median([one.rows_per_s for one, _ in rounds])
-        figures.append(judged(f"{name}, rows", rows, "rows/s", least))
+        figures.append(Figure(f"{name}, rows", rows, "rows/s", least))
     return figures
 
 
@@ -162,14 +162,14 @@ def plain_bytes(context: Context) -> list[Figure]:
     source, once = context.folder / "bytes.bin", flight(context)
     source.write_bytes(once * ((1 if context.quick else 20) * _MB // len(once) + 1))
     size = source.stat().st_size / _MB
-    figures = [judged("scan", size / min(scan(source) for _ in range(7)), "MB/s", ">= 900")]
+    figures = [Figure("scan", size / min(scan(source) for _ in range(7)), "MB/s", ">= 900")]
     for form, options, aim in (
         ("candump", ("--dbc", FIVE), ">= 80"),
         ("parquet", ("--live",), ">= 70"),
         ("csv", ("--live",), ">= 30"),
     ):
         run = min(convert(context, form, source, *options) for _ in range(context.rounds))
-        figures.append(judged(f"{form}, bytes", size / run.cpu_s, "MB/s", aim, run.written))
+        figures.append(Figure(f"{form}, bytes", size / run.cpu_s, "MB/s", aim, run.written))
     return figures
 
 

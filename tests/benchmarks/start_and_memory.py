@@ -12,17 +12,8 @@ import uuid
 from dataclasses import replace
 from pathlib import Path
 
-from programs import (
-    CANOPEN,
-    EVERYTHING,
-    STANDIN,
-    config_text,
-    end,
-    median,
-    running,
-    start,
-)
-from registry import ROOT, Context, Figure, benchmark, judged
+from programs import CANOPEN, EVERYTHING, STANDIN, config_text, end, median, running, start
+from registry import ROOT, Context, Figure, benchmark
 
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.lean import without_asammdf
@@ -66,19 +57,15 @@ def first_frame_ms(escs: int, config: str) -> float:
 @benchmark("start", "from exec to the first CAN frame: 1 and 8 ESCs, CANopen")
 def start_up(context: Context) -> list[Figure]:
     """From exec to the first CAN frame, by turns."""
-    cases = {
-        "1 ESC": (1, ""),
-        "8 ESCs": (8, ""),
-        "1 ESC, CANopen": (1, CANOPEN),
-        "8 ESCs, CANopen": (8, CANOPEN),
-    }
+    cases = {"1 ESC": (1, ""), "8 ESCs": (8, "")}
+    cases |= {"1 ESC, CANopen": (1, CANOPEN), "8 ESCs, CANopen": (8, CANOPEN)}
     first_frame_ms(1, CANOPEN)  # what is compiled at the first run is there from now on
     found: dict[str, list[float]] = {name: [] for name in cases}
     for _ in range(2 * context.rounds - 1):
         for name, (escs, config) in cases.items():
             found[name].append(first_frame_ms(escs, config))
     return [
-        judged(f"first CAN frame, {name}", median(times), "ms", "<= 250" if name == "1 ESC" else "")
+        Figure(f"first CAN frame, {name}", median(times), "ms", "<= 250" if name == "1 ESC" else "")
         for name, times in found.items()
     ]
 
@@ -125,7 +112,7 @@ def memory(context: Context) -> list[Figure]:
     further = (rss["64 ESCs"] - rss["1 ESC"]) / 63
     nodes = (rss["8 ESCs, CANopen"] - rss["1 ESC, CANopen"]) / 7
     return [
-        *(judged(f"RSS, {case}", rss[case], "MB", aim) for case, (_, _, aim) in cases.items()),
-        judged("RSS, each further ESC", further, "MB", "<= 0.05"),
+        *(Figure(f"RSS, {case}", rss[case], "MB", aim) for case, (_, _, aim) in cases.items()),
+        Figure("RSS, each further ESC", further, "MB", "<= 0.05"),
         Figure("RSS, each further ESC, CANopen", nodes, "MB"),
     ]

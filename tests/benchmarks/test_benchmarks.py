@@ -38,11 +38,10 @@ def test_a_short_run_of_the_three_programs_gives_a_table(
 @pytest.mark.parametrize(
     ("outcome", "code", "said"),
     [
-        (registry.judged("a", 3.3, "x", "<= 2.2"), 0, "MISSED"),
-        (registry.judged("a", 3, "x", ">= 4"), 0, "MISSED"),
-        (registry.judged("a", 5, "x", ">= 4"), 0, "reached"),
-        (registry.judged("a", 5, "x", ">= 4", fair=False), 0, "MISSED\n"),
-        (Figure("a", 2, "of 10", "0", False), 0, "MISSED\n"),
+        (Figure("a", 3.3, "x", "<= 2.2"), 0, "MISSED"),
+        (Figure("a", 3, "x", ">= 4"), 0, "MISSED"),
+        (Figure("a", 5, "x", ">= 4"), 0, "reached"),
+        (Figure("a", 5, "x", ">= 4", fair=False), 0, "MISSED\n"),
         (LeftOut("no gcc: sudo apt-get install gcc"), 0, "left out: no gcc: sudo apt-get"),
         (RuntimeError("c ended"), 1, "failed: RuntimeError: c ended"),
     ],

@@ -77,11 +77,7 @@ def test_without_a_name_the_configuration_of_the_folder_comes_before_the_machine
 def test_commands_that_also_work_without_one_say_which_they_take(places: tuple[Path, Path]) -> None:
     own, _ = places
     assert run("dbc").err == ""
-    written(
-        own,
-        LEAST.replace("[[esc]]", '[[esc]]\nname = "left"')
-        + '[[esc]]\nname = "right"\nport = "x"\n',
-    )
+    written(own, f'{LEAST}name = "left"\n[[esc]]\nname = "right"\nport = "x"\n')
     done = run("dbc")
     assert done.err.startswith("kontronik-can-gw: by gateway.toml\n")
     assert "EscSpeed_right" in done.out or "right" in done.out.lower()

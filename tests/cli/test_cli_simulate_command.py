@@ -42,6 +42,10 @@ def test_the_bytes_of_a_file_and_of_standard_output_are_those_of_the_simulator(
     expected = SimulatedEsc(seed=5).frames_until(90 * 10**9 - 1)
     assert (tmp_path / "out.bin").read_bytes() == b"".join(sent.wire for sent in expected)
     assert run(*words, "-").data == (tmp_path / "out.bin").read_bytes()
+    assert run(*words, tmp_path / "esc{n}.bin", "--esc", 3, "--layout", "legacy").code == 0
+    files = [(tmp_path / f"esc{n}.bin").read_bytes() for n in (1, 2, 3)]
+    assert len(set(files)) == 3
+    assert {frame.layout for file in files for frame in frames_of(file)} == {Layout.LEGACY}
 
 
 def test_error_bits_and_the_device_are_as_asked(tmp_path: Path) -> None:
@@ -110,14 +114,6 @@ def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
     assert "exists and is not a symbolic link" in said
     assert [file.name for file in tmp_path.iterdir()] == ["esc2"]
     assert link.read_text() == "precious"
-
-
-def test_several_escs_write_a_file_each_in_the_layout_asked_for(tmp_path: Path) -> None:
-    words = ["--esc", "3", "--layout", "legacy", "--seconds", "2s", "--out"]
-    assert run("simulate", *words, tmp_path / "esc{n}.bin").code == 0
-    files = [(tmp_path / f"esc{n}.bin").read_bytes() for n in (1, 2, 3)]
-    assert len(set(files)) == 3
-    assert {frame.layout for file in files for frame in frames_of(file)} == {Layout.LEGACY}
 
 
 def test_what_is_lost_and_disturbed_is_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:

@@ -57,15 +57,6 @@ def values(dictionary: Any) -> dict[Key, int | bytes]:
     return found
 
 
-def dcf_values(*words: object) -> dict[Key, int | bytes]:
-    code, text, said = command(*words)
-    assert (code, said) == (0, "")
-    return values(imported(text))
-
-
-# --- the EDS
-
-
 def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
     assert command("-o", tmp_path / "out.eds")[0] == 0
     assert (tmp_path / "out.eds").read_bytes() == command()[1].encode() == EDS.read_bytes()
@@ -75,9 +66,6 @@ def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
     assert command("-c", file)[1].encode() == mine
     file = configuration(tmp_path, 'enabled = true\neds = "mine.eds"\ncia402_mirrors = false')
     assert command("-c", file)[1].encode() == without(mine, range(0x6000, 0x6800))
-
-
-# --- the DCF of the defaults
 
 
 @pytest.mark.parametrize(
@@ -98,9 +86,6 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
         ("FileName", named),
         ("LastEDS", "mine.eds"),
     ]
-
-
-# --- the DCF of a configured node
 
 
 def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_master_stored(
@@ -132,7 +117,7 @@ def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_maste
     communication |= {(0x1014, 0): 0xA1, (0x1200, 1): 0x621, (0x1803, 1): 0x400004A1}
     assert {key: found[key] for key in communication} == communication
 
-    of_left = dcf_values("-c", file, "--node-id", "0x14")
+    of_left = values(imported(command("-c", file, "--node-id", "0x14")[1]))
     assert (of_left[0x1018, 4], of_left[0x1017, 0], of_left[0x2100, 1]) == (1000, 1000, 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["gateway.toml", "kept"]
 

@@ -26,42 +26,31 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
-DEFAULTS: dict[str, dict[str, object]] = {
-    "can": {"interface": "socketcan", "channel": "can0", "bitrate": 500_000, "fd": False, "data_bitrate": 2_000_000, "options": {}},
-    "dbc": {"enabled": True, "file": "shipped", "node": None, "on_loss": "not_available", "base_id": None, "id_step": None}
-    | {"bind": {}, "e2e_data_ids": {}, "units": {}, "send_type": {}, "messages": (), "unbound": "error", "flags_on_loss": None},
-    "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
-    | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
-    "dronecan": {"enabled": False, "node_id": 0, "per_esc_nodes": False, "name": "kontronik_can_gw", "first_index": 0}
-    | {"rate_hz": 50, "extended_hz": 0, "rpm": "motor", "health": "gateway", "log_messages": True},
-    "run": {"wait_for_devices": False, "realtime_priority": None},
-    "statistics": {"file": None},
-    "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100},
-    "mqtt": dict.fromkeys(("broker", "ca_file", "cert_file", "key_file", "username", "password_file"), None)
-    | {"tls": False, "gateway": None, "topic": "kontronik", "rate": 1.0, "retain": False, "discovery": None},
-    "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250}
-    | {"node_id": None, "device": None, "protocol": "kontronik"},
-}  # fmt: skip
-TABLES = {table: [*keys, *(["port"] if table == "esc" else [])] for table, keys in DEFAULTS.items()}
-_WHOLE = """
-can bitrate 10000 1000000, can data_bitrate 10000 8000000, dbc base_id 0 536870911, dbc id_step 1 536870911, dbc flags_on_loss 0 1,
-run realtime_priority 1 99, canopen vendor_id 0 4294967295, canopen serial 0 4294967295, canopen node_id 1 127, record part_mb 1 4000,
-record part_minutes 1 10000, record keep_mb 0 10000000, record min_free_mb 0 10000000, esc node_id 1 127, esc pole_pairs 1 100,
-esc cell_count 0 255, esc telemetry_timeout_ms 20 60000, dronecan node_id 0 125, dronecan first_index 0 31, dronecan rate_hz 1 200,
-dronecan extended_hz 0 200"""
-RANGES = {
-    (table, key): (int(low), int(high))
-    for table, key, low, high in map(str.split, _WHOLE.split(","))
+KEYS: dict[str, dict[str, Any]] = {
+    table: {
+        key: entry
+        for key, entry in described.get("items", described)["properties"].items()
+        if "deprecated" not in entry
+    }
+    for table, described in schema()["properties"].items()
 }
-_TEXTS = """
-can interface, can channel, dbc file, dbc node, esc port, canopen eds, canopen store, statistics file, record directory,
-mqtt ca_file, mqtt cert_file, mqtt key_file, mqtt username, mqtt password_file"""
-_FLAGS = """
-can fd, run wait_for_devices, dbc enabled, mqtt tls, mqtt retain, canopen enabled, canopen self_start, canopen read_only,
-canopen cia402_mirrors, dronecan enabled, dronecan per_esc_nodes, dronecan log_messages"""
-STRINGS, BOOLEANS = (
-    [(table, key) for table, key in map(str.split, text.split(","))] for text in (_TEXTS, _FLAGS)
-)
+"""What the schema says of each key; with defaults and ranges it is in docs/reference/configuration.md."""
+
+
+def of_type(kind: str) -> list[tuple[str, str]]:
+    """The keys of this type that take any text, or all that the type has."""
+    return [
+        (table, key)
+        for table, keys in KEYS.items()
+        for key, entry in keys.items()
+        if entry.get("type") == kind and not entry.keys() & {"enum", "maxLength", "not"}
+    ]
+
+
+RANGES = {
+    (table, key): (KEYS[table][key]["minimum"], KEYS[table][key]["maximum"])
+    for table, key in of_type("integer")
+}
 
 
 def tables(table: str = "", key: str = "", value: object = None) -> dict[str, Any]:
@@ -94,13 +83,13 @@ def problems(given_tables: Any) -> list[str]:
 
 TAKEN: dict[tuple[str, str], list[object]] = {
     **{place: [*ends] for place, ends in RANGES.items()},
-    **{place: ["a b"] for place in STRINGS},
-    **{place: [True, False] for place in BOOLEANS},
+    **{place: ["a b"] for place in of_type("string")},
+    **{place: [True, False] for place in of_type("boolean")},
     ("canopen", "node_id"): [1, 127, 255],
-    ("esc", "node_id"): [1, 127, 255],
     ("dronecan", "name"): ["a", "com.example.esc-1_2", "x" * 60],
     ("dronecan", "rpm"): ["motor", "output", "electrical"],
     ("dronecan", "health"): ["gateway", "esc"],
+    ("mqtt", "broker"): ["broker", "[::1]:65535"],
     ("mqtt", "rate"): [0.01, 0.5, 1, 20, 20.0],
     ("esc", "name"): ["a", "Left", "esc_1", "A23456789012"],
     ("dbc", "on_loss"): ["silent", "not_available"],
@@ -194,21 +183,13 @@ def escs(*entries: dict[str, Any]) -> dict[str, Any]:
     return {"esc": [{"port": f"p{n}"} | entry for n, entry in enumerate(entries)]}
 
 
-def named(*names: str) -> dict[str, Any]:
-    return escs(*({"name": name} for name in names))
-
-
 DBC = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gateway\nBO_ 256 M: 8 Gateway\n SG_ BattVolt : 0|16@1+ (1,0) [0|0] "V" Gateway\n'
 BAD_DBC = "M.BattVolt: no such source"
 OTHERS: list[tuple[dict[str, Any], list[str]]] = [
-    (named("x", "X"), ["esc[2].name: 'X' is also", BAD_DBC]),
-    ({"esc": [{"port": "a"}] * 2}, ["esc[2].port: 'a' is also", BAD_DBC]),
-    ({"canopen": {"eds": "none.eds"}} | escs({}), ["none.eds: cannot be read", BAD_DBC]),
+    ({"statistics": {"file": "my.dbc"}} | escs({"name": "x"}, {"name": "X"}),
+     ["esc[2].name: 'X' is also", "statistics.file", BAD_DBC]),
     ({"canopen": {"node_id": 127, "eds": "none.eds"}, "esc": [{"port": "a"}] * 2},
      ["esc[2].port", "esc[2]: its node-ID would be 128", "none.eds: cannot be read", BAD_DBC]),
-    ({"canopen": {}} | escs({"node_id": 5}, {"node_id": 5}), ["esc[2].node_id: 5 is also", BAD_DBC]),
-    ({"can": {"interface": "socketcn"}} | escs({}), ["'socketcn' is no interface", BAD_DBC]),
-    ({"statistics": {"file": "my.dbc"}} | escs({}), ["statistics.file", BAD_DBC]),
     ({"can": {"channel": "/dev/null"}, "esc": [{"port": "/dev/null"}]}, ["is the port of esc1", BAD_DBC]),
     # the rest depends on what a table says
     ({"dbc": {"file": "my.dbc", "noode": 1}, "esc": [{"port": "a"}] * 2}, ["noode", "esc[2].port"]),
@@ -261,10 +242,7 @@ def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(
     assert problems(old | {"run": 1}) == ["a.toml: run: is a table, written [run]"]
     for key, advice in REMOVED_KEYS.items():
         table, _, name = key.partition(".")
-        assert table in TABLES and name not in TABLES[table] and advice.endswith("."), key
-
-
-# --- files
+        assert table in KEYS and name not in KEYS[table] and advice.endswith("."), key
 
 
 # --- the shipped example
@@ -284,13 +262,10 @@ def test_the_shipped_example_is_valid_and_has_every_key_of_every_table(tmp_path:
     windows.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     assert [esc.name for esc in load(windows).esc] == ["esc1", "right"]
     made = tomllib.loads(text)
-    properties = schema()["properties"]
-    for table, keys in TABLES.items():
-        entries = properties[table].get("items", properties[table])["properties"]
-        assert {key for key, entry in entries.items() if "deprecated" not in entry} == set(keys)
+    for table, keys in KEYS.items():
         given = made["esc"] if table == "esc" else [made[table]]
         assert {key for entry in given for key in entry} == set(keys)
-    assert set(properties) == set(TABLES) == set(made)
+    assert set(KEYS) == set(made)
 
 
 # --- the schema against the parser
@@ -309,21 +284,18 @@ def accepted(made: Any) -> bool:
 def test_every_key_of_the_schema_is_described_and_its_default_is_the_parsers() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
     config = parse(tables(), "folder/a.toml")
-    for table, keys in DEFAULTS.items():
-        made = config.esc[0] if table == "esc" else getattr(config, table)
-        assert {key: getattr(made, key) for key in keys} == keys
     assert config.dbc_path == shipped("dbc/kontronik_esc.dbc") and config.dbc_path.is_file()
     mine = parse(tables("dbc", "file", "my.dbc"), "folder/a.toml")
     assert mine.dbc_path == Path("folder/my.dbc")
-    for table, entry in schema()["properties"].items():
-        properties = entry.get("items", entry)["properties"]
-        for key, described in properties.items():
+    for table, keys in KEYS.items():
+        made = config.esc[0] if table == "esc" else getattr(config, table)
+        for key, described in keys.items():
             assert described["description"]
             if "default" in described:
                 VALIDATOR.evolve(schema=described).validate(described["default"])
-                given_default = described["default"]
-                default = Fraction(given_default) if key == "gear" else given_default
-                assert default == DEFAULTS[table][key]
+                assert getattr(made, key) == described["default"]
+            elif (table, key) not in (("esc", "port"), ("esc", "name")):
+                assert not getattr(made, key)
 
 
 def samples() -> list[tuple[str, dict[str, Any]]]:
@@ -341,12 +313,12 @@ def samples() -> list[tuple[str, dict[str, Any]]]:
     values += [{"a": entry} for entry in entries]
     made = [
         (f"{t}.{k}={v!r}"[:60], tables(t, k, v))
-        for t, keys in TABLES.items()
+        for t, keys in KEYS.items()
         for k in (*keys, "x")
         for v in values
     ]
     kinds: list[Any] = [{}, [], 1, "x", [{}], [1], [{"port": "a"}, {"port": "b"}], [{}, {}]]
-    made += [(f"{t}={v!r}", tables() | {t: v}) for t in (*TABLES, "x") for v in kinds]
+    made += [(f"{t}={v!r}", tables() | {t: v}) for t in (*KEYS, "x") for v in kinds]
     return made
 
 

@@ -145,13 +145,6 @@ def test_dpkg_can_verify_every_file(made: dict[str, bytes]) -> None:
     )
 
 
-@pytest.mark.parametrize("name", [*make_deb.SCRIPTS, "rtupdate", "take-over"])
-def test_maintainer_scripts_are_shell(name: str) -> None:
-    script = make_deb.HERE / name
-    assert script.read_text().startswith("#!/bin/sh\n")
-    subprocess.run(["sh", "-n", script], check=True)
-
-
 @pytest.fixture
 def board(tmp_path: Path) -> Path:
     """A root with the package's files of the service, the scripts moved into it, and stand-ins for the tools they call."""

@@ -96,15 +96,8 @@ class Tree(Machine):
     def systemd(self, **shown: str) -> None:
         """systemd with our unit, which shows these properties besides the usual ones."""
         self.folder("/run/systemd/system")
-        usual = {
-            "LoadState": "loaded",
-            "ActiveState": "active",
-            "SubState": "running",
-            "UnitFileState": "enabled",
-            "NRestarts": "0",
-            "Result": "success",
-            "User": "anna",
-        }
+        usual = {"LoadState": "loaded", "ActiveState": "active", "SubState": "running"}
+        usual |= {"UnitFileState": "enabled", "NRestarts": "0", "Result": "success", "User": "anna"}
         text = "".join(f"{name}={value}\n" for name, value in {**usual, **shown}.items())
         self.programs["systemctl", "show"] = text
 

@@ -10,6 +10,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from fault_report import FAILED, GOOD, NOT_JUDGED, Report, Row
 from programme import conclude
+from qemu_adapter import SerialAdapter
 from taken import Load, Sample, worst_share
 
 
@@ -86,3 +87,21 @@ def test_all_that_the_virtual_machine_started_in_sessions_of_its_own_is_watched(
             child.wait()
     assert {str(child.pid) for child in children} <= watched
     assert str(os.getpid()) not in watched
+
+
+def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gateways_from_then_on() -> (
+    None
+):
+    adapter = SerialAdapter("x")
+
+    def set_line(divisor: int, parity_and_bits: int) -> None:
+        adapter.vendor(3, divisor, 0, 0)
+        adapter.vendor(4, parity_and_bits, 0, 0)
+
+    set_line(312, 0x0008)  # 9600 8N1, at the opening
+    adapter.take(b"echo")
+    set_line(26, 0x0208)  # 115200 8E1
+    adapter.take(b"A")
+    set_line(312, 0x0008)  # by another program
+    adapter.take(b"B")
+    assert adapter.received == 2

@@ -17,7 +17,7 @@ import yaml  # type: ignore[import-untyped]
 from command_line import written
 from harness import LoggedProcess
 from statistics_bench import Bench
-from vcan_tools import PROGRAM, wait_for
+from vcan_tools import GatewayProcess, wait_for
 
 FOLDER = Path(__file__).parents[2] / "examples/grafana"
 RULES = [
@@ -38,21 +38,12 @@ class Prometheus:
     """A server that scrapes one target each second, on a port of its own choice."""
 
     def __init__(self, folder: Path, target: str) -> None:
-        config = {
-            "rule_files": [str(FOLDER / "alerts.yml")],
-            "scrape_configs": [
-                {
-                    "job_name": "kontronik",
-                    "scrape_interval": "1s",
-                    "static_configs": [{"targets": [target]}],
-                }
-            ],
-        }
+        job = {"job_name": "kontronik", "scrape_interval": "1s"}
+        job |= {"static_configs": [{"targets": [target]}]}  # type: ignore[dict-item]
+        config = {"rule_files": [str(FOLDER / "alerts.yml")], "scrape_configs": [job]}
         file = written(folder / "prometheus.yml", json.dumps(config))
         words = [f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}"]
-        self._process = LoggedProcess(
-            ["prometheus", *words, "--web.listen-address=127.0.0.1:0"], keep_out=False
-        )
+        self._process = LoggedProcess(["prometheus", *words, "--web.listen-address=127.0.0.1:0"])
         wait_for(lambda: "is ready to receive" in self._process.log, lambda: self._process.log)
         (self._address,) = set(re.findall(r"127\.0\.0\.1:[1-9]\d*", self._process.log)) - {target}
 
@@ -84,18 +75,16 @@ def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
 
     thread = threading.Thread(target=refresh)
     thread.start()
-    metrics = LoggedProcess(
-        [*PROGRAM, "metrics", "--file", str(file), "--listen", "127.0.0.1:0"], keep_out=False
-    )
-    wait_for(lambda: "/metrics serves" in metrics.log, lambda: metrics.log)
+    words = ("--file", file, "--listen", "127.0.0.1:0")
+    metrics = GatewayProcess(None, *words, command="metrics")
+    metrics.wait_for_line("/metrics serves")
     (target,) = re.findall(r"http://(\S+)/metrics", metrics.log)
     prometheus = Prometheus(tmp_path, target)
     yield prometheus
     prometheus.end()
     stop.set()
     thread.join()
-    metrics.process.terminate()
-    metrics.wait()
+    metrics.end()
 
 
 def test_every_expression_finds_something(prometheus: Prometheus) -> None:

@@ -1,12 +1,9 @@
 """``kontronik-can-gw metrics``: what is answered for a good, a missing, a stale and a damaged status file, and to whom."""
 
 import json
-import os
-import signal
 import socket
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from http.client import HTTPConnection
@@ -15,9 +12,9 @@ from typing import Any
 
 import pytest
 from command_line import refused, written
-from harness import LoggedProcess
 from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench
+from vcan_tools import GatewayProcess
 
 from kontronik_can_gw.cli.metrics import _status_file
 from kontronik_can_gw.desk import metrics
@@ -158,18 +155,11 @@ def test_it_serves_the_file_of_a_configuration_on_this_machine_until_sigterm(
         assert "is no port on this machine" in refused(2, "metrics", toml, "--listen", text)
     said = refused(1, "metrics", "--file", file, "--listen", f"127.0.0.1:{port}")
     assert "cannot be listened to: Address already in use. Choose another" in said
-    command = [sys.executable, "-m", "kontronik_can_gw", "metrics", str(toml)]
-    paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    program = LoggedProcess([*command, "--listen", "127.0.0.1:0"], paths)
+    program = GatewayProcess(None, toml, "--listen", "127.0.0.1:0", command="metrics")
     try:
-        end = time.monotonic() + PATIENCE
-        while "serves" not in program.log:
-            assert time.monotonic() < end
-            time.sleep(0.01)
-        assert program.log.endswith(f"serves {tmp_path}/own.json")
+        program.wait_for_line(f"serves {tmp_path}/own.json")
         assert ask(int(program.log.partition("127.0.0.1:")[2].partition("/")[0]))[0] == 503
-        program.process.send_signal(signal.SIGTERM)
-        assert program.process.wait(PATIENCE) == 0
+        assert program.end() == 0
     finally:
         program.kill()
 

@@ -1,7 +1,6 @@
 """A real mosquitto on loopback, clients that are not ours, and the program as a process."""
 
 import contextlib
-import json
 import os
 import pwd
 import random
@@ -10,21 +9,17 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import threading
-import time
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import paho.mqtt.client as paho
 import pytest
-from harness import LoggedProcess
 from paho.mqtt.enums import CallbackAPIVersion
+from vcan_tools import wait_for
 
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/sbin")
 PATIENCE = 60.0
-PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "mqtt"]
 
 
 def need_mosquitto() -> str:
@@ -44,15 +39,6 @@ def free_port() -> int:
         with socket.socket() as probe, contextlib.suppress(OSError):
             probe.bind(("127.0.0.1", port))
             return port
-
-
-def wait_for(condition: Callable[[], object], what: object) -> None:
-    """Wait until something holds, however loaded the machine is."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        if time.monotonic() > end:
-            raise AssertionError(f"not within {PATIENCE} s: {what() if callable(what) else what}")
-        time.sleep(0.005)
 
 
 class Mosquitto:
@@ -102,16 +88,9 @@ class Mosquitto:
 class Heard(NamedTuple):
     """A message as a subscriber got it."""
 
-    when: float
     topic: str
     payload: bytes
     retained: bool
-
-    @property
-    def json(self) -> dict[str, Any]:
-        made = json.loads(self.payload)
-        assert isinstance(made, dict)
-        return made
 
 
 class Subscriber:
@@ -132,17 +111,15 @@ class Subscriber:
         assert self._subscribed.wait(PATIENCE)
 
     def _take(self, _client: object, _data: object, message: paho.MQTTMessage) -> None:
-        payload = bytes(message.payload)
-        self.heard.append(Heard(time.monotonic(), message.topic, payload, message.retain))
-
-    def of(self, topic: str) -> list[Heard]:
-        return [heard for heard in list(self.heard) if heard.topic == topic]
+        self.heard.append(Heard(message.topic, bytes(message.payload), message.retain))
 
     def wait(self, topic: str, payload: bytes | None = None) -> Heard:
         """The first message of a topic (with this payload), as soon as it has come."""
 
         def found() -> list[Heard]:
-            return [heard for heard in self.of(topic) if payload in (None, heard.payload)]
+            return [
+                h for h in list(self.heard) if h.topic == topic and payload in (None, h.payload)
+            ]
 
         wait_for(found, lambda: f"{topic} {payload!r} in {self.heard}")
         return found()[0]
@@ -161,25 +138,3 @@ def kept(port: int, topic: str = "#") -> dict[str, bytes]:
         heard.client.publish(heard.mark, b"x", 1)
         heard.wait(heard.mark)
     return {found.topic: found.payload for found in heard.heard if found.retained}
-
-
-class Process(LoggedProcess):
-    """``kontronik-can-gw mqtt`` as its own process."""
-
-    def __init__(self, *words: object, environment: Mapping[str, str] | None = None) -> None:
-        paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        super().__init__([*PROGRAM, *map(str, words)], paths | dict(environment or {}))
-
-    def wait_for_line(self, text: str) -> None:
-        wait_for(lambda: text in self.log, lambda: f"{text!r} in:\n{self.log}")
-
-    def end(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal; the exit code."""
-        self.process.send_signal(number)
-        return self.process.wait(PATIENCE)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.kill()

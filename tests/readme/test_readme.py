@@ -13,6 +13,7 @@ import pytest
 from pictures import SHOWN, main
 from reference import FOLDER, pages
 from report_browser import MISSING, PROGRAM
+from shell_blocks import PAGES as BY_HAND
 
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.config.export import schema
@@ -20,17 +21,9 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 
 PROJECT = FOLDER.parents[1]
-PAGES = {
-    path: path.read_text(encoding="utf-8")
-    for path in [
-        PROJECT / "README.md",
-        PROJECT / "CONTRIBUTING.md",
-        *sorted((PROJECT / "docs").rglob("*.md")),
-        *sorted((PROJECT / "examples").rglob("*.md")),
-    ]
-}
+PAGES = {path: path.read_text(encoding="utf-8") for path in (*BY_HAND, *FOLDER.glob("*.md"))}
 README = PAGES[PROJECT / "README.md"]
-ALL = "\n".join(text for path, text in PAGES.items() if path.parent != FOLDER)
+ALL = "\n".join(PAGES[path] for path in BY_HAND)
 
 
 def test_the_reference_is_that_of_the_sources() -> None:
@@ -107,9 +100,7 @@ def test_a_wheel_carries_dbc_and_example_and_finds_them(tmp_path: Path) -> None:
     shutil.copytree(
         PROJECT,
         source,
-        ignore=shutil.ignore_patterns(
-            ".venv", ".git", ".cache", "__pycache__", ".*_cache", "tests"
-        ),
+        ignore=shutil.ignore_patterns(".*", "__pycache__", "tests"),
     )
 
     def python(*words: object) -> str:

@@ -11,7 +11,6 @@ import os
 import shutil
 import socket
 import stat
-import struct
 import subprocess
 import sys
 import time
@@ -20,14 +19,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "deb"))
+
+from on_board import LIMIT_S, fresh
+
 PROGRAM = str(Path(sys.prefix, "bin", "kontronik-can-gw"))
 CONFIGURATION = Path("/etc/kontronik-can-gw/gateway.toml")
 UNIT = "kontronik-can-gw.service"
 LINK = "/run/esc"
 LOCKS = "/run/kontronik-can-gw/lock"
-VALUES = 0x698
-LIMIT_S = 120.0
-"""No machine that works takes that long."""
 FORBIDDEN = "/dev/not_a_serial_port"
 Facts = dict[str, Any]
 
@@ -55,21 +55,7 @@ def until(condition: Callable[[], bool]) -> float:
             return time.monotonic() - start
         time.sleep(
             0.2
-        )  # the machine has one processor: who asks all the time holds up what it waits for
-    return -1.0
-
-
-def fresh() -> float:
-    """How long it took until a value of the ESC was on the bus: until then the bytes of the shipped DBC's message say "not available"."""
-    start = time.monotonic()
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
-        bus.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", VALUES, 0x7FF))
-        bus.bind(("vcan0",))
-        bus.settimeout(0.2)
-        while time.monotonic() - start < LIMIT_S:
-            with contextlib.suppress(TimeoutError):
-                if bus.recv(16)[8:12] != b"\xff" * 4:
-                    return time.monotonic() - start
+        )  # the machine has one processor: asking all the time holds up what is waited for
     return -1.0
 
 
@@ -78,10 +64,8 @@ def write_configuration(file: Path, channel: str, port: str) -> None:
 
 
 def entries() -> list[dict[str, Any]]:
-    return [
-        json.loads(line)
-        for line in run("journalctl", "-u", UNIT, "-o", "json", "--no-pager")["out"].splitlines()
-    ]
+    lines = run("journalctl", "-u", UNIT, "-o", "json", "--no-pager")["out"].splitlines()
+    return [json.loads(line) for line in lines]
 
 
 def fetched() -> str:
@@ -116,15 +100,14 @@ def trial(facts: Facts) -> None:
     facts["install"] = service("install")
     facts["after install"] = shown()
 
-    simulator = subprocess.Popen(
-        [PROGRAM, "simulate", "--link", LINK], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    silent: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    simulator = subprocess.Popen([PROGRAM, "simulate", "--link", LINK], **silent)
     until(Path(LINK).exists)
     shutil.chown(LINK, "root", "dialout")
     Path(LINK).chmod(0o660)
     write_configuration(CONFIGURATION, "vcan0", LINK)
     facts["install now"] = service("install", "--now")
-    facts["fresh after"] = fresh()
+    facts["fresh"] = fresh()
     until(lambda: "telemetry ok" in shown()["StatusText"])  # which is reported once a second
     facts["running"] = shown()
     pid = facts["running"]["MainPID"]
@@ -137,18 +120,17 @@ def trial(facts: Facts) -> None:
         if Path(path).exists()
     }
 
+    def is_another() -> bool:
+        return shown()["MainPID"] not in ("0", pid) and shown()["ActiveState"] == "active"
+
     os.kill(int(pid), 9)
-    facts["running again after kill"] = until(
-        lambda: shown()["MainPID"] not in ("0", pid) and shown()["ActiveState"] == "active"
-    )
+    facts["running again after kill"] = until(is_another)
     facts["fresh after kill"] = fresh()
     facts["killed"] = shown()
 
     pid = facts["killed"]["MainPID"]
     os.kill(int(pid), 19)  # SIGSTOP: nothing in it goes on
-    facts["running again after freeze"] = until(
-        lambda: shown()["MainPID"] not in ("0", pid) and shown()["ActiveState"] == "active"
-    )
+    facts["running again after freeze"] = until(is_another)
     facts["frozen"] = shown()
     pid = facts["frozen"]["MainPID"]
     until(lambda: "telemetry ok" in shown()["StatusText"])
@@ -178,9 +160,7 @@ def trial(facts: Facts) -> None:
     facts["running in the end"] = shown()
     facts["locks"] = sorted(path.name.partition(".")[2] for path in Path(LOCKS).iterdir())
     run("systemctl", "stop", UNIT)
-    facts["locks after a stop"] = (
-        [path.name for path in Path(LOCKS).iterdir()] if Path(LOCKS).is_dir() else None
-    )
+    facts["locks after a stop"] = [path.name for path in Path(LOCKS).iterdir()]
     facts["end"] = service("uninstall")
 
 

@@ -57,28 +57,10 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
         pytest.skip(reason)
     folder = tmp_path_factory.mktemp("systemd")
     folder.chmod(0o755)
-    words = ["--backend", "uml", "--timeout", str(TIMEOUT_S), "--rw", str(folder), "--"]
-    inside = [
-        "sh",
-        str(HERE / "boot_systemd.sh"),
-        sys.executable,
-        str(HERE / "inside_systemd.py"),
-        str(folder),
-    ]
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-B",
-            str(PROJECT / "tests" / "vm" / "vm_run.py"),
-            *words,
-            *inside,
-            *hidden_folders(),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=TIMEOUT_S + 60,
-    )
+    command = [sys.executable, "-B", f"{PROJECT}/tests/vm/vm_run.py", "--backend", "uml"]
+    command += [f"--timeout={TIMEOUT_S}", f"--rw={folder}", "--", "sh", f"{HERE}/boot_systemd.sh"]
+    command += [sys.executable, f"{HERE}/inside_systemd.py", str(folder), *hidden_folders()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S + 60)
     file, said = folder / "facts.json", folder / "said"
     talk = done.stdout + done.stderr + (said.read_text() if said.exists() else "")
     assert file.exists(), talk
@@ -118,7 +100,7 @@ def test_it_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
 
 
 def test_telemetry_of_a_port_of_its_group_reaches_the_bus(facts: Facts) -> None:
-    assert facts["fresh after"] >= 0
+    assert facts["fresh"]
     assert "telemetry ok" in facts["running"]["StatusText"]
 
 
@@ -137,7 +119,7 @@ def test_the_folder_of_locks_outlives_the_service_that_stops(facts: Facts) -> No
 
 def test_a_killed_process_is_started_again(facts: Facts) -> None:
     assert facts["running again after kill"] >= 0
-    assert facts["fresh after kill"] >= 0
+    assert facts["fresh after kill"]
     assert facts["killed"]["NRestarts"] == "1"
 
 
@@ -164,29 +146,12 @@ def test_several_gateways_run_side_by_side(facts: Facts) -> None:
 
 
 def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> None:
-    needed = [
-        *(
-            "CAN socket",
-            "netlink",
-            "abstract socket",
-            "state folder",
-            "runtime folder",
-            "lock folder",
-            "terminal",
-        ),
-        *("ctypes", "other processes", "machine-id"),
-    ]
-    refused = {
-        "internet": "Errno 97",
-        "packet": "Errno 97",
-        "write /etc": "Errno 30",
-        "set kernel": "Errno 30",
-        "write and execute": "Errno 1]",
-        "another device": "Errno 1]",
-        "namespace": "Errno 1]",
-        "priority": "Errno 1]",
-        "another user": "Errno 1]",
-    }
+    needed = {"CAN socket", "netlink", "abstract socket", "state folder", "runtime folder"}
+    needed |= {"lock folder", "terminal", "ctypes", "other processes", "machine-id"}
+    refused = dict.fromkeys(("internet", "packet"), "Errno 97")
+    refused |= dict.fromkeys(("write /etc", "set kernel"), "Errno 30")
+    denied = ("write and execute", "another device", "namespace", "priority", "another user")
+    refused |= dict.fromkeys(denied, "Errno 1]")
     probe = facts["probe"]
     assert set(probe) == {*needed, *refused}
     assert [name for name in needed if probe[name] != "works"] == []
