@@ -1,4 +1,4 @@
-"""The listener on python-can's in-process bus, and on a fake port where an interface disappears."""
+"""The listener on a fake port whose interface disappears; on a real one: tests/vcan."""
 
 import itertools
 
@@ -9,7 +9,7 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime import bus_listener, socketcan_port
+from kontronik_can_gw.runtime import bus_listener
 from kontronik_can_gw.runtime.bus_listener import BusListener
 
 FRAME = CanFrame(0x123, b"\x01\x02")
@@ -19,37 +19,29 @@ class FakePort:
     """A port whose interface can be taken away; nothing may be sent with it: it has no way to."""
 
     opened: list["FakePort"]
-    fault: int
+    gone, state, overruns = False, CanState.UNKNOWN, 0
 
-    def __init__(self, config: CanConfig) -> None:
-        if FakePort.fault:
-            raise socketcan_port.socketcan_error(config, FakePort.fault)
+    def __init__(self, _config: CanConfig) -> None:
         self.inbox: list[CanFrame] = []
-        self.gone = self.closed = False
-        self.state = CanState.UNKNOWN
-        self.overruns = 0
         FakePort.opened.append(self)
 
-    def set_receive_ids(self, ids: frozenset[int]) -> None:
-        self.ids = ids
+    def set_receive_ids(self, ids: frozenset[int]) -> None: ...
 
-    def fileno(self) -> None:
-        return None
+    def fileno(self) -> None: ...
 
     def receive(self, _limit: int) -> list[tuple[CanFrame, int | None]]:
         frames, self.inbox = self.inbox, []
         return [(frame, None) for frame in frames]
 
-    def close(self) -> None:
-        self.closed = True
+    def close(self) -> None: ...
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    FakePort.opened, FakePort.fault = [], 0
+    FakePort.opened = []
     made = Clock()
     monkeypatch.setattr(bus_listener, "open_can", FakePort)
-    monkeypatch.setattr(bus_listener, "fault_of", lambda _name: FakePort.fault)
+    monkeypatch.setattr(bus_listener, "fault_of", lambda _name: 0)
     monkeypatch.setattr(bus_listener, "time", made)
     return made
 
