@@ -52,15 +52,15 @@ def test_it_is_tried_at_most_each_half_second(
     listener = BusListener(CanConfig("pcan", "PCAN_USBBUS1"), frozenset({0x123}))
     looked: list[float] = []
 
-    def refuse(config: CanConfig) -> FakePort:
+    def refuse(_: CanConfig) -> FakePort:
         looked.append(clock.now)
-        raise RunError("CAN pcan PCAN_USBBUS1: cannot be opened: no")
+        raise RunError("cannot be opened")
 
     FakePort.opened[0].gone = True
     monkeypatch.setattr(bus_listener, "open_can", refuse)
     for _ in range(100):
         assert listener.receive(0.05) == []
-    assert listener.problem == "CAN pcan PCAN_USBBUS1: cannot be opened: no"
+    assert listener.problem == "cannot be opened"
     assert 8 <= len(looked) <= 11
     assert all(later - earlier >= 0.5 for earlier, later in itertools.pairwise(looked))
 
@@ -72,7 +72,5 @@ def test_bus_off_is_reported_until_a_frame_comes(clock: Clock) -> None:
     listener.receive(0.6)
     assert "is bus-off" in listener.problem
     port.inbox.append(FRAME)
-    assert listener.receive(0.6) == [FRAME]
-    assert listener.problem == ""
-    listener.receive(0.6)
-    assert listener.problem == ""
+    assert (listener.receive(0.6), listener.problem) == ([FRAME], "")
+    assert (listener.receive(0.6), listener.problem) == ([], "")

@@ -37,24 +37,19 @@ COUNT = """((key, name) => {
 })"""
 
 
-def flown(*names: str) -> Flight:
+def flown(names: list[str]) -> Flight:
     bus = shipped_bus(*names)
     options = [EscOptions(faults=FAULTS), EscOptions()]
     return analysed(analysis_of(bus), simulated(bus, 60, options))
 
 
 @pytest.fixture(scope="module")
-def one() -> Flight:
-    return flown("esc1")
-
-
-@pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory, one: Flight) -> dict[str, Path]:
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     written = {}
-    for name, flight, title in (("one", one, "One"), ("two", flown("left", "right"), EVIL)):
+    for name, escs, title in (("one", ["esc1"], "One"), ("two", ["left", "right"], EVIL)):
         written[name] = folder / f"{name}.html"
-        html = render(flight, source=title, provenance={EVIL: EVIL}, wall_ns=S)
+        html = render(flown(escs), source=title, provenance={EVIL: EVIL}, wall_ns=S)
         written[name].write_text(html, encoding="utf-8")
     return written
 
@@ -91,7 +86,7 @@ def count(browser: Browser, key: str, colour: str) -> int:
 
 @pytest.mark.parametrize(("name", "look"), [("one", "light"), ("two", "dark"), ("two", "phone")])
 def test_every_plot_is_drawn_and_the_page_fits(
-    browser: Browser, pages: dict[str, Path], one: Flight, name: str, look: str
+    browser: Browser, pages: dict[str, Path], name: str, look: str
 ) -> None:
     width, height = (390, 844) if look == "phone" else (1280, 900)
     browser.open(pages[name], width, height, dark=look == "dark", phone=look == "phone")
