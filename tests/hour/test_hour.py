@@ -15,7 +15,7 @@ pytestmark = pytest.mark.extended
 NAMES = (
     *(f"convert to {form}" for form in (*READERS, *LOGS)),
     *(f"convert {form} to csv" for form in LOGS),
-    *("the CAN frames", "convert to bin", "decode the bin", "report", "monitor --once"),
+    *("the CAN frames", "convert to bin"),
 )
 
 
@@ -60,10 +60,9 @@ def test_the_minute_has_everything_in_it(minute: Minute) -> None:
 def test_it_reads_back_equal(name: str, minute: Minute) -> None:
     verdict = minute.steps[name].verdict
     assert verdict.problems == []
-    least = {"report": 5, "monitor --once": 40, "convert to bin": 190_000, "decode the bin": 75_000}
     frames, rows = 2 * len(minute.truth.sent_ns), 90 * len(minute.truth.row_ns)
     is_table = name.startswith("convert") and name.endswith(("csv", "jsonl", "parquet"))
-    assert verdict.values >= least.get(name, rows if is_table else frames)
+    assert verdict.values >= (190_000 if name.endswith("bin") else rows if is_table else frames)
 
 
 def test_nothing_is_left_out(minute: Minute) -> None:
@@ -114,33 +113,22 @@ def _in_log(change: Callable[[str], str]) -> Fault:
     return lambda lines: lines.__setitem__(9000, change(lines[9000]))
 
 
-CHANGED, IN_A_GAP = (
-    _cell(VOLTAGE, lambda text: f"{float(text) + 0.01:.2f}"),
-    _cell(VOLTAGE, lambda _: "24.1", lambda text: not text),
-)
+IN_A_GAP = _cell(VOLTAGE, lambda _: "24.1", lambda text: not text)
 FAULTS: dict[tuple[str, str], Fault] = {
-    ("hour.csv", "value"): CHANGED,
+    ("hour.csv", "value"): _cell(VOLTAGE, lambda text: f"{float(text) + 0.01:.2f}"),
     ("hour.csv", "value in a gap"): IN_A_GAP,
     ("hour.csv", "row"): lambda lines: lines.pop(3000),
     ("hour.csv", "time"): _cell("Time [s]", _later),
     ("hour.csv", "clock"): _cell("Utc", lambda text: text.replace("Z", "5Z")[:20] + "999999Z"),
     ("hour.csv", "text"): _cell("operating_state", lambda _: "StandBy"),
-    ("hour.csv", "value of a JIVEPro"): _cell(
-        "bec_current [A]", lambda _: "0.0", lambda text: not text
-    ),
     ("hour.csv", "column"): _without_last_column,
-    ("hour.csv", "unit"): lambda lines: lines.__setitem__(0, lines[0].replace("[V]", "[mV]", 1)),
     ("hour.jsonl", "value"): _add("pwm_input"),
     ("hour.jsonl", "what only the gateway knows"): _add("uptime"),
-    ("of_log.csv", "value"): CHANGED,
     ("of_log.csv", "value in a gap"): IN_A_GAP,
     ("hour.log", "byte"): _in_log(lambda line: re.sub("#(....).", r"#\g<1>5", line)),
     ("hour.log", "id"): _in_log(lambda line: line.replace(" can0 6", " can0 5")),
     ("hour.log", "time"): _in_log(lambda line: f"({_later(line[1:18])}{line[18:]}"),
     ("hour.log", "missing frame"): lambda lines: lines.pop(9000),
-    ("hour.log", "order"): lambda lines: lines.insert(9000, lines.pop(9001)),
-    ("decoded.jsonl", "last"): lambda lines: lines.pop(),
-    ("decoded.jsonl", "word"): _add("operating_errors"),
 }
 
 
@@ -154,31 +142,7 @@ def test_a_mutilated_file_is_found_out(
     assert lines != before
     bad = tmp_path / f"bad{Path(file).suffix}"
     bad.write_text("\n".join(lines) + "\n")
-    if fault == "unit":
-        with pytest.raises(AssertionError, match=re.escape("battery_voltage [mV]: is in 'V'")):
-            minute.check(file, bad)
-        return
     assert minute.check(file, bad).problems
-
-
-def test_a_mutilated_file_of_libraries_and_of_bytes_is_found_out(
-    minute: Minute, tmp_path: Path
-) -> None:
-    from pyarrow import compute, parquet  # type: ignore[import-untyped]
-
-    found = parquet.read_table(minute.folder / "hour.parquet")
-    place = found.schema.names.index("motor_current [A]")
-    other = compute.add(found.column(place), 0.1)
-    changed = found.set_column(place, found.schema.field(place), other)
-    parquet.write_table(changed, tmp_path / "hour.parquet")
-    data = bytearray((minute.folder / "esc1.bin").read_bytes())
-    data[5000] ^= 1
-    (tmp_path / "esc1.bin").write_bytes(data)
-    last = json.loads((minute.folder / "last.json").read_text())
-    last["escs"][0]["values"]["battery_voltage"] += 0.01
-    (tmp_path / "last.json").write_text(json.dumps(last))
-    for path in tmp_path.iterdir():
-        assert not minute.check(path.name, path).ok, path.name
 
 
 def test_a_value_that_no_esc_meant_is_found_out(minute: Minute, tmp_path: Path) -> None:
@@ -194,10 +158,7 @@ def test_a_value_that_no_esc_meant_is_found_out(minute: Minute, tmp_path: Path) 
     assert problem.startswith("battery_voltage: 1 differ")
 
 
-def test_a_command_that_fails_ends_the_programme_and_nothing_read_is_no_success(
-    tmp_path: Path,
-) -> None:
-    assert not Verdict().ok
+def test_a_command_that_fails_ends_the_programme(tmp_path: Path) -> None:
     words = ["convert", str(tmp_path / "none.kcap"), "OUT"]
     with pytest.raises(RuntimeError, match=r"exit code 1: .*none\.kcap"):
         Step("bad", words, tmp_path / "a.csv", "", lambda _: Verdict()).run()

@@ -34,12 +34,8 @@ class Terminal:
         self.tmux("set", "-g", "status", "off")
 
     def tmux(self, *words: str) -> str:
-        command = ["tmux", "-u", "-S", self._socket, *words]
-        done = subprocess.run(
-            command, capture_output=True, text=True, env=self._environment, timeout=60, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        command, env = ["tmux", "-u", "-S", self._socket, *words], self._environment
+        return subprocess.check_output(command, text=True, env=env, timeout=60)
 
     def lines(self) -> list[str]:
         return [line.rstrip() for line in self.tmux("capture-pane", "-p").split("\n")[:-1]]
@@ -66,9 +62,7 @@ def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> 
     names = [f"esc{number}" for number in range(1, 9)]
     frames = flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)])
     log = write_log(tmp_path / "8.log", frames)
-    escs = [
-        f'[[esc]]\nname = "{name}"\nport = "/dev/tty{name}"\npole_pairs = 7\n' for name in names
-    ]
+    escs = [f'[[esc]]\nname = "{one}"\nport = "/dev/tty{one}"\npole_pairs = 7\n' for one in names]
     toml = written(tmp_path / "8.toml", "[can]\nbitrate = 1000000\n" + "".join(escs))
     words = ["monitor", str(log), "-c", str(toml), *SLOWLY]
     command = shlex.join([sys.executable, "-m", "kontronik_can_gw", *words])

@@ -62,10 +62,8 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
             sent.append(current)
         assert esc.number("battery_current") == pytest.approx(current)
         track = esc.tracks["battery_current"]
-        if sent:
-            assert [track.low, track.high] == pytest.approx([min(sent), max(sent)])
-        else:
-            assert (track.low, track.high) == (None, None)
+        extremes = (pytest.approx(min(sent)), pytest.approx(max(sent))) if sent else (None, None)
+        assert (track.low, track.high) == extremes
     monitor.reset()
     track = esc.tracks["battery_current"]
     assert (track.low, track.high, list(track.history)) == (None, None, [])
@@ -102,10 +100,7 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
     esc = monitor.escs[0]
     assert all(esc.value(source) is None for source in esc.units)
     assert (esc.state, esc.link, esc.device_text, esc.active) == (None, None, "", [])
-    assert (monitor.gateway.text("gateway_state"), monitor.gateway.text("can_state")) == (
-        None,
-        None,
-    )
+    assert {monitor.gateway.text(name) for name in ("gateway_state", "can_state")} == {None}
     assert monitor.silent_ns >= 5 * SECOND_NS
     assert esc.tracks["battery_voltage"].high is not None, "extremes stay"
 
@@ -156,47 +151,33 @@ def test_errors_have_their_meaning_and_come_first() -> None:
 
 
 USERS_DBC = """VERSION ""
-
 NS_ :
-
 BS_:
-
-BU_: Gw Logger
-
+BU_: Gw
 BO_ 2566844672 Main: 8 Gw
- SG_ PackVolt : 0|16@1+ (1,0) [0|65533] "mV" Logger
- SG_ StageTemp : 16|16@1+ (0.1,0) [0|6553.3] "K" Logger
- SG_ ErrorWord : 32|32@1+ (1,0) [0|4294967293] "" Logger
-
+ SG_ PackVolt : 0|16@1+ (1,0) [0|65533] "mV" Gw
+ SG_ StageTemp : 16|16@1+ (0.1,0) [0|6553.3] "K" Gw
+ SG_ ErrorWord : 32|32@1+ (1,0) [0|4294967293] "" Gw
 BO_ 257 Other: 8 Gw
- SG_ Zustand : 0|8@1+ (1,0) [0|253] "" Logger
- SG_ Zellen : 8|8@1+ (1,0) [0|253] "" Logger
-
+ SG_ Zustand : 0|8@1+ (1,0) [0|253] "" Gw
+ SG_ Zellen : 8|8@1+ (1,0) [0|253] "" Gw
 BA_DEF_ BO_  "GenMsgCycleTime" INT 0 65535;
-BA_DEF_DEF_  "GenMsgCycleTime" 0;
-BA_ "GenMsgCycleTime" BO_ 2566844672 20;
-BA_ "GenMsgCycleTime" BO_ 257 100;
+BA_DEF_DEF_  "GenMsgCycleTime" 20;
 """
 
 
-@pytest.fixture
-def users(tmp_path: Path) -> BusLayout:
-    """A DBC with other names, units and a 29-bit id, bound by a configuration."""
+def test_a_users_dbc_with_other_names_and_units_shows_the_same(tmp_path: Path) -> None:
+    """And a 29-bit id."""
     (tmp_path / "car.dbc").write_text(USERS_DBC)
     bind = {
         "PackVolt": "battery_voltage", "StageTemp": "power_stage_temperature", "ErrorWord": "operating_errors",
         "Zustand": "operating_state", "Zellen": "cell_count",
     }  # fmt: skip
-    tables = {
-        "dbc": {"file": str(tmp_path / "car.dbc"), "bind": bind},
-        "esc": [{"port": "/dev/ttyX"}],
-    }
+    dbc = {"file": str(tmp_path / "car.dbc"), "bind": bind}
+    tables = {"dbc": dbc, "esc": [{"port": "/dev/ttyX"}]}
     loaded = assemble(parse(tables, str(tmp_path / "c.toml")))
     assert loaded.database is not None
-    return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
-
-
-def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout) -> None:
+    users = BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
     monitor = Monitor(users)
     (esc,) = monitor.escs
     word = 1 << int(OperatingError.UNDERVOLTAGE) | 1 << 30
@@ -215,7 +196,5 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout)
         ("undervoltage", Severity.ERROR),
         ("bit30", Severity.WARNING),
     ]
-    assert not esc.has("motor_speed")
-    assert esc.number("motor_speed") is None
-    assert esc.link is None
+    assert (esc.has("motor_speed"), esc.number("motor_speed"), esc.link) == (False, None, None)
     assert monitor.document()["units"]["battery_voltage"] == "V"

@@ -3,6 +3,7 @@
 import random
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import can
 
@@ -72,6 +73,13 @@ def read_log(path: Path) -> tuple[list[Item], list[str]]:
             for time_ns, frame, received in log.frames()
         ]
         return items, log.damage
+
+
+def message_of(item: Item) -> can.Message:
+    """The frame as python-can has it."""
+    time_ns, frame, received = item
+    more: dict[str, Any] = {"data": frame.data, "is_fd": frame.fd, "is_rx": received, "channel": 0}
+    return can.Message(time_ns / 1e9, frame.can_id, frame.extended, **more)
 
 
 def read_by_library(path: Path, format_: str) -> list[Item]:

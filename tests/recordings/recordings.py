@@ -1,15 +1,13 @@
 """Recordings to convert: a capture of two ESCs, a CAN log, plain bytes. Made once a session."""
 
-import random
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-import cantools.database
 from capture_bench import Bench, capture_file, made
+from simulated_bus import Timed, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -40,43 +38,11 @@ def dump_bytes(seconds: float = 4, faults: bool = False) -> bytes:
 
 
 @cache
-def shipped_database() -> "cantools.database.can.Database":
-    """The DBC of one ESC, by cantools."""
-    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-    assert isinstance(database, cantools.database.can.Database)
-    return database
+def _flown() -> Timed:
+    return flight(layout_of(["esc1"]), 3)
 
 
-def candump_lines(count: int, seed: int = 1) -> list[tuple[int, int, bytes]]:
-    """Frames of the shipped DBC with values of all kinds, not available and errors too: time in us, id, data."""
-    chance = random.Random(seed)
-    database = shipped_database()
-    now = 1_700_000_000_000_000
-    lines = []
-    for number in range(count):
-        now += chance.choice((10, 250, 9_000, 20_000))
-        message = database.messages[number % len(database.messages)]
-        values: dict[str, int] = {}
-        for signal in message.signals:
-            names = list(signal.choices or {})
-            bits = 1 << signal.length
-            low = -bits // 2 if signal.is_signed else 0
-            if names and len(names) > 2 and chance.random() < 0.9:
-                values[signal.name] = chance.choice(names)
-            else:
-                values[signal.name] = chance.choice(
-                    (low, low + bits - 1, chance.randrange(low, low + bits))
-                )
-        lines.append((now, message.frame_id, message.encode(values, scaling=False, strict=False)))
-    return lines
-
-
-def write_candump(path: Path, lines: list[tuple[int, int, bytes]]) -> Path:
-    """As ``candump -L`` has it."""
-    path.write_text(
-        "".join(
-            f"({us // 10**6}.{us % 10**6:06d}) can0 {i:03X}#{d.hex().upper()}\n"
-            for us, i, d in lines
-        )
-    )
+def candump_log(path: Path, times: int = 1) -> Path:
+    """What an ESC's gateway sends in 3 s, as ``candump -L`` has it; so many ``times`` over."""
+    path.write_text(write_log(path, _flown()).read_text() * times)
     return path

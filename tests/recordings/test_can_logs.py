@@ -11,6 +11,7 @@ from log_files import (
     SUFFIX,
     Item,
     at_wall,
+    message_of,
     opened,
     read_by_library,
     read_log,
@@ -40,18 +41,8 @@ def test_what_python_can_writes_is_read(tmp_path: Path, format_: str) -> None:
     items = at_wall(some_frames(300, fd=format_ in WITH_FD))
     path = tmp_path / f"log{SUFFIX[format_]}"
     with can.Logger(path) as writer:
-        for time_ns, frame, received in items:
-            writer(
-                can.Message(
-                    time_ns / 1e9,
-                    frame.can_id,
-                    frame.extended,
-                    data=frame.data,
-                    is_fd=frame.fd,
-                    is_rx=received,
-                    channel=0,
-                )
-            )
+        for item in items:
+            writer(message_of(item))
     found, damage = read_log(path)
     assert damage == []
     assert [item[1:] for item in found] == [item[1:] for item in items]

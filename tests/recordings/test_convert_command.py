@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from command_line import refused, run
 from log_files import SUFFIX
-from recordings import candump_lines, convert, dump_bytes, write_candump
+from recordings import candump_log, convert, dump_bytes
 
 from kontronik_can_gw.cli.progress import watched
 
@@ -33,16 +33,8 @@ def dump(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def log(tmp_path: Path) -> Path:
-    return write_candump(tmp_path / "bus.log", candump_lines(300))
-
-
-# --- CAN logs and bytes
-
-
-def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path, log: Path) -> None:
-    before = log
+def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path) -> None:
+    before = log = candump_log(tmp_path / "bus.log")
     for number, format_ in enumerate(["blf", "asc", "mf4", "trc", "candump"]):
         out = tmp_path / f"{number}{SUFFIX[format_]}"
         assert convert(before, out, "--to", "mf4-log" if format_ == "mf4" else format_) == 0
@@ -51,38 +43,25 @@ def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path,
     assert plain == log.read_text().splitlines()
 
 
-# --- standard output and talk
-
-
 def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_error(
     dump: Path, tmp_path: Path
 ) -> None:
     done = run("convert", dump, "-", "--to", "csv", "--live-rate", "50")
     assert convert(dump, tmp_path / "out.csv", "--live-rate", "50") == 0
     assert (done.code, done.data) == (0, (tmp_path / "out.csv").read_bytes())
-    assert [line.partition(",")[0] for line in done.out.splitlines()[1:4]] == [
-        "0.000000",
-        "0.020000",
-        "0.040000",
-    ]
+    times = [float(line.partition(",")[0]) for line in done.out.splitlines()[1:4]]
+    assert times == [0, 0.02, 0.04]
     assert "times are assumed: 50 live frames a second" in done.err
 
 
 @pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "candump", "blf", "mf4-log"])
-def test_nothing_to_convert_leaves_nothing(
-    tmp_path: Path, form: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source = tmp_path / "other.log"
-    source.write_text(
-        "(1700000000.000000) can0 123#00\n" if form in ("csv", "jsonl", "parquet") else "\n"
-    )
+def test_nothing_to_convert_leaves_nothing(tmp_path: Path, form: str) -> None:
+    source, is_table = tmp_path / "other.log", form in ("csv", "jsonl", "parquet")
+    source.write_text("(1700000000.000000) can0 123#00\n" if is_table else "\n")
     said = refused(1, "convert", source, tmp_path / "out", "--to", form)
     assert f"{source}: nothing in it can be converted" in said
-    assert "--dbc" in said or form not in ("csv", "jsonl", "parquet")
+    assert "--dbc" in said or not is_table
     assert [path.name for path in tmp_path.iterdir()] == ["other.log"]
-
-
-# --- refusals
 
 
 @pytest.mark.parametrize(
@@ -90,21 +69,12 @@ def test_nothing_to_convert_leaves_nothing(
     [("pyarrow", "parquet", "parquet"), ("asammdf", "mf4-log", "mf4")],
 )
 def test_a_missing_library_is_named_with_its_extra(
-    dump: Path,
-    tmp_path: Path,
-    module: str,
-    form: str,
-    extra: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    dump: Path, tmp_path: Path, module: str, form: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     said = refused(1, "convert", dump, tmp_path / "out", "--to", form)
     assert said.endswith(f"needs {module}: pip install 'kontronik-can-gw[{extra}]'")
     assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
-
-
-# --- when it cannot go on
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "asc", "blf", "mf4-log"])
@@ -114,24 +84,18 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(dump: Path, tmp_path: Path, 
 
     done = program(dump, tmp_path / "out", "--to", form, preexec_fn=small)
     assert done.returncode == 1, done.stderr
-    assert (
-        done.stderr
-        == f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
-    )
+    said = f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
+    assert done.stderr == said
     assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
 
 
 @pytest.mark.parametrize(
     ("form", "number"),
-    [
-        ("csv", signal.SIGINT),
-        ("parquet", signal.SIGTERM),
-        ("blf", signal.SIGINT),
-    ],
+    [("csv", signal.SIGINT), ("parquet", signal.SIGTERM), ("blf", signal.SIGINT)],
 )
 def test_a_signal_leaves_no_half_file(tmp_path: Path, form: str, number: signal.Signals) -> None:
-    source = write_candump(tmp_path / "long.log", candump_lines(10_000))
-    source.write_text(source.read_text() * 15)  # far more than is done before the signal comes
+    # far more than is done before the signal comes
+    source = candump_log(tmp_path / "long.log", 100)
     process = subprocess.Popen(
         [*PROGRAM, source, tmp_path / "out", "--to", form], stderr=subprocess.PIPE, text=True
     )

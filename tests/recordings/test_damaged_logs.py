@@ -9,7 +9,7 @@ from pathlib import Path
 
 import can
 import pytest
-from log_files import SUFFIX, Item, at_wall, read_log, some_frames, write_log
+from log_files import SUFFIX, Item, at_wall, message_of, read_log, some_frames, write_log
 
 from kontronik_can_gw.errors import UserError
 
@@ -35,27 +35,20 @@ def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(
     tmp_path: Path, format_: str
 ) -> None:
     path, items, content = _log(tmp_path, format_, 8)
-    most = 0
-    for cut in range(len(content) - 1, 0, -1):
+    others = content.count(b"\n") - len(items) - (format_ == "asc")
+    for cut in range(len(content)):
         path.write_bytes(content[:cut])
         try:
             found, damage = read_log(path)
         except UserError:  # not even its first line
             continue
         if format_ in TEXT:
+            assert len(found) >= min(content[:cut].count(b"\n") - others, len(items))
             # of a line that is cut a shorter number may be left, which nobody can tell
-            whole = found[:-1] if found and not content[:cut].endswith(b"\n") else found
-            lines = (
-                content[:cut].count(b"\n") - content.count(b"\n") + len(items) + (format_ == "asc")
-            )
-            assert len(whole) >= min(lines, len(items)) - 1
+            found = found if content[:cut].endswith(b"\n") else found[:-1]
         else:
-            whole = found
             assert damage
-        if content[:cut].count(b"\n") > 3 or format_ not in TEXT:  # the header tells the wall clock
-            assert [item[1:] for item in whole] == [item[1:] for item in items[: len(whole)]]
-        most = max(most, len(found))
-    assert most >= len(items) - 1
+        assert [item[1:] for item in found] == [item[1:] for item in items[: len(found)]]
 
 
 @pytest.mark.parametrize("format_", TEXT)
@@ -74,21 +67,14 @@ def test_rubbish_between_lines_costs_no_frame(tmp_path: Path, format_: str, rubb
         assert "damaged line" in damage[0]
 
 
+ENDED = "damaged after 9 frames (an object of 0 bytes)"
+
+
 @pytest.mark.parametrize(
     ("place", "bits", "lost", "told"),
     [
-        (
-            8,
-            struct.pack("<LL", 0, 1),
-            slice(9, 30),
-            "damaged after 9 frames (an object of 0 bytes)",
-        ),
-        (
-            8,
-            struct.pack("<LL", 0, 8),
-            slice(9, 30),
-            "damaged after 9 frames (an object of 0 bytes)",
-        ),
+        (8, struct.pack("<LL", 0, 1), slice(9, 30), ENDED),
+        (8, struct.pack("<LL", 0, 8), slice(9, 30), ENDED),
         (35, b"\x10", slice(9, 10), "1 damaged frame left out"),
         (8, struct.pack("<L", 5000), slice(9, 30), "the last frame is cut off"),
         *(
@@ -109,10 +95,8 @@ def test_of_a_damaged_blf_file_the_frames_before_the_damage_are_read(
     items = at_wall(some_frames(30))
     path = tmp_path / "log.blf"
     with can.BLFWriter(path, compression_level=0) as writer:
-        for time_ns, frame, received in items:
-            message = can.Message(time_ns / 1e9, frame.can_id, frame.extended, data=frame.data)
-            message.is_rx = received
-            writer.on_message_received(message)
+        for item in items:
+            writer.on_message_received(message_of(item))
     content = bytearray(path.read_bytes())
     at = 0
     for _ in range(11):  # the first is the container
@@ -133,15 +117,11 @@ def test_no_damage_raises_anything_else(tmp_path: Path, format_: str) -> None:
     for _ in range(15 if format_ == "mf4" else 200):
         damaged = bytearray(content)
         for _ in range(chance.choice((1, 1, 3, 20))):
-            match chance.randrange(3):
-                case 0:
-                    damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
-                case 1:
-                    at = chance.randrange(len(damaged))
-                    damaged[at:at] = chance.randbytes(chance.randrange(40))
-                case _:
-                    at = chance.randrange(len(damaged))
-                    del damaged[at : at + chance.randrange(40)]
+            at, most = chance.randrange(len(damaged)), chance.randrange(40)
+            flipped = bytes((damaged[at] ^ 1 << chance.randrange(8),))
+            damaged[at : at + chance.choice((1, 0, most))] = chance.choice(
+                (flipped, chance.randbytes(most), b"")
+            )
         path.write_bytes(damaged)
         problem = ""
         try:
@@ -151,25 +131,26 @@ def test_no_damage_raises_anything_else(tmp_path: Path, format_: str) -> None:
         assert "\n" not in problem
 
 
-@pytest.mark.parametrize("format_", ["candump", "blf"])
-def test_a_damaged_time_is_left_out(tmp_path: Path, format_: str) -> None:
+@pytest.mark.parametrize(
+    ("moved", "lost"),
+    [
+        ({0: 400, 10: 900, 11: 950, 20: 1400}, [10, 11, 20]),
+        (dict.fromkeys(range(15, 30), 9999), []),
+    ],
+    ids=["damaged times are left out", "a clock that was set leaves nothing out"],
+)
+def test_a_time_far_away_is_believed_where_the_next_one_agrees(
+    tmp_path: Path, moved: dict[int, int], lost: list[int]
+) -> None:
+    """``moved``: by how many days."""
     items = at_wall(some_frames(30))
-    day = 86_400 * 10**9
-    for number in (0, 10, 11, 20):
-        items[number] = (items[number][0] + (400 + number * 50) * day, *items[number][1:])
-    path = tmp_path / f"log{SUFFIX[format_]}"
-    write_log(path, "candump", items, 0)
-    found, damage = read_log(path)
-    assert [i for i, item in enumerate(items) if item not in found] == [10, 11, 20]
-    assert damage == ["3 frames with an impossible time left out"]
-
-
-def test_a_clock_that_was_set_leaves_nothing_out(tmp_path: Path) -> None:
-    items = at_wall(some_frames(30))
-    items[15:] = [(time_ns + 10**18, *rest) for time_ns, *rest in items[15:]]  # type: ignore[misc]
+    for number, days in moved.items():
+        items[number] = (items[number][0] + days * 86_400 * 10**9, *items[number][1:])
     path = tmp_path / "log.log"
     write_log(path, "candump", items, 0)
-    assert read_log(path) == (items, [])
+    found, damage = read_log(path)
+    assert [number for number, item in enumerate(items) if item not in found] == lost
+    assert damage == ["3 frames with an impossible time left out"] * bool(lost)
 
 
 @pytest.mark.parametrize("size", [15, 0x7FFFFFFF, 0xFFFFFFFF])

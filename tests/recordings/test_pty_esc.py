@@ -1,4 +1,4 @@
-"""The ESC's pseudo terminal: bytes pass unchanged one way, and whatever comes back is noticed."""
+"""The ESC's pseudo terminal: bytes pass unchanged one way, and an echo is noticed (what a gateway sends: tests/cli)."""
 
 import os
 from collections.abc import Iterator
@@ -33,16 +33,6 @@ def test_every_byte_value_passes_unchanged_and_nothing_is_echoed(esc: PtyEsc) ->
     assert read_exactly(esc.path, 256) == ALL_BYTES
     assert esc.check() == 0
     assert esc.received == 0
-
-
-def test_a_transmitting_gateway_is_noticed(esc: PtyEsc) -> None:
-    fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
-    os.write(fd, b"ATSN?\r\n")
-    os.close(fd)
-    assert esc.check() == 7
-    assert esc.check() == 0
-    assert esc.received == 7
-    assert esc.first_received == b"ATSN?\r\n"
 
 
 def test_an_echo_switched_on_by_the_gateway_is_noticed(esc: PtyEsc) -> None:

@@ -11,31 +11,18 @@ import numpy as np
 import pytest
 from command_line import refused, run
 from log_files import SUFFIX
-from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
-from simulated_bus import flight, layout_of
-from simulated_bus import write_log as write_bus_log
+from recordings import candump_log, capture_bytes, convert, dump_bytes
+from simulated_bus import flight, layout_of, write_log
 
 from kontronik_can_gw.desk.recordings.can_logs.log import NAMES
 
 
-def program(
-    command: str, data: bytes | None = None, cwd: Path | None = None
-) -> "subprocess.CompletedProcess[bytes]":
+def program(command: str, cwd: Path) -> "subprocess.CompletedProcess[bytes]":
     """A line of bash; ``gw`` is the program."""
     line = f'gw() {{ "{sys.executable}" -m kontronik_can_gw "$@"; }}; {command}'
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.run(
-        ["bash", "-c", line],
-        input=data,
-        capture_output=True,
-        timeout=60,
-        check=False,
-        cwd=cwd,
-        env=environment,
-    )
-
-
-# --- pipes
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    bash = ["bash", "-c", line]
+    return subprocess.run(bash, capture_output=True, timeout=60, check=False, cwd=cwd, env=env)
 
 
 def _recording(folder: Path, kind: str) -> Path:
@@ -45,7 +32,7 @@ def _recording(folder: Path, kind: str) -> Path:
     elif kind == "bytes":
         path.write_bytes(dump_bytes())
     else:
-        log = write_candump(folder / "a.log", candump_lines(1000))
+        log = candump_log(folder / "a.log")
         assert kind == "log" or convert(log, path, "--to", kind.replace("mf4", "mf4-log")) == 0
     return path
 
@@ -73,10 +60,7 @@ def test_a_pipe_gives_what_the_file_gives(tmp_path: Path, kind: str, way: str) -
     ("command", "said"),
     [
         ("gw convert - o.csv < /dev/null", "standard input: is empty"),
-        (
-            "gw convert /dev/zero o.csv",
-            "/dev/zero: is a terminal or another device. Give a file, or a pipe",
-        ),
+        ("gw convert /dev/zero o.csv", "/dev/zero: is a terminal or another device."),
         ("gw convert - o.csv < /dev/zero", "standard input: is a terminal or another device."),
         ("echo rubbish | gw convert - o.csv", "standard input: is no capture, no CAN log"),
     ],
@@ -92,7 +76,7 @@ def test_a_stream_without_a_recording_is_one_line(tmp_path: Path, command: str, 
 def test_frames_that_the_dbc_does_not_have_are_counted_and_the_remedy_is_said(
     tmp_path: Path,
 ) -> None:
-    log = write_bus_log(tmp_path / "bus.log", flight(layout_of(["a", "b", "c"]), 2))
+    log = write_log(tmp_path / "bus.log", flight(layout_of(["a", "b", "c"]), 2))
     for words in (
         ("convert", log, tmp_path / "o.csv"),
         ("convert", "-q", log, tmp_path / "q.csv"),
@@ -105,21 +89,17 @@ def test_frames_that_the_dbc_does_not_have_are_counted_and_the_remedy_is_said(
     assert "left out" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
 
 
-# --- content before names
-
-
 @pytest.mark.parametrize("format_", sorted(SUFFIX))
-@pytest.mark.parametrize("rubbish", ["random", "text", "zeros"])
+@pytest.mark.parametrize(
+    "rubbish",
+    [random.Random(1).randbytes(50_000), b"hello, this is no log\n" * 3000, bytes(3_000_000)],
+    ids=["random", "text", "zeros"],
+)
 def test_rubbish_with_the_name_of_a_log_is_one_line(
-    tmp_path: Path, format_: str, rubbish: str
+    tmp_path: Path, format_: str, rubbish: bytes
 ) -> None:
-    content = {
-        "random": random.Random(1).randbytes(50_000),
-        "text": b"hello, this is no log\n" * 3000,
-        "zeros": bytes(3_000_000),
-    }[rubbish]
     path = tmp_path / f"x{SUFFIX[format_]}"
-    path.write_bytes(content)
+    path.write_bytes(rubbish)
     said = refused(2, "convert", path, tmp_path / "o.csv")
     assert said == f"{path}: is no {NAMES[format_]}, whatever its name says, and no other recording"
 

@@ -92,9 +92,8 @@ class Browser:
     def _receive(self) -> dict[str, Any]:
         end = time.monotonic() + _TIMEOUT_S
         while b"\0" not in self._buffer:
-            assert select.select([self._in], [], [], max(0.0, end - time.monotonic()))[0], (
-                "the browser does not answer"
-            )
+            left = max(0.0, end - time.monotonic())
+            assert select.select([self._in], [], [], left)[0], "the browser does not answer"
             data = os.read(self._in, 1 << 20)
             assert data, "the browser has gone"
             self._buffer += data
@@ -107,10 +106,7 @@ class Browser:
         params = message.get("params", {})
         match message.get("method"):
             case "Runtime.exceptionThrown":
-                details = params["exceptionDetails"]
-                self.errors.append(
-                    details.get("exception", {}).get("description") or details["text"]
-                )
+                self.errors.append(str(params["exceptionDetails"]))
             case "Log.entryAdded" if params["entry"]["level"] == "error":
                 self.errors.append(params["entry"]["text"])
             case "Runtime.consoleAPICalled" if params["type"] in ("error", "assert"):
@@ -125,18 +121,12 @@ class Browser:
         page: Path,
         width: int = 1280,
         height: int = 900,
-        *,
         dark: bool = False,
         phone: bool = False,
     ) -> None:
         """Show a file in a window of this size, and wait until it is loaded and drawn."""
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=2 if phone else 1,
-            mobile=phone,
-        )
+        size = {"width": width, "height": height, "deviceScaleFactor": 1 + phone, "mobile": phone}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
         self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
@@ -146,16 +136,14 @@ class Browser:
         self.call("Page.navigate", url=page.resolve().as_uri())
         while not self._loaded:
             self._receive()
-        self.run(
-            "new Promise(d => { const f = () => window.flight ? d(0) : requestAnimationFrame(f); f(); })"
-        )
+        while not self.run("'flight' in window"):
+            self.settle()
         self.settle()
 
     def settle(self) -> None:
         """Two frames are drawn."""
-        self.run(
-            "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(0))))"
-        )
+        frame = "await new Promise(requestAnimationFrame);"
+        self.run(f"(async () => {{ {frame} {frame} }})()")
 
     def run(self, script: str) -> Any:
         """The value of an expression (of a promise: what it becomes)."""
@@ -165,15 +153,8 @@ class Browser:
         assert "exceptionDetails" not in found, found["exceptionDetails"].get("exception", found)
         return found["result"].get("value")
 
-    def mouse(self, kind: str, x: float, y: float, *, buttons: int = 0, clicks: int = 1) -> None:
+    def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
         """One event: ``Moved``, ``Pressed`` or ``Released``."""
+        event = {"type": f"mouse{kind}", "x": x, "y": y, "buttons": buttons, "clickCount": 1}
         button = "left" if kind != "Moved" else "none"
-        self.call(
-            "Input.dispatchMouseEvent",
-            type=f"mouse{kind}",
-            x=x,
-            y=y,
-            button=button,
-            buttons=buttons,
-            clickCount=clicks,
-        )
+        self.call("Input.dispatchMouseEvent", **event, button=button)

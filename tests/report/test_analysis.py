@@ -128,23 +128,28 @@ def test_the_voltage_at_rest_and_under_load(
     assert summary.cells == 6
 
 
-def test_errors_begin_and_end_when_they_did(flight: Flight) -> None:
+def test_errors_and_a_swapped_device_are_events_when_they_came(flight: Flight) -> None:
     def of(text: str, esc: int = 0) -> list[Event]:
         return [e for e in flight.events if e.kind == "error" and e.text == text and e.esc == esc]
 
-    start = flight.origin_ns
-    (warning,) = of("power stage hot")
-    assert (warning.begin_ns - start) / S == pytest.approx(18, abs=0.05)
-    assert warning.end_ns is not None
-    assert (warning.end_ns - start) / S == pytest.approx(23, abs=0.05)
-    assert warning.severity == "warning"
-    (error,) = of("battery voltage too low")
-    assert (error.severity, error.end_ns is not None) == ("error", True)
+    for text, severity, *times in (
+        ("power stage hot", "warning", 18, 23),
+        ("battery voltage too low", "error", 20, 20.5),
+    ):
+        (event,) = of(text)
+        assert event.severity == severity
+        found = [((at or 0) - flight.origin_ns) / S for at in (event.begin_ns, event.end_ns)]
+        assert found == pytest.approx(times, abs=0.05)
     # set for ever: it comes again after each loss and with each info frame
     selftest = of("self-test: EEPROM size")
     assert len(selftest) >= 2
     assert selftest[0].note == "until telemetry was lost"
     assert not [e for e in flight.events if e.kind == "error" and e.esc == 1]
+    devices = ["Kosmik 120, firmware 4.17", "Kolibri 120, firmware 4.17"]
+    assert (flight.escs[0].devices, flight.escs[0].layout) == (devices, "V4")
+    (change,) = [event for event in flight.events if event.kind == "device"]
+    assert change.text == "Device changed from {} to {}".format(*devices)
+    assert change.begin_ns == change.end_ns
     assert not [e for e in flight.events if "programming" in e.text]
 
 
@@ -159,12 +164,9 @@ def test_losses_are_gaps_in_lines_and_events(
     assert summary.longest_gap_ns / S == pytest.approx(1.75, abs=0.05)
     assert summary.counted["losses"] == rows[-1][1][column(bus, "losses")] == 3
     assert summary.counted["crc_errors"] > 0
-    line = flight.lines[0, "battery_power"]
+    points = list(zip(flight.times, flight.lines[0, "battery_power"], strict=True))
     for event in lost:
-        assert event.end_ns is not None
-        inside = [
-            v for t, v in zip(flight.times, line, strict=True) if event.begin_ns < t < event.end_ns
-        ]
+        inside = [v for t, v in points if event.begin_ns < t < (event.end_ns or 0)]
         assert None in inside
         assert all(v is None for v in inside[5:-5])
 
@@ -233,22 +235,3 @@ def test_words_of_errors_and_the_state_of_the_link_become_events() -> None:
         (20, 40, "battery voltage too low", "until telemetry was lost"),
         (30, None, "The port of the ESC cannot be used", ""),
     ]
-
-
-def test_a_device_in_its_place_is_an_event() -> None:
-    found, events = EscFlight("esc1", KONTRONIK), trackers.Events()
-    device = trackers.Device(0, found, events)
-    columns: dict[str, list[object]] = {
-        "device": [None, "KOSMIK", "KOSMIK", None, None],
-        "device_raw": [None, 1, 1, None, 63],
-        "variant": [None, 120, 120, None, 9],
-        "firmware_main": [None, 4, 4, None, None],
-        "firmware_sub": [None, 17, 17, None, None],
-        "layout": ["unknown", "V4", "V4", "V4", None],
-    }
-    device.take([0, 10, 20, 30, 40], columns)
-    assert found.devices == ["KOSMIK 120, firmware 4.17", "device 63 9"]
-    assert found.layout == "V4"
-    (change,) = events.in_order()
-    assert (change.begin_ns, change.end_ns) == (40, 40)
-    assert change.text == "Device changed from KOSMIK 120, firmware 4.17 to device 63 9"

@@ -37,24 +37,19 @@ COUNT = """((key, name) => {
 })"""
 
 
-def flown(*names: str) -> Flight:
+def flown(names: list[str]) -> Flight:
     bus = shipped_bus(*names)
     options = [EscOptions(faults=FAULTS), EscOptions()]
     return analysed(analysis_of(bus), simulated(bus, 60, options))
 
 
 @pytest.fixture(scope="module")
-def one() -> Flight:
-    return flown("esc1")
-
-
-@pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory, one: Flight) -> dict[str, Path]:
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     written = {}
-    for name, flight, title in (("one", one, "One"), ("two", flown("left", "right"), EVIL)):
+    for name, escs, title in (("one", ["esc1"], "One"), ("two", ["left", "right"], EVIL)):
         written[name] = folder / f"{name}.html"
-        html = render(flight, source=title, provenance={EVIL: EVIL}, wall_ns=S)
+        html = render(flown(escs), source=title, provenance={EVIL: EVIL}, wall_ns=S)
         written[name].write_text(html, encoding="utf-8")
     return written
 
@@ -76,15 +71,11 @@ def nothing_fails(browser: Browser) -> Iterator[None]:
 
 def centre(browser: Browser, key: str, share: float = 0.5) -> tuple[float, float]:
     """A point in a plot's data area, on the screen."""
-    browser.run(
-        f"document.getElementById('plot-{key}').scrollIntoView({{behavior: 'instant', block: 'center'}})"
-    )
+    over = f"flight.plots.find((p) => p.key === '{key}').u.over"
+    browser.run(f"{over}.scrollIntoView({{behavior: 'instant', block: 'center'}})")
     browser.settle()
-    box: dict[str, float] = browser.run(
-        f"(() => {{ const r = flight.plots.find((p) => p.key === '{key}').u.over.getBoundingClientRect(); "
-        "return {x: r.left, y: r.top, w: r.width, h: r.height}; })()"
-    )
-    return box["x"] + share * box["w"], box["y"] + box["h"] / 2
+    box: dict[str, float] = browser.run(f"{over}.getBoundingClientRect().toJSON()")
+    return box["left"] + share * box["width"], box["top"] + box["height"] / 2
 
 
 def count(browser: Browser, key: str, colour: str) -> int:
@@ -95,7 +86,7 @@ def count(browser: Browser, key: str, colour: str) -> int:
 
 @pytest.mark.parametrize(("name", "look"), [("one", "light"), ("two", "dark"), ("two", "phone")])
 def test_every_plot_is_drawn_and_the_page_fits(
-    browser: Browser, pages: dict[str, Path], one: Flight, name: str, look: str
+    browser: Browser, pages: dict[str, Path], name: str, look: str
 ) -> None:
     width, height = (390, 844) if look == "phone" else (1280, 900)
     browser.open(pages[name], width, height, dark=look == "dark", phone=look == "phone")
@@ -115,20 +106,13 @@ def test_every_plot_is_drawn_and_the_page_fits(
 def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Path]) -> None:
     """Telemetry is lost from 29 to 31 s: what came before and comes after is not the value of the time between."""
     browser.open(pages["one"])
-    for share, is_known in (
-        (28.5 / 60, True),
-        (30.4 / 60, False),
-        (30.9 / 60, False),
-        (40 / 60, True),
-    ):
-        x, y = centre(browser, "battery_voltage", share)
-        browser.mouse("Moved", x, y)
+    cells = "[...document.querySelectorAll('.u-series:not(:first-child) .u-value')]"
+    for seconds, is_known in ((28.5, True), (30.4, False), (30.9, False), (40, True)):
+        browser.mouse("Moved", *centre(browser, "battery_voltage", seconds / 60))
         browser.settle()
-        shown = browser.run(
-            "[...document.querySelectorAll('.u-series:not(:first-child) .u-value')].map((c) => c.textContent)"
-        )
+        shown = browser.run(f"{cells}.map((c) => c.textContent)")
         assert len(shown) >= 10
-        assert all((text != "–") == is_known for text in shown), (share, shown)
+        assert all((text != "–") == is_known for text in shown), (seconds, shown)
 
 
 def test_a_drag_zooms_all_plots_and_a_click_on_an_event_goes_there(

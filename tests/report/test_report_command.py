@@ -12,11 +12,6 @@ from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.esc.telemetry import SECOND as S
 
 
-def report(*words: object) -> tuple[object, str, str]:
-    done = run("report", *words)
-    return done.code, done.out, done.err
-
-
 @pytest.fixture(scope="module")
 def dump(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The UART bytes of 25 s."""
@@ -29,22 +24,22 @@ def dump(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_page_is_made_of_a_file(dump: Path, tmp_path: Path) -> None:
     page = tmp_path / "flight.html"
-    assert report(dump, "-o", page) == (0, "", f"kontronik-can-gw: {page} written\n")
+    assert run("report", dump, "-o", page) == (0, b"", f"kontronik-can-gw: {page} written\n")
     html = page.read_text(encoding="utf-8")
     assert "<title>flight 1.bin</title>" in html
     assert "battery voltage too low" in [event["text"] for event in data_of(html)["events"]]
     assert "assumed: 100 live frames a second" in html
     assert re.search(r"<b>25\.0 s</b>", html)
     again = tmp_path / "again.html"
-    report(dump, "-o", again)
+    run("report", dump, "-o", again)
     assert again.read_bytes() == page.read_bytes()
 
 
 def test_the_page_can_go_to_standard_output_and_be_of_a_part(dump: Path) -> None:
     part = dump.with_name("part <1>")
     part.write_bytes(dump.read_bytes())
-    code, out, talk = report(part, "-o", "-", "--from", 5, "--until", 15)
-    assert (code, talk) == (0, "")
-    assert "<h1>part &lt;1&gt;</h1>" in out
-    assert "0:05.0 to 0:15.0 of the recording" in out
-    assert not [event for event in data_of(out)["events"] if event["kind"] == "error"]
+    done = run("report", part, "-o", "-", "--from", 5, "--until", 15)
+    assert (done.code, done.err) == (0, "")
+    assert "<h1>part &lt;1&gt;</h1>" in done.out
+    assert "0:05.0 to 0:15.0 of the recording" in done.out
+    assert not [event for event in data_of(done.out)["events"] if event["kind"] == "error"]

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
-from kontronik_can_gw.signals.unpacker import Column
-
 TIME = "Time"
 UTC = "Utc"
 _OWN = (TIME, UTC)
@@ -45,20 +43,6 @@ class Field:
     def header(self) -> str:
         """Name with unit: ``battery_voltage [V]``."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
-
-
-def field_of_signal(column: Column) -> Field:
-    """The field of a DBC's signal."""
-    kind = Kind.WHOLE if column.is_whole else Kind.FLOAT
-    if column.texts:
-        kind = Kind.TEXT
-    elif column.is_flag:
-        kind = Kind.FLAG
-    return Field(
-        *(column.name, column.unit, kind, column.message, column.texts, column.source, column.esc),
-        signal=column.name,
-        high=column.high,
-    )
 
 
 def distinct(fields: Sequence[Field]) -> list[Field]:

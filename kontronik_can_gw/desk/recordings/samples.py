@@ -6,12 +6,11 @@ message, within 5 ms goes into the same row.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.columns import Read, reader_of, values_of_fields
-from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
+from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct
 from kontronik_can_gw.desk.recordings.recording import Sample
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES
@@ -109,12 +108,19 @@ def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[Fie
     """A field for each signal of a layout, with the name and in the unit of the value that it is bound to."""
     found = []
     for column in reader.columns:
-        field = field_of_signal(column)
         prefix = "" if column.esc is None or len(escs) == 1 else f"{escs[column.esc].name}."
         unit, slope, shift = _to_value(column)
+        kind, high = Kind.FLOAT, column.high
         if (slope, shift) != (1, 0):
-            field = replace(field, kind=Kind.FLOAT, high=(field.high - shift) / slope)
-        found.append(replace(field, name=prefix + column.source, unit=unit))
+            high = (high - shift) / slope
+        elif column.texts:
+            kind = Kind.TEXT
+        elif column.is_flag:
+            kind = Kind.FLAG
+        elif column.is_whole:
+            kind = Kind.WHOLE
+        what = prefix + column.source, unit, kind, column.message, column.texts, column.source
+        found.append(Field(*what, column.esc, column.name, high))
     return distinct(found)
 
 

@@ -236,15 +236,13 @@ class _Esc:
             ]
 
     def _find_extremes(self, times: Sequence[int], columns: dict[str, Sequence[Any]]) -> None:
-        for source in (MAXIMA.keys() | MINIMA.keys()) & columns.keys():
-            values = columns[source]
-            known = [value for value in values if value is not None]
-            if not known:
-                continue
-            high, low = max(known), min(known)
-            before = self.found.maxima.get(source)
-            if source in MAXIMA and (before is None or high > before.value):
-                self.found.maxima[source] = Extreme(high, times[values.index(high)])
-            before = self.found.minima.get(source)
-            if source in MINIMA and (before is None or low < before.value):
-                self.found.minima[source] = Extreme(low, times[values.index(low)])
+        kinds = (MAXIMA, self.found.maxima, max), (MINIMA, self.found.minima, min)
+        for quantities, found, best in kinds:
+            for source in quantities.keys() & columns.keys():
+                values = columns[source]
+                value = best((v for v in values if v is not None), default=None)
+                before = found.get(source)
+                if value is not None and (
+                    before is None or best(value, before.value) != before.value
+                ):
+                    found[source] = Extreme(value, times[values.index(value)])

@@ -127,11 +127,6 @@ class SimulatedEsc:
         self._noise_step = math.log(faults.noise / (1 + faults.noise)) if faults.noise else 0.0
         self._losses, self._flips = Random(f"losses {seed}"), Random(f"flips {seed}")
 
-    @property
-    def phase(self) -> str:
-        """Name of the phase the profile is in."""
-        return self._model.phase.name
-
     def frames_until(self, now_ns: int) -> list[Sent]:
         """What leaves up to and including ``now_ns`` and was not returned yet, in order."""
         frames: list[Sent] = []

@@ -135,9 +135,8 @@ _LINE = re.compile(
 )
 
 
-def candump_line(line: bytes) -> "re.Match[bytes] | None":
-    """A line of ``candump -L``: ``(1700000000.123456) can0 681#0011223344556677 R``."""
-    return _LINE.fullmatch(line)
+candump_line = _LINE.fullmatch
+"""Matches a line of ``candump -L``: ``(1700000000.123456) can0 681#0011223344556677 R``."""
 
 
 class CandumpReader(TextReader):
@@ -167,17 +166,11 @@ _DIRECTIONS = (b"rx", b"tx", b"txrq")
 _HEADS = (b"date", b"base", b"begin", b"end", b"no", b"internal", b"previous")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
-_ASC_HEAD = re.compile(
-    rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)", re.IGNORECASE
-)
-_ASC_LINE = re.compile(
-    rb"\s*\d+\.\d+\s+(?:CANFD\s+\d+\s+(?:Rx|Tx)|\d+\s+\w+\s+(?:Rx|Tx))", re.IGNORECASE
-)
-
-
-def asc_line(line: bytes) -> "re.Match[bytes] | None":
-    """What a line of the head begins with, or one of a frame."""
-    return _ASC_HEAD.match(line) or _ASC_LINE.match(line)
+_ASC_HEAD = rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)"
+_ASC_FRAME = rb"\s*\d+\.\d+\s+(?:CANFD\s+\d+\s+(?:Rx|Tx)|\d+\s+\w+\s+(?:Rx|Tx))"
+_asc_frame = re.compile(_ASC_FRAME, re.IGNORECASE).match
+asc_line = re.compile(_ASC_HEAD + b"|" + _ASC_FRAME, re.IGNORECASE).match
+"""Matches what a line of the head begins with, or one of a frame."""
 
 
 class AscReader(TextReader):
@@ -195,7 +188,7 @@ class AscReader(TextReader):
                 started = asc_time(head[2 if head[0] == "date" else 3 :])
                 if started is not None and started >= OLDEST_WALL_S * SECOND_NS:
                     self.wall_start_ns = started
-            elif _ASC_LINE.match(line):
+            elif _asc_frame(line):
                 break
 
     def _frame(self, line: bytes) -> TimedFrame | None:
@@ -247,18 +240,11 @@ def asc_time(words: list[str]) -> int | None:
 
 # --- PEAK TRC
 
-_TRC_HEAD = re.compile(
-    rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE
-)
-
-
+_TRC_HEAD = rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})"
+trc_line = re.compile(_TRC_HEAD, re.IGNORECASE).match
+"""Matches a line of the head."""
 _NEWER_TRC = re.compile(r"\$FILEVERSION=(?!1\.0\s)")
 """python-can reads a file without a version as 1.0, and does not know that some say so."""
-
-
-def trc_line(line: bytes) -> "re.Match[bytes] | None":
-    """A line of the head."""
-    return _TRC_HEAD.match(line)
 
 
 class TrcReader(TextReader):

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from datetime import UTC as UTC_ZONE
 from datetime import datetime
-from functools import cached_property
+from functools import cached_property, partial
 from typing import IO, TYPE_CHECKING
 
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Kind, Table
@@ -41,10 +41,6 @@ def csv_text(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
 
 
-def json_text(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
-
-
 class TextTable:
     """A row each line: ``start``, the time, ``utc`` and the Unix time, each cell after its prefix, ``end``. ``nothing``: not available.
 
@@ -53,8 +49,9 @@ class TextTable:
 
     def __init__(self, file: IO[bytes], table: Table, is_json: bool) -> None:
         self._file, self._table = file, table
-        self._text: Callable[[str], str] = json_text if is_json else csv_text
+        self._text: Callable[[str], str] = csv_text
         if is_json:
+            self._text = partial(json.dumps, ensure_ascii=False)
             self._start, self._utc, self._utc_end = f'{{"{TIME}": ', f', "{UTC}": "', '"'
             self._end, self._nothing = "}\n", "null"
             self._prefixes = [f", {json.dumps(one.name)}: " for one in table.fields]
