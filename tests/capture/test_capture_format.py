@@ -3,7 +3,9 @@
 import random
 import struct
 import zlib
+from collections.abc import Callable
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,8 +19,10 @@ from kontronik_can_gw.capture.format import (
     block,
     data_payload,
     frame_data,
+    read_counters,
     read_entries,
     read_frame,
+    read_number,
 )
 from kontronik_can_gw.frames import CanFrame
 
@@ -120,3 +124,9 @@ def test_a_block_that_claims_to_be_huge_is_none() -> None:
 )
 def test_a_can_frame_comes_back(frame: CanFrame) -> None:
     assert read_frame(frame_data(frame)) == frame
+
+
+@pytest.mark.parametrize("read", [read_frame, read_number, read_counters])
+def test_data_that_is_too_short_is_refused(read: Callable[[bytes], object]) -> None:
+    with pytest.raises(ValueError):
+        read(b"abc")

@@ -7,7 +7,6 @@ import os
 import select
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from typing import cast
 
 import native_world
 import pytest
@@ -31,7 +30,7 @@ from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Received
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.poller import Handler, Poller, PortInput
+from kontronik_can_gw.runtime.poller import Handler, Poller
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
@@ -234,21 +233,16 @@ class World:
         self.handlers: dict[int, Handler] = {}
         self._events: dict[int, int] = {}
         self.late = 0
-        self.poller = cast("Poller", FakePoller(self))
+        self.poller = FakePoller(self)
 
     def clock(self) -> int:
         return self.now
 
-    def register(
-        self, fd: int, handler: Handler, events: int = select.POLLIN, esc: int | None = None
-    ) -> None:
+    def register(self, fd: int, handler: Handler, events: int) -> None:
         self.handlers[fd], self._events[fd] = handler, events
 
     def unregister(self, fd: int) -> None:
         del self.handlers[fd]
-
-    def close(self) -> None:
-        pass
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         pause = max(0, due - self.now)
@@ -286,33 +280,25 @@ class World:
         return select.POLLIN * len(found)
 
 
-class FakePoller:
+class FakePoller(Poller):
     """The World as the loop's poller: it has a clock of the same name."""
 
-    is_native = False
-
     def __init__(self, world: World) -> None:
+        super().__init__(world.clock)
         self._world = world
-        self.register, self.unregister = world.register, world.unregister
-        self.wait, self.close = world.wait, world.close
 
-    def noted(self, _esc: int) -> PortInput:
-        return PortInput()
+    def register(
+        self, fd: int, handler: Handler, events: int = select.POLLIN, esc: int | None = None
+    ) -> None:
+        self._world.register(fd, handler, events)
 
-    def begin(self) -> None:
-        pass
+    def unregister(self, fd: int) -> None:
+        self._world.unregister(fd)
 
-    @property
-    def now(self) -> int:
-        return self._world.looked
-
-    @property
-    def before(self) -> int:
-        return self._world.before
-
-    @property
-    def late(self) -> int:
-        return self._world.late
+    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+        ready = self._world.wait(last, due)
+        self.before, self.now, self.late = self._world.before, self._world.looked, self._world.late
+        return ready
 
 
 def loop_in(
