@@ -47,7 +47,7 @@ def test_every_frame_is_on_the_bus_as_it_was_sent_and_the_last_word_is_that_it_e
             link = f"Esc{index + 1}Link"
             wait_for(lambda i=index, d=identity.device: run.watch.info_device(i) == d, "the device")  # type: ignore[misc]
             wait_for(
-                lambda name=link: run.signal(name, "link_state") in LINK_THERE,  # type: ignore[misc]
+                lambda name=link: run.watch.value(name, "link_state") in LINK_THERE,  # type: ignore[misc]
                 "the link is there",
             )
         newest = [len(fed.sent) - 1 for fed in run.escs]
@@ -58,7 +58,7 @@ def test_every_frame_is_on_the_bus_as_it_was_sent_and_the_last_word_is_that_it_e
         )
         assert gateway.end(number) == 0, gateway.log
         run.watch.wait_for_mark()
-        assert run.signal("GatewayStatus", "gateway_state") == STOPPING
+        assert run.watch.value("GatewayStatus", "gateway_state") == STOPPING
 
 
 NOT_AVAILABLE = bytes.fromhex("ffffffffff80ff")
@@ -70,7 +70,7 @@ def test_loss_and_return_of_telemetry_are_on_the_bus(vcan: str, tmp_path: Path) 
         for times in (1, 2):
             run.feed(times=5)
             count = len(run.watch.of(0x680))
-            wait_for(lambda: run.signal("Esc1Link", "link_state") == LINK_LOST, "it is lost")
+            wait_for(lambda: run.watch.value("Esc1Link", "link_state") == LINK_LOST, "it is lost")
             wait_for(
                 lambda count=count: (  # type: ignore[misc]
                     [f.data[3] for f in run.watch.of(0x680)[count:]].count(0xFF) >= 3
@@ -84,7 +84,9 @@ def test_loss_and_return_of_telemetry_are_on_the_bus(vcan: str, tmp_path: Path) 
                 "the log says so",
             )
         run.feed()
-        wait_for(lambda: run.signal("Esc1Link", "link_state") in LINK_THERE, "it is there again")
+        wait_for(
+            lambda: run.watch.value("Esc1Link", "link_state") in LINK_THERE, "it is there again"
+        )
 
 
 CAR = Path(__file__).resolve().parents[1] / "golden" / "inputs" / "my_car.dbc"

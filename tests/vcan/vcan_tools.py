@@ -159,16 +159,9 @@ class Chain:
     """ESCs that say what is expected of them, the gateway, and a judge of each value on the bus."""
 
     def __init__(
-        self,
-        interface: str,
-        folder: Path,
-        identities: Sequence[Identity],
-        toml: str,
-        esc: str,
+        self, interface: str, folder: Path, identities: Sequence[Identity], toml: str, esc: str
     ) -> None:
-        self.escs = [
-            PtyPort(folder / f"port{i + 1}", identity) for i, identity in enumerate(identities)
-        ]
+        self.escs = [PtyPort(folder / f"port{n}", each) for n, each in enumerate(identities)]
         for fed in self.escs:
             fed.info_every = 10
         self.config = folder / "gateway.toml"
@@ -211,10 +204,6 @@ class Chain:
                 return seen or self.held_up > held_up
 
             wait_for(shown, f"frames {numbers} on the bus")
-
-    def signal(self, message: str, signal: str) -> int | None:
-        """The newest raw value of a signal of the gateway's own messages."""
-        return self.watch.value(message, signal)
 
     def check(self) -> None:
         """No value was wrong, and nothing was sent to an ESC."""
