@@ -1,6 +1,6 @@
 """A DBC as people write it: compiled, refused, and what its messages hold."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -11,7 +11,7 @@ from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
@@ -21,23 +21,17 @@ NOW = 50 * MS
 FILE = "my_car.dbc"
 
 
-def compiled(
-    text: str,
-    names: Sequence[str] = ("esc1",),
-    fd: bool = True,
-    taken: Mapping[int, str] | None = None,
-    **settings: Any,
-) -> Layout:
+def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> Layout:
     """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcSettings."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
-    return prepare(database, FILE, escs, DbcSettings(**settings), fd, taken)
+    return prepare(database, FILE, escs, DbcSettings(**settings), fd_allowed=True)
 
 
-def refused(text: str, *arguments: Any, **more: Any) -> list[str]:
+def refused(text: str, **settings: Any) -> list[str]:
     """What ``compiled`` refuses these with: plain lines, each with its place."""
     with pytest.raises(UserError) as caught:
-        compiled(text, *arguments, **more)
+        compiled(text, **settings)
     assert caught.value.exit_code == 2
     lines = list(caught.value.problems)
     assert lines
@@ -47,18 +41,16 @@ def refused(text: str, *arguments: Any, **more: Any) -> list[str]:
     return lines
 
 
-def gateway_with(layout: Layout, *lives: LiveData | None, info: InfoData | None = None) -> Gateway:
-    """A gateway whose ESCs, called esc1 and so on, have just sent this."""
-    lives = lives or (None,)
-    gateway = Gateway([EscSettings(f"esc{n}", 7) for n in range(1, len(lives) + 1)], layout, 0)
+def gateway_with(layout: Layout, *lives: LiveData) -> Gateway:
+    """A gateway whose ESCs, called esc1 and so on, have just sent this; without: one that is not heard."""
+    names = [f"esc{number}" for number in range(1, max(1, len(lives)) + 1)]
+    gateway = Gateway([EscSettings(name, 7) for name in names], layout, 0)
     for esc, live in enumerate(lives):
-        for data in (info, live):
-            if data is not None:
-                gateway.receive_bytes(esc, encode(data, WireLayout.V4), NOW, NOW)
+        gateway.receive_bytes(esc, encode(live, WireLayout.V4), NOW, NOW)
     return gateway
 
 
-def packed(plan: MessagePlan, gateway: Gateway, alive: int = 0, page: int | None = None) -> bytes:
+def packed(plan: MessagePlan, gateway: Gateway, page: int | None = None) -> bytes:
     """What a message holds now."""
-    bits = compile_pack(plan)(gateway.escs, gateway.status, NOW, alive, plan.pages.index(page))
+    bits = compile_pack(plan)(gateway.escs, gateway.status, NOW, 0, plan.pages.index(page))
     return bits.to_bytes(plan.length, "little")

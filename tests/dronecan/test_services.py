@@ -1,5 +1,7 @@
 """What a node of ours answers: asked by the package ``dronecan``, by too many, and by what is no request."""
 
+from typing import Any
+
 import pytest
 from dronecan_bench import Bench, Peer, dronecan, loaded, peers_frames
 
@@ -25,50 +27,44 @@ def test_node_info_says_who_it_is() -> None:
     assert bytes(again.hardware_version.unique_id.to_bytes()) == ids[0]
 
 
-def value(answer: object) -> object:
-    """What a GetSet response holds; None for an empty one."""
-    kind = dronecan.get_active_union_field(answer.value)  # type: ignore[attr-defined]
-    if kind == "empty":
+def held(peer: Peer, name: str = "", index: int = 0, **given: Any) -> object:
+    """What a parameter is after a GetSet request, with its name where it was asked for by index; None for none."""
+    request = GetSet.Request(index=index)
+    request.name.from_bytes(name.encode())
+    for field, value in given.items():
+        setattr(request.value, field, value)
+    answer = peer.ask(request, 42)
+    found = bytes(answer.name.to_bytes()).decode()
+    kind = dronecan.get_active_union_field(answer.value)
+    assert (kind == "empty") == (not found)
+    if not found:
         return None
-    found = getattr(answer.value, kind)  # type: ignore[attr-defined]
-    return bytes(found.to_bytes()).decode() if kind == "string_value" else found
+    value = getattr(answer.value, kind)
+    value = bytes(value.to_bytes()).decode() if kind == "string_value" else value
+    return value if name else (found, value)
 
 
 def test_parameters_are_listed_and_read_by_name() -> None:
-    bench = Bench(2, first_index=4, rpm="output").run(0.1)
-    peer = Peer(bench)
-    listed = []
-    for index in range(100):
-        answer = peer.ask(GetSet.Request(index=index), 42)
-        if not len(answer.name):
-            assert value(answer) is None
-            break
-        listed.append((bytes(answer.name.to_bytes()).decode(), value(answer)))
+    peer = Peer(Bench(2, first_index=4, rpm="output").run(0.1))
     expected = [("rate_hz", 50), ("extended_hz", 0), ("rpm", "output")]
     for number in (0, 1):
         expected += [(f"e{number}.esc_index", 4 + number), (f"e{number}.pole_pairs", 7)]
         expected += [(f"e{number}.gear", pytest.approx(10))]
-    assert listed == expected
-    for name, held in listed:
-        request = GetSet.Request(index=77)
-        request.name.from_bytes(name.encode())
-        assert value(peer.ask(request, 42)) == held
-    request = GetSet.Request()
-    request.name.from_bytes(b"xyzzy")
-    assert not len(peer.ask(request, 42).name)
+    listed = [held(peer, index=index) for index in range(len(expected) + 2)]
+    assert listed == [*expected, None, None]
+    assert all(held(peer, name, index=77) == value for name, value in expected)
+    assert held(peer, "xyzzy") is None
 
 
 def test_what_somebody_sets_stays_as_it_is() -> None:
     bench = Bench(rate_hz=25).run(0.1)
     peer = Peer(bench)
     for field, given in (("integer_value", 1), ("real_value", 2.5), ("boolean_value", 1)):
-        request = GetSet.Request(index=0)
-        setattr(request.value, field, given)
-        assert value(peer.ask(request, 42)) == 25
-    request = GetSet.Request()
+        assert held(peer, "", 0, **{field: given}) == ("rate_hz", 25)
+    request = GetSet.Request(index=2)
     request.value.string_value.from_bytes(b"electrical")
-    request.name.from_bytes(b"rpm")
-    assert value(peer.ask(request, 42)) == "motor"
+    peer.ask(request, 42)
+    assert held(peer, "rpm") == "motor"
     bench.clear()
     assert len(bench.run(1).of("Status")) == 25
 
