@@ -111,27 +111,19 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     table, blocks = rows_of(recording, choice)
     if table is None:
         return None
+    count, last_ns = 0, 0
     writer = _table_writer(out.open(), form, table)
-    count, last = _written(out, writer, blocks, writer.write)
-    lasted = (last.times[-1] - table.origin_ns) / 1e9
-    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {lasted:.3f} s"
-
-
-def _written(
-    out: Output, writer: Any, blocks: Iterable[Any], write: Callable[[Any], object]
-) -> tuple[int, Any]:
-    """Write all blocks, of which there is one at least, and the end; how many items they had, and the last of them."""
-    count, block = 0, None
     try:
         for block in out.watch(blocks):
-            write(block)
+            writer.write(block)
             count += len(block)
+            last_ns = block.times[-1] - table.origin_ns
         writer.close()
     except BaseException:
         writer.discard()
         raise
     out.is_whole = True
-    return count, block
+    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {last_ns / 1e9:.3f} s"
 
 
 def _table_writer(file: IO[bytes], form: str, table: "Table") -> "ParquetTable | TextTable":
@@ -168,8 +160,17 @@ def to_log(
     writer = CanLogWriter(
         out.open(), form, wall_ns, begins, channel, out.name, recording.provenance
     )
-    count, last = _written(out, writer, batches, lambda frames: writer.write_all(frames, origin_ns))
-    last_ns = _time_at(last, -1)
+    count = 0
+    try:
+        for frames in out.watch(batches):
+            writer.write_all(frames, origin_ns)
+            count += len(frames)
+            last_ns = _time_at(frames, -1)
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
+    out.is_whole = True
     lasted = last_ns - origin_ns
     frames_written = _many(count - sum(writer.left_out.values()), "CAN frame")
     summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
