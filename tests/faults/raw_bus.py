@@ -68,11 +68,7 @@ class RawBus:
         self, node: int, index: int, sub: int, value: int, size: int, seconds: float = 2
     ) -> int | None:
         """SDO download of a number: 0, the abort code, or None without an answer."""
-        request = (
-            bytes([0x23 | (4 - size) << 2])
-            + struct.pack("<HB", index, sub)
-            + value.to_bytes(4, "little")
-        )
+        request = struct.pack("<BHBI", 0x23 | (4 - size) << 2, index, sub, value)
         answer = self._ask(node, request, seconds)
         if answer is None:
             return None
@@ -80,7 +76,7 @@ class RawBus:
 
     def read(self, node: int, index: int, sub: int, seconds: float = 2) -> int | None:
         """SDO upload of a number of at most four bytes; None without an answer or with an abort."""
-        answer = self._ask(node, b"\x40" + struct.pack("<HB", index, sub) + bytes(4), seconds)
+        answer = self._ask(node, struct.pack("<BHB4x", 0x40, index, sub), seconds)
         if answer is None or answer[0] >> 5 != 2:
             return None
         size = 4 - (answer[0] >> 2 & 3) if answer[0] & 1 else 4

@@ -43,10 +43,8 @@ class Adapter:
 
     def up(self, bitrate: int) -> None:
         """Set the bit rate and bring the interface up."""
-        subprocess.run(
-            ["ip", "link", "set", self.name, "type", "can", "bitrate", str(bitrate)], check=True
-        )
-        subprocess.run(["ip", "link", "set", self.name, "up"], check=True)
+        command = f"ip link set {self.name} up type can bitrate {bitrate}"
+        subprocess.run(command.split(), check=True)
 
     def down(self) -> None:
         subprocess.run(["ip", "link", "set", self.name, "down"], check=True)
@@ -112,12 +110,8 @@ class Bus:
     def carry(self, source: Adapter, frame: bytes) -> None:
         acknowledged = False
         for adapter in self.adapters:
-            if (
-                adapter is not source
-                and adapter.is_open
-                and adapter.rate == source.rate
-                and not adapter.silent
-            ):
+            hears = adapter.is_open and adapter.rate == source.rate and not adapter.silent
+            if hears and adapter is not source:
                 acknowledged = True
                 if not adapter.stalled:
                     adapter.tell(frame.decode())

@@ -29,11 +29,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     Faults,
     Phase,
 )
-from kontronik_can_gw.esc.kontronik.states import (
-    OperatingError,
-    OperatingState,
-    SelfTestError,
-)
+from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 TOPICS = Topics("fleet", "boat")
@@ -179,12 +175,8 @@ def test_an_error_is_reported_at_once_however_slow_the_rate() -> None:
 
 
 def test_a_new_kind_of_state_and_a_lost_link_are_reported_at_once_and_a_new_speed_is_not() -> None:
-    options = EscOptions(
-        profile=(
-            Phase("off", 2, 0, OperatingState.MotorOff, 0),
-            Phase("go", 90, 60, OperatingState.Forward, 5),
-        )
-    )
+    start = Phase("off", 2, 0, OperatingState.MotorOff, 0)
+    options = EscOptions(profile=(start, Phase("go", 90, 60, OperatingState.Forward, 5)))
     frames = flight(layout_of(["esc1"]), 8, [options], until=6)
     published = run(publisher("esc1", rate=0.01), frames, 8)
     kinds = changes(published, "motor")
@@ -193,10 +185,8 @@ def test_a_new_kind_of_state_and_a_lost_link_are_reported_at_once_and_a_new_spee
     lost = next(now for now, found in states(published) if found["link_state"] == "Lost")
     assert lost - 6 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway itself waits for the time-out
     assert len(states(published)) <= 8
-    available = [
-        (now, m.payload) for now, m in published if m.topic == TOPICS.of("esc1", "available")
-    ]
-    assert [payload for _, payload in available] == [b"online", b"offline"]
+    topic = TOPICS.of("esc1", "available")
+    assert [m.payload for _, m in published if m.topic == topic] == [b"online", b"offline"]
 
 
 def test_what_comes_and_goes_is_bounded() -> None:

@@ -9,6 +9,7 @@ import re
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from command_line import run
 from report_browser import MISSING, PROGRAM, Browser
@@ -18,13 +19,8 @@ from simulated_bus import FLYING, flight, layout_of, write_log
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import screen
 from kontronik_can_gw.desk.sources import Source
-from kontronik_can_gw.esc.kontronik.simulator import (
-    SECOND_NS,
-    ErrorWindow,
-    EscOptions,
-    Faults,
-    OperatingError,
-)
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults
+from kontronik_can_gw.esc.kontronik.states import OperatingError
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 SIZES = ((80, 24), (120, 40))
@@ -53,21 +49,15 @@ def monitors(folder: Path) -> None:
             monitor.take(frame, now)
             monitor.advance(now)
         for size in SIZES:
-            console = Console(
-                record=True,
-                file=io.StringIO(),
-                width=size[0],
-                force_terminal=True,
-                color_system="truecolor",
-            )
+            how: Any = {"force_terminal": True, "color_system": "truecolor", "record": True}
+            console = Console(file=io.StringIO(), width=size[0], **how)
             for line in screen(monitor, source, size, 0):
                 console.print(line, no_wrap=True)
             picture = console.export_svg(title="kontronik-can-gw monitor", unique_id="m")
             # letters of the reader's own machine, not from a server
             picture = re.sub(r"@font-face \{.*?\}\s*", "", picture, flags=re.DOTALL)
-            picture = picture.replace(
-                "font-family: Fira Code", "font-family: Fira Code, DejaVu Sans Mono"
-            )
+            font = "font-family: Fira Code"
+            picture = picture.replace(font, f"{font}, DejaVu Sans Mono")
             (folder / f"monitor_{count}_{size[0]}.svg").write_text(picture, encoding="utf-8")
 
 

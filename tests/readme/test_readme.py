@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cantools.database
 import pytest
-from pictures import SHOWN, main
+from pictures import SHOWN, VIEWS, main
 from reference import FOLDER, pages
 from report_browser import MISSING, PROGRAM
 from shell_blocks import PAGES as BY_HAND
@@ -150,4 +150,5 @@ def test_pictures_can_be_made_anew(tmp_path: Path) -> None:
     if PROGRAM is None:
         pytest.skip(MISSING)
     main(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} >= set(SHOWN)
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made > set(SHOWN) and len(made) == 4 + len(VIEWS)

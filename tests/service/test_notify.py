@@ -163,11 +163,10 @@ def record(level: int, text: str) -> logging.LogRecord:
 def test_standard_error_is_the_journal_only_where_its_inode_is_named(tmp_path: Path) -> None:
     with (tmp_path / "log").open("w") as stream:
         status = os.fstat(stream.fileno())
-        assert is_journal(stream, {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"})
-        assert not is_journal(stream, {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino + 1}"})
-        assert not is_journal(stream, {"JOURNAL_STREAM": "rubbish"})
-        assert not is_journal(stream, {})
-    assert not is_journal(stream, {"JOURNAL_STREAM": "1:2"})
+        named = f"{status.st_dev}:{status.st_ino}"
+        for value, is_so in ((named, True), (f"{named}1", False), ("rubbish", False), ("", False)):
+            assert is_journal(stream, {"JOURNAL_STREAM": value}) == is_so
+    assert not is_journal(stream, {"JOURNAL_STREAM": named}), "a closed one"
 
 
 def test_each_line_carries_its_priority(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -64,9 +64,6 @@ def wants(root: Path) -> Path:
     return root / UNITS / "multi-user.target.wants"
 
 
-# --- install and uninstall below a folder
-
-
 def test_a_staged_install_writes_files_that_all_may_read(root: Path) -> None:
     done = install(root)
     assert done.code == 0
@@ -158,9 +155,6 @@ def test_a_link_that_leads_out_of_the_root_is_not_followed(root: Path, tmp_path:
     assert (done.code, done.err.count("\n")) == (1, 1)
     assert "leads out of" in done.err
     assert tree(tmp_path / "elsewhere") == []
-
-
-# --- wrong uses
 
 
 @pytest.mark.parametrize(
