@@ -65,6 +65,8 @@ class Row:
     """Values not sent because the machine as a whole stood still; no loss of the gateway's."""
     transmitted: int = 0
     """Bytes that the gateway sent to an ESC."""
+    ended: bool = False
+    """The gateway's process ended by itself, which no lack of processor time excuses."""
     taken: float = 0.0
     """The largest share of processor time that was taken from the virtual machine, over one second, while the fault ran."""
     notes: list[str] = field(default_factory=list)
@@ -73,11 +75,11 @@ class Row:
 
     @property
     def state(self) -> str:
-        """Lateness and loss are not judged on a machine that could not run; a wrong value or a byte to an ESC fails anywhere."""
+        """Lateness and loss are not judged on a machine that could not run; a wrong value, a byte to an ESC or an end fails anywhere."""
         healed = self.injected > 0 and self.recovered == self.injected
         if healed and not (self.wrong or self.lost or self.transmitted):
             return GOOD
-        only_late = self.wrong == self.old and not self.transmitted
+        only_late = self.wrong == self.old and not self.transmitted and not self.ended
         return NOT_JUDGED if self.taken > MAX_TAKEN and only_late else FAILED
 
     @property

@@ -48,6 +48,10 @@ class NotRecovered(AssertionError):
     """The gateway did not come back in time."""
 
 
+class Ended(NotRecovered):
+    """The gateway's process is no more."""
+
+
 class LoggedProcess:
     """A program as its own process, and the lines that it has written so far: ``lines`` to standard error, ``out`` to standard output."""
 
@@ -322,7 +326,8 @@ class Bench:
 
     def check_alive(self) -> None:
         code = self._gateway and self._gateway.process.poll()
-        self.expect(code is None, f"the gateway ended with {code}")
+        if code is not None:
+            raise Ended(f"the gateway ended with {code}; {self.last_words()}")
         for failure in (self.feeder.error, self.watch.failure):
             if failure is not None:
                 raise failure

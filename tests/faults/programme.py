@@ -32,7 +32,7 @@ import serial_faults  # noqa: F401
 import traffic_faults  # noqa: F401
 from bus_watch import SECOND
 from fault_report import FAILED, NOT_JUDGED, PAGE, Fault, Report, in_order, put
-from harness import Bench, growth
+from harness import Bench, Ended, growth
 from taken import Load, worst_share
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -143,6 +143,7 @@ def run_one(bench: Bench, fault: Fault, rounds: Sequence[object], report: Report
             bench.inject(fault, row, each)
         good = True
     except AssertionError as error:
+        row.ended |= isinstance(error, Ended)
         if not row.notes:
             row.notes.append(str(error))
     except Exception as error:

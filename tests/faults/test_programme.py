@@ -4,12 +4,14 @@ import itertools
 import os
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-from fault_report import FAILED, GOOD, NOT_JUDGED, Report, Row
-from programme import conclude
+from fault_report import FAILED, GOOD, NOT_JUDGED, Report, Row, in_order
+from harness import Bench
+from programme import conclude, run_one
 from qemu_adapter import SerialAdapter
 from taken import Load, Sample, worst_share
 
@@ -33,6 +35,7 @@ def row(name: str = "x", taken: float = 0.0, **counts: Any) -> Row:
         (0.5, {"wrong": 2, "old": 2}, NOT_JUDGED),
         (0.5, {"lost": 1, "wrong": 1}, FAILED),
         (0.5, {"transmitted": 1}, FAILED),
+        (0.5, {"recovered": 2, "ended": True}, FAILED),
         (0.0, {"injected": 0, "recovered": 0}, FAILED),
     ],
 )
@@ -105,3 +108,29 @@ def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gate
     set_line(312, 0x0008)  # by another program
     adapter.take(b"B")
     assert adapter.received == 2
+
+
+@pytest.mark.parametrize(("ends", "state"), [(True, FAILED), (False, NOT_JUDGED)])
+def test_a_gateway_that_ended_fails_whatever_was_taken(ends: bool, state: str) -> None:
+    class OfOneProcess(Bench):
+        def __init__(self, process: "subprocess.Popen[bytes]") -> None:
+            self._gateway: Any = SimpleNamespace(process=process, lines=["the last word"])
+
+        def inject(self, _fault: object, row: Row, _given: object) -> None:
+            row.injected += 1
+            if ends:
+                self._gateway.process.kill()
+                self._gateway.process.wait()
+                self.check_alive()
+            self.expect(False, "not within 2 s")
+
+    fault, report = in_order()[0], Report()
+    with subprocess.Popen(["sleep", "600"]) as process:
+        assert not run_one(OfOneProcess(process), fault, [None], report)
+        process.kill()
+    row = report.of(fault)
+    row.taken = 0.5
+    assert (row.state, ["the gateway ended with -9" in note for note in row.notes]) == (
+        state,
+        [ends],
+    )

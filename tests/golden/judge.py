@@ -30,6 +30,8 @@ from cantools.database.can import Database  # noqa: E402
 from cantools.database.can.signal import Signal  # noqa: E402
 from esc import reference, sheet  # noqa: E402
 
+_DOWNLOADS = 0x20, 0xC0
+"""Command of an SDO client that begins to write, in one frame or segments, or in blocks (CiA 301, 7.2.4.3)."""
 NOT_JUDGED = ("no_start_values.txt",)
 """Flags without a start value go to 1 on loss, which is a false alarm: a known defect (README.md)."""
 NS_PER_BYTE = 11 * 10**9 // 115_200
@@ -261,10 +263,15 @@ class Judge:
         return esc
 
     def received(self, frame: drive.CanFrame) -> None:
-        """A frame from the bus: what a master writes by itself, or resets, is not followed."""
-        if frame.data[1:3] == b"\x00\x21" or (frame.can_id == 0 and frame.data[:1] == b"\x81"):
+        """A frame from the bus: what a master writes by itself to 2100h of an ESC's node, or resets, is not followed."""
+        node = frame.can_id & 0x7F
+        if frame.can_id == 0 and frame.data[:1] == b"\x81":
             for esc in self.escs:
                 esc.sure = False
+        elif frame.can_id & ~0x7F == 0x600 and frame.data[1:3] == b"\x00\x21":
+            writes = frame.data[0] & 0xE0 in _DOWNLOADS
+            if writes and node in self.node_ids:
+                self.escs[self.node_ids.index(node)].sure = False
 
     def setting(self, node: int, entry: int, data: bytes) -> None:
         """A confirmed download to 2100h."""
