@@ -85,5 +85,5 @@ def test_a_master_that_writes_settings_of_a_node_makes_its_esc_unsure(
     frame: str, sure: list[bool]
 ) -> None:
     escs = [judge.Esc("Left"), judge.Esc("Right")]
-    judge.Judge(escs, None, [1, 2], steady=True).received(scenario.read_frame(frame))
+    judge.Judge(escs, None, [1, 2]).received(scenario.read_frame(frame))
     assert [esc.sure for esc in escs] == sure
