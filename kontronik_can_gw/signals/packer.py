@@ -179,10 +179,10 @@ def ratio(numerator: int, denominator: int) -> float:
 
 
 def float_bits(number: float | Fraction, length: int) -> int | None:
-    """The IEEE 754 bits of a float of 16, 32 or 64 bits; None where it is too large."""
+    """The IEEE 754 bits of a float of 16, 32 or 64 bits; None where it is too large, and of any other length."""
     try:
         packed = struct.pack(_FLOATS[length], float(number))
-    except OverflowError:
+    except (KeyError, OverflowError):
         return None
     return int.from_bytes(packed, "little")
 

@@ -488,3 +488,11 @@ def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_
     for silent in (False, True):
         (line,) = unreported(layout, silent)
         assert "on_loss" not in line and "link_state" in line
+
+
+@pytest.mark.parametrize("bits", [8, 16, 24, 63])
+def test_a_float_of_another_length_is_refused_whatever_it_begins_with(bits: int) -> None:
+    text = HEAD + "BO_ 256 Message: 8 Gateway\n" + signal("Throttle", f"0|{bits}@1-", "%")
+    more = "SIG_VALTYPE_ 256 Throttle : 1;\n" + START + start_of("Throttle", 5)
+    (line,) = refused(text + more)
+    assert f"a float of {bits} bits cannot be sent" in line
