@@ -92,10 +92,6 @@ class Judge:
         """The newest ones, settled."""
         self.wrong_count = 0
         """Settled ones; see ``settle``."""
-        self.old_count = 0
-        """Of them those that were right, but late."""
-        self.late_count = 0
-        """Values that were old only because the machine stood still."""
         self.values = 0
         """Frames with values that were compared and right."""
         self.marked = 0
@@ -173,13 +169,11 @@ class Judge:
             stood = 0 if each.since_ns is None else stood_still(each.since_ns, each.at_ns)
             # short standstills between the long ones are not noted: four fifths have to be
             if each.since_ns is not None and 5 * stood >= 4 * each.excess_ns:
-                self.late_count += 1
                 if each.shown:
                     esc, n, follows = each.shown
                     self.escs[esc].seen[n] |= follows
             else:
                 self.wrong_count += 1
-                self.old_count += each.since_ns is not None
                 still = f"; the machine stood still for {stood // MS} ms of it" if stood else ""
                 self.wrong.append(each._replace(what=each.what + still))
                 del self.wrong[:-KEPT]

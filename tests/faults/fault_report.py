@@ -32,11 +32,7 @@ class Fault:
 FAULTS: list[Fault] = []
 """Every fault; filled by importing the modules that define them."""
 AREAS = ("Start", "Serial", "CAN", "Time", "Process", "Disk", "Traffic", "Many")
-WITH_PYTHON = "s with the start of Python"
-"""The figure of a fault that ends the process: what its users wait for here."""
-MAX_TAKEN = 0.1
-"""Of the processor time that the virtual machine would have had. Where more was taken, what came late or not at all shows nothing."""
-GOOD, FAILED, NOT_JUDGED = "good", "failed", "not judged"
+GOOD, FAILED = "good", "failed"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
 BEGIN, END = "<!-- faults begin -->\n", "<!-- faults end -->\n"
 COLUMNS = "machine, fault|injected|recovered|worst recovery|wrong values|values lost|state"
@@ -58,29 +54,19 @@ class Row:
     recovered: int = 0
     worst_s: float = 0.0
     wrong: int = 0
-    old: int = 0
-    """Those of the wrong values that were right, but too late on the bus, or an age that was told too young."""
     lost: int = 0
     excused: int = 0
     """Values not sent because the machine as a whole stood still; no loss of the gateway's."""
     transmitted: int = 0
     """Bytes that the gateway sent to an ESC."""
-    ended: bool = False
-    """The gateway's process ended by itself, which no lack of processor time excuses."""
-    taken: float = 0.0
-    """The largest share of processor time that was taken from the virtual machine, over one second, while the fault ran."""
     notes: list[str] = field(default_factory=list)
     """What went wrong, for people."""
     figures: dict[str, float] = field(default_factory=dict)
 
     @property
     def state(self) -> str:
-        """Lateness and loss are not judged on a machine that could not run; a wrong value, a byte to an ESC or an end fails anywhere."""
         healed = self.injected > 0 and self.recovered == self.injected
-        if healed and not (self.wrong or self.lost or self.transmitted):
-            return GOOD
-        only_late = self.wrong == self.old and not self.transmitted and not self.ended
-        return NOT_JUDGED if self.taken > MAX_TAKEN and only_late else FAILED
+        return FAILED if not healed or self.wrong or self.lost or self.transmitted else GOOD
 
     @property
     def recovery(self) -> str:
@@ -90,10 +76,7 @@ class Row:
     @property
     def cells(self) -> list[str]:
         """What the page shows, the fault first."""
-        recovery = self.recovery
-        if WITH_PYTHON in self.figures:
-            recovery += f", {self.figures[WITH_PYTHON]:.2f} {WITH_PYTHON}"
-        counts = (self.injected, self.recovered, recovery, self.wrong, self.lost, self.state)
+        counts = (self.injected, self.recovered, self.recovery, self.wrong, self.lost, self.state)
         return [self.fault, *map(str, counts)]
 
     @property
@@ -105,8 +88,6 @@ class Row:
             text += f", {self.excused} not sent while the machine stood still"
         if self.transmitted:
             text += f", {self.transmitted} bytes sent to an ESC"
-        if self.taken > MAX_TAKEN:
-            text += f", {self.taken:.0%} of the processor time was taken"
         text += "".join(f"; {name} {value:g}" for name, value in self.figures.items())
         return text + "".join(f"\n       {note}" for note in self.notes[:8])
 
@@ -126,15 +107,12 @@ class Report(dict[str, Row]):
         self.update((found["fault"], Row(**found)) for found in json.loads(path.read_text()))
 
     def write_junit(self, path: Path) -> None:
-        """Each row as a test; one that was not judged as skipped."""
+        """Each row as a test."""
         suite = ET.Element("testsuite")
         for row in self.values():
             case = ET.SubElement(suite, "testcase", classname="faults", name=row.fault)
             if row.state == FAILED:
                 ET.SubElement(case, "failure", message=row.line)
-            elif row.state == NOT_JUDGED:
-                why = f"{NOT_JUDGED}: {row.taken:.0%} of the processor time was taken"
-                ET.SubElement(case, "skipped", message=why)
         ET.ElementTree(suite).write(path)
 
 

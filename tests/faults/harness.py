@@ -32,24 +32,10 @@ IN_FLIGHT_NS = 60 * MS
 STANDSTILL_NS = 8 * MS
 AHEAD = ("chrt", "-f", "10")
 """The gateway goes before the bench's own processes, with which it shares a processor here."""
-_METRONOME = """
-import sys, time
-step, last = float(sys.argv[1]), time.monotonic_ns()
-while True:
-    time.sleep(step)
-    now = time.monotonic_ns()
-    if now - last > 3e9 * step:
-        print(last + int(1e9 * step), now, flush=True)
-    last = now
-"""
 
 
 class NotRecovered(AssertionError):
     """The gateway did not come back in time."""
-
-
-class Ended(NotRecovered):
-    """The gateway's process is no more."""
 
 
 class LoggedProcess:
@@ -179,32 +165,12 @@ class PtyPort(FedEsc):
         self.unplug()
 
 
-class Metronome(LoggedProcess):
-    """A process that only wakes up, and notes when it could not: then nothing could run, the gateway neither."""
-
-    def __init__(self, step_s: float) -> None:
-        python = [sys.executable, "-S", "-E", "-c", _METRONOME, str(step_s)]
-        super().__init__(["chrt", "-f", "20", *python], keep_out=True)
-
-    def stood_still(self, begin_ns: int, end_ns: int) -> int:
-        """Nanoseconds of that time in which nothing ran."""
-        total = 0
-        for words in reversed(self.out):
-            begin, end = map(int, words.split())
-            if end < begin_ns:
-                break
-            total += max(0, min(end, end_ns) - max(begin, begin_ns))
-        return total
-
-
 class Bench:
     """Everything that runs around one gateway.
 
     ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen`` None: no nodes.
     ``dbc``: another layout than the shipped one.
     """
-
-    metronome_step_s = 0.004
 
     def __init__(
         self,
@@ -232,7 +198,6 @@ class Bench:
         self.start_limit_s = start_limit_s
         self.config.write_text(self._configuration(canopen, dbc))
         self.watch = BusWatch(watched, table, self.escs, slack_ns=slack_ns).start()
-        self.metronome = Metronome(self.metronome_step_s)
         self.feeder = Feeder(self.escs).start()
         self._gateway: Gateway | None = None
         self._accounted = [0 for _ in escs]
@@ -327,7 +292,7 @@ class Bench:
     def check_alive(self) -> None:
         code = self._gateway and self._gateway.process.poll()
         if code is not None:
-            raise Ended(f"the gateway ended with {code}; {self.last_words()}")
+            raise NotRecovered(f"the gateway ended with {code}; {self.last_words()}")
         for failure in (self.feeder.error, self.watch.failure):
             if failure is not None:
                 raise failure
@@ -336,23 +301,20 @@ class Bench:
         lines = self._gateway.lines[-6:] if self._gateway is not None else []
         return f"the gateway's last lines: {' | '.join(lines) or 'none'}"
 
+    def stood_still(self, begin_ns: int, end_ns: int) -> int:
+        """Nanoseconds of that time in which the whole machine stood still: none where it has a time of its own."""
+        return 0
+
     def running_s(self, begin_ns: int, end_ns: int) -> float:
         """Seconds of that time in which the machine did not stand still."""
-        time.sleep(0.02)
-        return (end_ns - begin_ns - self.metronome.stood_still(begin_ns, end_ns)) / SECOND
+        return (end_ns - begin_ns - self.stood_still(begin_ns, end_ns)) / SECOND
 
     def longest_silence_s(self, escs: Sequence[int] | range, begin_ns: int) -> float:
-        """How long at most the gateway was silent of one of these ESCs since then though the machine ran."""
-        self._catch_up()
+        """How long at most the gateway was silent of one of these ESCs since then."""
+        self.watch.catch_up()
         now = time.monotonic_ns()
         silences = [each for esc in escs for each in self.watch.silences(esc, begin_ns, now)]
-        stood_still = self.metronome.stood_still
-        longest = [end - begin - stood_still(begin, end) for begin, end in silences]
-        return max(longest, default=0) / SECOND
-
-    def _catch_up(self) -> None:
-        self.watch.catch_up()
-        time.sleep(0.05)  # until the metronome has told of the last standstill
+        return max((end - begin for begin, end in silences), default=0) / SECOND
 
     # --- accounts
 
@@ -364,9 +326,9 @@ class Bench:
     def account(self, row: Row) -> list[tuple[int, str]]:
         """Note in a row how many values that were sent since the last account, outside of all faults, never came; when and which."""
         until_ns = time.monotonic_ns() - 150 * MS
-        self._catch_up()
+        self.watch.catch_up()
         self.forgive(until_ns)
-        self.watch.settle(self.metronome.stood_still)
+        self.watch.settle(self.stood_still)
         losses = []
         for index, fed in enumerate(self.escs):
             last = fed.newest(until_ns)
@@ -377,7 +339,7 @@ class Bench:
                 if any(begin <= at <= end for begin, end in self._excluded[index]):
                     continue
                 following = fed.sent[n + 1] if n + 1 < len(fed.sent) else at + SECOND // 20
-                if self.metronome.stood_still(at - 5 * MS, following + 5 * MS) >= STANDSTILL_NS:
+                if self.stood_still(at - 5 * MS, following + 5 * MS) >= STANDSTILL_NS:
                     row.excused += 1
                     continue
                 seen = {0: "nothing", SPEED: "only EscSpeed"}.get(fed.seen[n], "only EscCurrent")
@@ -425,7 +387,6 @@ class Bench:
         self.feeder.close()
         self.kill()
         self.watch.close()
-        self.metronome.kill()
         for esc in self.escs:
             esc.close()
 
@@ -450,7 +411,7 @@ class Injection:
         self.recovery_s = 0.0
         self._boot_ups = len(bench.watch.boot_ups)
         self._emergencies = len(bench.watch.emergencies)
-        self._wrong, self._old = bench.watch.wrong_count, bench.watch.old_count
+        self._wrong = bench.watch.wrong_count
 
     def cleared(self) -> None:
         """The cause is gone; what is sent from now on has to arrive soon."""
@@ -504,7 +465,6 @@ class Injection:
         watch, row = self.bench.watch, self.row
         wrong = watch.wrong_count - self._wrong
         row.wrong += wrong
-        row.old += watch.old_count - self._old
         for each in watch.wrong[-min(wrong, 3) :] if wrong else ():
             row.notes.append(f"wrong value {after(each.at_ns)} after the injection: {each.what}")
         if losses:

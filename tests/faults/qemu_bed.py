@@ -16,7 +16,7 @@ from pathlib import Path
 from bus_watch import MS
 from encoding import Identity
 from feeder import CURRENT, SPEED, FedEsc
-from harness import Bench
+from harness import Bench, LoggedProcess
 from qemu_adapter import ESC_LINE, Line, SerialAdapter
 from qemu_machine import AS_SET, can_up, line_setting, serial_ports, wait_until
 from signals import table_of
@@ -150,6 +150,37 @@ class WirePort(FedEsc):
         self.unplug()
 
 
+_METRONOME = """
+import time
+step, last = 0.03, time.monotonic_ns()
+while True:
+    time.sleep(step)
+    now = time.monotonic_ns()
+    if now - last > 3e9 * step:
+        print(last + int(1e9 * step), now, flush=True)
+    last = now
+"""
+
+
+class Metronome(LoggedProcess):
+    """A process that only wakes up, and notes when it could not: then nothing could run, the gateway neither."""
+
+    def __init__(self) -> None:
+        python = [sys.executable, "-S", "-E", "-c", _METRONOME]
+        super().__init__(["chrt", "-f", "20", *python], keep_out=True)
+
+    def stood_still(self, begin_ns: int, end_ns: int) -> int:
+        """Nanoseconds of that time in which nothing ran."""
+        time.sleep(0.02)  # until it has told of the last one
+        total = 0
+        for words in reversed(self.out):
+            begin, end = map(int, words.split())
+            if end < begin_ns:
+                break
+            total += max(0, min(end, end_ns) - max(begin, begin_ns))
+        return total
+
+
 class MachineBench(Bench):
     """Two ESCs on two kinds of port, and a gateway on the first controller; the second one watches.
 
@@ -157,8 +188,6 @@ class MachineBench(Bench):
     sent at most SLACK_NS later is not lost. What the gateway sends by the clock it sends four times more slowly than by the shipped
     DBC, and its CANopen nodes stay PRE-OPERATIONAL, for speed's sake.
     """
-
-    metronome_step_s = 0.03
 
     def __init__(self, folder: Path) -> None:
         self._gateway = None  # the feeder asks before it is set
@@ -176,12 +205,20 @@ class MachineBench(Bench):
             canopen="",
             start_limit_s=120,
         )
+        self._metronome = Metronome()
 
     def _reader(self) -> int | None:
         """The gateway's process."""
         if self._gateway is None or self._gateway.process.poll() is not None:
             return None
         return self._gateway.process.pid
+
+    def stood_still(self, begin_ns: int, end_ns: int) -> int:
+        return self._metronome.stood_still(begin_ns, end_ns)
+
+    def close(self) -> None:
+        super().close()
+        self._metronome.kill()
 
     def forgive(self, until_ns: int) -> None:
         both = SPEED | CURRENT

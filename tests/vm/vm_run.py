@@ -1,6 +1,6 @@
 """Run a command under a Linux kernel that has vcan: this one if it has, else User Mode Linux, else QEMU.
 
-    tests/vm/run [--backend auto|native|uml|qemu] [--timeout S] [--rw DIR]... -- COMMAND...
+    tests/vm/run [--backend auto|native|uml|qemu] [--timeout S] [--rw DIR]... [--own-time] -- COMMAND...
     tests/vm/run --which            which of them `auto` takes, or none
 
 Prints what COMMAND prints, stdout and stderr apart, and exits with its exit code; 124: time-out; 125: the VM failed.
@@ -13,6 +13,8 @@ qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci co
 
 A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
 --rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
+--own-time (uml): what happens in there does not depend on how fast or busy the machine is, and to wait takes no time
+(uml_time.c; needs a C compiler); only --timeout is the machine's.
 Of the environment it gets PATH, HOME, LANG, CI, VIRTUAL_ENV and what starts with KCG_, PYTHON, PYTEST_, HYPOTHESIS_
 or COVERAGE_. Python finds no asammdf in there, which python-can imports where it is installed, and with it numpy and pandas:
 4 s of each process in UML, a minute in QEMU.
@@ -114,11 +116,15 @@ def uml_command(job: str, out: int, err: int) -> list[str]:
     """.split()
 
 
-def uml_host_environment(job: str) -> dict[str, str]:
+def uml_host_environment(job: str, own_time: bool) -> dict[str, str]:
     """Its own, outside of the guest; uml_xstate.so is there where it does not start without."""
     help_to_start = os.path.join(cache(), "uml_xstate.so")
-    preload = {"LD_PRELOAD": help_to_start} if os.path.exists(help_to_start) else {}
-    return {"TMPDIR": uml_memory_folder(job)} | preload
+    preload = [help_to_start] if os.path.exists(help_to_start) else []
+    if own_time:
+        preload.append(os.path.join(job, "uml_time.so"))
+        compile_time = ["cc", "-O2", "-shared", "-fPIC", "-o", preload[-1]]
+        subprocess.run([*compile_time, os.path.join(HERE, "uml_time.c"), "-ldl"], check=True)
+    return {"TMPDIR": uml_memory_folder(job), "LD_PRELOAD": ":".join(preload)}
 
 
 def uml_memory_folder(job: str) -> str:
@@ -275,10 +281,10 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def start_vm(
-    backend: str, job: str, out: int, err: int, log: BinaryIO
+    backend: str, job: str, out: int, err: int, log: BinaryIO, own_time: bool
 ) -> "subprocess.Popen[bytes]":
     if backend == "uml":
-        command, environment = uml_command(job, out, err), uml_host_environment(job)
+        command, environment = uml_command(job, out, err), uml_host_environment(job, own_time)
     else:
         command, environment = qemu_command(job, out, err), {"TMPDIR": job}
     environment |= {"PATH": with_sbin(os.environ.get("PATH", ""))}
@@ -323,7 +329,7 @@ def read(job: str, name: str) -> str:
 
 
 def run_in_vm(
-    backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
+    backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float, own_time: bool
 ) -> tuple[int, bool]:
     """Returns the exit code, and whether the command was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
@@ -332,7 +338,7 @@ def run_in_vm(
         pipes = [os.pipe() for _ in range(2)]
         try:
             with open(os.path.join(job, "log"), "wb") as log:
-                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log)
+                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log, own_time)
         finally:
             for _, end in pipes:
                 os.close(end)
@@ -360,7 +366,7 @@ def run_in_vm(
         if not late:
             print(*(read(job, name)[-4000:] for name in ("log", "klog")), file=sys.stderr)
         return VM_FAILED, started
-    except OSError as error:
+    except (OSError, subprocess.CalledProcessError) as error:
         print(f"vm/run: {backend}: {error}", file=sys.stderr)
         return VM_FAILED, False
     finally:
@@ -388,6 +394,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")
+    parser.add_argument("--own-time", action="store_true")
     parser.add_argument("command", nargs="*")
     args = parser.parse_args()
     args.rw = [os.path.realpath(folder) for folder in args.rw]
@@ -396,6 +403,8 @@ def arguments() -> argparse.Namespace:
             parser.error(f"--rw {folder}: no such folder")
     if not args.command and not args.which:
         parser.error("COMMAND is missing")
+    if args.own_time and args.backend != "uml":
+        parser.error("--own-time: only with --backend uml")
     return args
 
 
@@ -418,7 +427,7 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, leave)
     for vm in vms:
-        code, started = run_in_vm(vm, args.command, args.rw, args.timeout)
+        code, started = run_in_vm(vm, args.command, args.rw, args.timeout, args.own_time)
         if code != VM_FAILED or started:
             return code
     if not vms:
