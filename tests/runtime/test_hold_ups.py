@@ -143,6 +143,31 @@ def test_what_waited_beyond_one_read_is_dated_by_its_place(
     assert abs(wire.frames[-1] - esc.live_bound_ns) <= NS_PER_BYTE
 
 
+def test_a_port_that_always_has_bytes_keeps_no_other_one_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A megabyte waits at one, of which 4 KiB take the process a millisecond; each frame of the other is shown two reads later at most."""
+    world = World(2)
+    flooded, usual = world.wires
+    start, read = world.now, flooded.read
+
+    def slow_read(most: int = 4096) -> bytes:
+        data = read(most)
+        world.now += len(data) * MS // 4096
+        return data
+
+    monkeypatch.setattr(flooded, "read", slow_read)
+    loop = begin(monkeypatch, world, *TWO)
+    flooded.put(bytes(1 << 20), [start] * (1 << 20))
+    usual.stream(start, start + 200 * MS, 10 * MS)
+    run(loop, world, start + 220 * MS)
+    loop.close()
+    assert flooded.waiting > 1 << 16
+    first = {number: at for at, number, _ in reversed(list(values(world, 1)))}
+    assert list(range(1, 21)) == sorted(first)
+    assert all(first[n + 1] - whole <= 2 * MS for n, whole in enumerate(usual.frames))
+
+
 @pytest.mark.parametrize("blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}])
 def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     monkeypatch: pytest.MonkeyPatch, blind: set[int]
