@@ -82,7 +82,7 @@ def test_whatever_the_profile_every_frame_decodes_to_what_was_meant(
 def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(
     cuts: list[int], seed: int
 ) -> None:
-    faults = Faults(noise=2, lost_bytes=0.01, flipped_bits=0.001, dropout=Dropout(S, 3 * S))
+    faults = Faults(flipped_bits=0.001, dropout=Dropout(S, 3 * S))
     options = EscOptions(faults=faults)
     esc = SimulatedEsc(options, seed=seed)
     pieces = [esc.frames_until(cut) for cut in [*sorted(cuts), 20 * S]]
@@ -117,7 +117,7 @@ def test_the_flight_is_physically_plausible(device: Device) -> None:
 @pytest.mark.parametrize("layout", Layout)
 def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(layout: Layout) -> None:
     """In the legacy layout, besides, those with flips that its CRC does not cover."""
-    faults = Faults(noise=3, lost_bytes=0.002, flipped_bits=0.0002)
+    faults = Faults(flipped_bits=0.001)
     frames = sends(60, EscOptions(layout=layout, faults=faults))
     intact = [sent.data for sent in frames if sent.intact]
     assert len(frames) * 0.5 < len(intact) < len(frames)
