@@ -16,7 +16,7 @@ help:
 	@echo 'make golden    record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
 	@echo 'make docs      write docs/reference from the sources'
 	@echo 'make pictures  draw docs/pictures: live screen and report; all sizes of them by ARGS=FOLDER'
-	@echo 'make wheels    one wheel with the core in C for x86-64, arm64 and armv7, each tried under qemu-user   (ARGS=FOLDER)'
+	@echo 'make wheels    one wheel with the core in C for x86-64, arm64 and armv7, looked through   (ARGS=FOLDER)'
 	@echo 'make deb       Debian packages for amd64, arm64 and armhf, with all libraries   (ARGS=FOLDER)'
 	@echo 'make lint      ruff and mypy only'
 	@echo 'make clean     remove .venv and all caches'

@@ -42,27 +42,8 @@ class EscStream(EscTelemetry):
         parts = [fields[name] for name in ("battery_voltage", "battery_current") if name in fields]
         self._power_at = [part.word for part in parts] if len(parts) == 2 else None
         self._per_watt = math.prod(part.per_unit for part in parts)
-        self.live: Data | None = None
-        self.info: Data | None = None
-        self.last_live: Data | None = None
-        self.last_info: Data | None = None
-        self.device: int | None = None
-        self.link = LinkState.NEVER_SEEN
-        self.layout = 0
         self.apply(settings)
-        self.frame_rate: int | None = 0
-        self.losses = 0
-        self.energy_mw_ns = self.run_time_ns = 0
-        self.live_ns: int | None = None
-        self.live_bound_ns = 0
-        self.info_bound_ns: int | None = None
-        self.last_info_ns: int | None = None
-        self.line_errors = 0
         self.base: Counters = self.counters.copy()
-        self.base_losses = 0
-        self.base_line_errors = 0
-        self.suspect_frames = 0
-        self.late_frames = 0
         self._arrivals: deque[tuple[int, int]] = deque()
         """(stream position after a chunk, the bound of its last byte) while bytes are pending."""
         self._interval_ns = 0  # between live frames, as usual; 0: not known

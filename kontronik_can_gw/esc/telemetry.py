@@ -75,31 +75,31 @@ class EscTelemetry:
 
     protocol: EscProtocol
     settings: EscSettings
-    live: Data | None
-    info: Data | None
-    last_live: Data | None
-    last_info: Data | None
-    device: int | None
-    link: LinkState
-    layout: int
+    live: Data | None = None
+    info: Data | None = None
+    last_live: Data | None = None
+    last_info: Data | None = None
+    device: int | None = None
+    link: LinkState = LinkState.NEVER_SEEN
+    layout: int = 0
     cells: int
     pole_pairs: int
     output_divisor: int
     gear_denominator: int
-    frame_rate: int | None
-    losses: int
-    suspect_frames: int
-    late_frames: int
-    energy_mw_ns: int
-    run_time_ns: int
-    live_ns: int | None
-    last_info_ns: int | None
-    live_bound_ns: int
-    info_bound_ns: int | None
-    line_errors: int
+    frame_rate: int | None = 0
+    losses: int = 0
+    suspect_frames: int = 0
+    late_frames: int = 0
+    energy_mw_ns: int = 0
+    run_time_ns: int = 0
+    live_ns: int | None = None
+    last_info_ns: int | None = None
+    live_bound_ns: int = 0
+    info_bound_ns: int | None = None
+    line_errors: int = 0
     base: Counters
-    base_losses: int
-    base_line_errors: int
+    base_losses: int = 0
+    base_line_errors: int = 0
 
     @property
     def counters(self) -> Counters:

@@ -11,14 +11,26 @@ import sys
 import traceback
 from pathlib import Path
 
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
 
-import live  # noqa: F401  registers its benchmarks, as the others do
-import offline  # noqa: F401
-import registry
-import start_and_memory  # noqa: F401
-from registry import Context, Figure, LeftOut
+import live  # noqa: E402
+import offline  # noqa: E402
+from programs import Context, Figure, LeftOut  # noqa: E402
+
+BENCHMARKS = {
+    "cpu": live.cpu,
+    "cpu-canopen": live.canopen,
+    "many": live.many,
+    "delay": live.delay,
+    "delay-full": live.delay_full,
+    "offline-capture": offline.captures,
+    "offline-bytes": offline.plain_bytes,
+    "start": live.start,
+    "memory": live.memory,
+}
+FOLDER = ROOT / "build" / "bench"
+"""For compiled programs and files of the moment; it stays from run to run."""
 
 
 def seconds(text: str) -> float:
@@ -28,35 +40,29 @@ def seconds(text: str) -> float:
     return number
 
 
-def parser() -> argparse.ArgumentParser:
-    made = argparse.ArgumentParser(prog="bench", description=__doc__.splitlines()[0])
-    option = made.add_argument
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="bench", description=__doc__.splitlines()[0])
+    option = parser.add_argument
     option("--only", nargs="+", default=["*"], metavar="NAME", help="these alone; as 'cpu*' too")
     option("--list", action="store_true", help="list the benchmarks and end")
     option("--seconds", type=seconds, default=5.0, metavar="N", help="of one measurement (5)")
     option("--quick", action="store_true", help="as short as it can be: tries the benchmarks")
-    return made
-
-
-def main(arguments: list[str] | None = None) -> int:
-    args = parser().parse_args(arguments)
-    known = registry.BENCHMARKS
+    args = parser.parse_args(arguments)
     if args.list:
-        for name, (text, _) in known.items():
-            print(f"{name:15} {text}")
+        for name, function in BENCHMARKS.items():
+            print(f"{name:15} {(function.__doc__ or '').splitlines()[0]}")
         return 0
     for one in args.only:
-        if not fnmatch.filter(known, one):
+        if not fnmatch.filter(BENCHMARKS, one):
             print(f"bench: there is no benchmark {one}. See --list.", file=sys.stderr)
             return 2
+    FOLDER.mkdir(parents=True, exist_ok=True)
     lasts, turns = (min(args.seconds, 0.5), 1) if args.quick else (args.seconds, 3)
-    folder = registry.ROOT / "build" / "bench"
-    folder.mkdir(parents=True, exist_ok=True)
-    context = Context(folder, lasts, turns, args.quick)
+    context = Context(FOLDER, lasts, turns, args.quick)
     results: dict[str, list[Figure] | str] = {}
-    for name, (text, function) in known.items():
+    for name, function in BENCHMARKS.items():
         if any(fnmatch.fnmatch(name, one) for one in args.only):
-            print(f"{name}: {text}", file=sys.stderr, flush=True)
+            print(name, file=sys.stderr, flush=True)
             try:
                 results[name] = function(context)
             except LeftOut as reason:

@@ -1,49 +1,32 @@
-"""Conversion of captures and of UART bytes to candump logs and tables.
+"""Conversion of captures and of UART bytes to candump logs and tables: CPU time without the start of the program.
 
 The bytes are a simulated flight of four minutes, over and over.
-
-    python offline.py FORM IN OUT [--dbc FILE] [--live]     one conversion: what came of it as JSON
 """
 
-import argparse
-import json
-import os
 import random
-import subprocess
-import sys
 import time
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
-from programs import FIVE, median
-from registry import Context, Figure, benchmark
+from programs import FIVE, Context, Figure, median, say
 
 FLIGHT_S, SEED = 240, 6
 _MB = 1_000_000
 
 
-# --- files
-
-
-def flight(context: Context) -> bytes:
+@cache
+def flight() -> bytes:
     """About a MB."""
     from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 
-    file = context.folder / f"flight-{FLIGHT_S}-{SEED}.bin"
-    if not file.exists():
-        context.say("a flight is simulated")
-        sent = SimulatedEsc(EscOptions(), seed=SEED).frames_until(FLIGHT_S * 1_000_000_000)
-        file.with_suffix(".new").write_bytes(b"".join(one.wire for one in sent))
-        file.with_suffix(".new").rename(file)
-    return file.read_bytes()
-
-
-# --- one run
+    say("a flight is simulated")
+    sent = SimulatedEsc(EscOptions(), seed=SEED).frames_until(FLIGHT_S * 1_000_000_000)
+    return b"".join(one.wire for one in sent)
 
 
 class Run(NamedTuple):
-    """One conversion: CPU time without the start of the program, and in words how much was written."""
+    """One conversion: CPU time, and in words how much was written."""
 
     cpu_s: float
     written: str
@@ -54,52 +37,30 @@ class Run(NamedTuple):
         return int(self.written.split()[0]) / self.cpu_s
 
 
-def convert(context: Context, form: str, source: Path, *options: object) -> Run:
-    """One conversion in a process of its own."""
-    target = context.folder / f"converted{'.log' if form == 'candump' else f'.{form}'}"
-    command = [sys.executable, __file__, form, source, target, *options]
-    # what is compiled at the first run is there from then on
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    done = subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, timeout=3600, env=environment
-    )
-    if done.returncode:
-        raise RuntimeError(f"{form}: {(done.stderr.strip().splitlines() or ['no word'])[-1]}")
-    return Run(*json.loads(done.stdout))
-
-
-def convert_here(arguments: list[str]) -> Run:
-    """In this process. The libraries are loaded before the clock starts."""
+def convert(
+    context: Context, form: str, source: Path, live: bool = False, dbc: Path | None = None
+) -> Run:
+    """One conversion. ``live``: of the 16 values of live data."""
     from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
     from kontronik_can_gw.desk.recordings.inputs import open_input
     from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
     from kontronik_can_gw.desk.recordings.tables.rows import Choice
     from kontronik_can_gw.esc.kontronik.fields import LiveData
 
-    parser = argparse.ArgumentParser()
-    for name in ("form", "source", "target"):
-        parser.add_argument(name)
-    parser.add_argument("--dbc", type=Path)
-    parser.add_argument("--live", action="store_true")
-    args = parser.parse_args(arguments)
-    if args.form == "parquet":
+    if form == "parquet":
         import pyarrow.parquet  # type: ignore[import-untyped]
 
         pyarrow.array([0])  # imports pandas where it is installed
-    layout = None if args.dbc is None else layout_of_dbc(args.dbc)
-    with open_input(Path(args.source), layout) as recording:
-        convert_all = partial(to_log, form=args.form)
-        if args.form in TABLES:
-            names = LiveData._fields if args.live else ()
-            choice = Choice.of(recording.fields, names)
-            convert_all = partial(to_table, form=args.form, choice=choice)
+    target = context.folder / f"converted{'.log' if form == 'candump' else f'.{form}'}"
+    with open_input(source, None if dbc is None else layout_of_dbc(dbc)) as recording:
+        convert_all = partial(to_log, form=form)
+        if form in TABLES:
+            choice = Choice.of(recording.fields, LiveData._fields if live else ())
+            convert_all = partial(to_table, form=form, choice=choice)
         begun = time.process_time()
-        with Output(Path(args.target)) as out:
+        with Output(target) as out:
             written = convert_all(recording, out)
         return Run(time.process_time() - begun, str(written))
-
-
-# --- benchmarks
 
 
 def capture(context: Context, seconds: int, noise: bool = False) -> Path:
@@ -115,12 +76,12 @@ def capture(context: Context, seconds: int, noise: bool = False) -> Path:
     chance, period, start = random.Random(SEED), 10_000_000, 1_000_000_000
     setup = setup_of(assemble(parse({"esc": [{"port": "/dev/ttyUSB0"}]}, "bench.toml")))
     header = setup.header() | {"created_ns": start, "monotonic_ns": start, "wall_ns": start << 30}
-    frames = [b"KOD" + frame for frame in flight(context).split(b"KOD")[1:]]
+    frames = [b"KOD" + frame for frame in flight().split(b"KOD")[1:]]
     first = [(start, Kind.PORT_OPENED, 0, b"", 0, None), (start, Kind.START, 0, b"", 1, None)]
     blocks = [(b"H", json_payload(header)), (b"D", data_payload(first))]
-    for at in range(0, 100 * seconds, 50):
+    for begin in range(0, 100 * seconds, 50):
         entries: list[tuple[int, int, int, bytes, int, int | None]] = []
-        for number in range(at, at + 50):
+        for number in range(begin, begin + 50):
             now, wire = start + number * period, frames[number % len(frames)]
             if noise and chance.random() < 0.05:
                 at = chance.randrange(len(wire))
@@ -133,18 +94,17 @@ def capture(context: Context, seconds: int, noise: bool = False) -> Path:
     return file
 
 
-@benchmark("offline-capture", "an hour's capture of one ESC, and the same with noise")
 def captures(context: Context) -> list[Figure]:
-    """Seconds of CPU without the start of the program."""
+    """An hour's capture of one ESC, and the same with noise."""
     figures, seconds = [], 60 if context.quick else 3600
     clean, noisy = capture(context, seconds), capture(context, seconds, noise=True)
-    for name, form, options, least in (
-        ("candump", "candump", (), ""),
-        ("parquet, 16 values", "parquet", ("--live",), ">= 400000"),
-        ("parquet, all values", "parquet", (), ">= 120000"),
+    for name, form, live, least in (
+        ("candump", "candump", False, ""),
+        ("parquet, 16 values", "parquet", True, ">= 400000"),
+        ("parquet, all values", "parquet", False, ">= 120000"),
     ):
         rounds = [
-            (convert(context, form, clean, *options), convert(context, form, noisy, *options))
+            (convert(context, form, clean, live), convert(context, form, noisy, live))
             for _ in range(context.rounds)
         ]
         spent = median([one.cpu_s for one, _ in rounds]) * 3600 / seconds
@@ -156,19 +116,18 @@ def captures(context: Context) -> list[Figure]:
     return figures
 
 
-@benchmark("offline-bytes", "UART bytes at full speed: MB a CPU second")
 def plain_bytes(context: Context) -> list[Figure]:
-    """Of the deframer alone, and of conversions without the start of the program; the quickest of the rounds."""
-    source, once = context.folder / "bytes.bin", flight(context)
-    source.write_bytes(once * ((1 if context.quick else 20) * _MB // len(once) + 1))
+    """UART bytes at full speed, MB a CPU second: the deframer alone, conversions; the quickest of the rounds."""
+    source = context.folder / "bytes.bin"
+    source.write_bytes(flight() * ((1 if context.quick else 20) * _MB // len(flight()) + 1))
     size = source.stat().st_size / _MB
     figures = [Figure("scan", size / min(scan(source) for _ in range(7)), "MB/s", ">= 900")]
-    for form, options, aim in (
-        ("candump", ("--dbc", FIVE), ">= 80"),
-        ("parquet", ("--live",), ">= 70"),
-        ("csv", ("--live",), ">= 30"),
+    for form, live, dbc, aim in (
+        ("candump", False, FIVE, ">= 80"),
+        ("parquet", True, None, ">= 70"),
+        ("csv", True, None, ">= 30"),
     ):
-        run = min(convert(context, form, source, *options) for _ in range(context.rounds))
+        run = min(convert(context, form, source, live, dbc) for _ in range(context.rounds))
         figures.append(Figure(f"{form}, bytes", size / run.cpu_s, "MB/s", aim, run.written))
     return figures
 
@@ -188,7 +147,3 @@ def scan(source: Path) -> float:
     for at in range(0, len(data), 16384):
         core.receive(0, data[at : at + 16384], 0, 0)
     return time.process_time() - begun
-
-
-if __name__ == "__main__":
-    print(json.dumps(convert_here(sys.argv[1:])))

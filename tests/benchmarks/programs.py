@@ -1,14 +1,10 @@
-"""Starts feeder and gateways, and measures the CPU time of a gateway while telemetry flows.
+"""What all benchmarks share: figures with their targets, and one measurement of a program while a feeder plays the ESCs."""
 
-with running(context, "c", 8) as (feeder, gateway):    # "c", "ours" or "obvious"
-    measured = feeder.measure(gateway)
-"""
-
-import contextlib
 import ctypes
 import json
 import os
-import select
+import re
+import shutil
 import signal
 import statistics
 import subprocess
@@ -16,212 +12,213 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple
 
-from registry import HERE, Context
-
+HERE = Path(__file__).resolve().parent
 FIVE = HERE / "five.dbc"
-STANDIN = HERE / "standin.py"
 PROGRAMS = ("c", "ours", "obvious")
 CANOPEN = '[canopen]\nenabled = true\nself_start = true\nstore = "store"\n'
 EVERYTHING = f'{CANOPEN}[record]\ndirectory = "captures"\n[statistics]\nfile = "status.json"\n'
 """Nodes, recorder, status file."""
 _PRIORITY = 80
 """Of the feeder, where we may: what it measures is not to be its own delay."""
+# what is compiled at the first run is there from then on
+ENVIRONMENT = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""}
+
+
+class LeftOut(Exception):
+    """This benchmark cannot be run here. The text says what is missing and how to get it, in one line."""
+
+
+class Figure(NamedTuple):
+    """A line of the table. ``target``: "<= 2.2" or ">= 4"; a missed one is no error."""
+
+    name: str
+    value: float
+    unit: str
+    target: str = ""
+    note: str = ""
+
+    @property
+    def reached(self) -> bool | None:
+        """None where there is no target."""
+        if not self.target:
+            return None
+        sign, limit = self.target.split()
+        return self.value <= float(limit) if sign == "<=" else self.value >= float(limit)
 
 
 @dataclass
-class Measured:
-    """What one run gave. ``cpu_us``: of all threads of the gateway, for each live frame."""
+class Context:
+    """How long a benchmark may measure, and where it may write. ``rounds``: of measurements that are compared, by turns."""
+
+    folder: Path
+    seconds: float = 5.0
+    rounds: int = 3
+    quick: bool = False
+    """As short as it can be: for trying the benchmarks themselves. Figures mean little."""
+
+    def compiled(self, name: str, *options: str) -> Path:
+        """The program made of a C file in peers/ by gcc -O2; made anew only where the file has changed."""
+        source, gcc = HERE / "peers" / name, shutil.which("gcc")
+        if gcc is None:
+            raise LeftOut(f"no gcc to compile {name} with:  sudo apt-get install gcc libc6-dev")
+        program = self.folder / source.stem
+        if not program.exists() or program.stat().st_mtime < source.stat().st_mtime:
+            command = [gcc, "-O2", "-Wall", "-Wextra", "-o", str(program), str(source), *options]
+            subprocess.run(command, check=True)
+        return program
+
+
+def say(text: str) -> None:
+    """A line of progress, to standard error."""
+    print(f"  {text}", file=sys.stderr, flush=True)
+
+
+def median(values: Sequence[float]) -> float:
+    return float(statistics.median(values))
+
+
+# --- processes
+
+
+@contextmanager
+def started(command: Sequence[object], **further: Any) -> Iterator["subprocess.Popen[str]"]:
+    """A child that ends with the block, and with us however we end."""
+
+    def die_with_us() -> None:
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+    words = list(map(str, command))
+    with subprocess.Popen(words, text=True, preexec_fn=die_with_us, **further) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(3)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def standin(bus: str, *words: object) -> list[object]:
+    """The command of a Python program on a bus that is no CAN interface."""
+    return [sys.executable, HERE / "standin.py", bus, *words]
+
+
+def new_bus() -> str:
+    return f"kontronik-{uuid.uuid4().hex[:12]}"
+
+
+def write_config(folder: Path, ports: Sequence[str], dbc: Path, further: str = "") -> Path:
+    """Our configuration; the 1 Mbit/s are what its bus load is compared with. ``further``: lines, tables at their end."""
+    lines = ['[can]\ninterface = "socketcan"\nchannel = "lo"\nbitrate = 1000000']
+    lines += [f'[dbc]\nfile = "{dbc}"', further]
+    if "[statistics]" not in further:
+        lines.append(f'[statistics]\nfile = "{folder / "status.json"}"')
+    for index, port in enumerate(ports, 1):
+        lines.append(f'[[esc]]\nport = "{port}"\nname = "e{index}"\npole_pairs = 7')
+    file = folder / "gateway.toml"
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+# --- a measurement
+
+
+class Measured(NamedTuple):
+    """What one run gave. ``cpu_us``: of all threads of the gateway, for each live frame; ``result``: what the feeder says."""
 
     cpu_us: float
     cpu_share: float
-    sent: int
-    lost: int
+    rss_mb: float
     result: dict[str, Any]
 
     @property
     def delay(self) -> dict[str, float]:
         """count, p50, p90, p99, p999, max in microseconds."""
-        return cast(dict[str, float], self.result["delay_us"])
+        found: dict[str, float] = self.result["delay_us"]
+        return found
+
+    @property
+    def frames(self) -> int:
+        """CAN frames that there should have been."""
+        return 5 * int(self.result["sent"])
 
     @property
     def lost_share(self) -> float:
-        """Of the CAN frames."""
-        return self.lost / (5 * self.sent) if self.sent else 0.0
+        return self.result["lost"] / self.frames if self.frames else 0.0
 
 
-def cpu_ns(pid: int) -> int:
+def _cpu_ns(pid: int) -> int:
     """CPU time of all threads of a process."""
     total = 0
     for thread in Path(f"/proc/{pid}/task").iterdir():
-        with contextlib.suppress(OSError):  # it has just ended
+        with suppress(OSError):  # it has just ended
             total += int((thread / "schedstat").read_text().split()[0])
     return total
 
 
-def die_with_us() -> None:
-    """In a child: end when the benchmark does, however it ends."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+def _rss_mb(pid: int) -> float:
+    found = re.search(r"^VmRSS:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    assert found
+    return int(found[1]) / 1024
 
 
-def start(command: Sequence[str], **further: Any) -> "subprocess.Popen[str]":
-    """A child that ends with us."""
-    return subprocess.Popen(command, text=True, preexec_fn=die_with_us, **further)
-
-
-def end(process: "subprocess.Popen[str]", patience_s: float = 3.0) -> None:
-    """End it, one way or the other."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            process.kill()
-    process.wait()
-    for stream in (process.stdin, process.stdout, process.stderr):
-        if stream is not None:
-            with contextlib.suppress(OSError):
-                stream.close()
-
-
-class Feeder:
-    """The ESCs, and the other end of the bus."""
-
-    def __init__(self, context: Context, escs: int, *options: str) -> None:
-        self.bus = f"kontronik-{uuid.uuid4().hex[:12]}"
-        program = context.compiled("feeder.c", "-pthread")
-        warmup = 0.5 if context.quick else 2.0
-        self._limit_s = context.seconds + warmup + 30
-        words = f"--bus {self.bus} --escs {escs} --seconds {context.seconds} --warmup {warmup}"
-        command = [str(program), *words.split(), "--priority", str(_PRIORITY), *options]
-        self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        self.ports: list[str] = self._line()["ports"]
-
-    def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
-        """What the feeder says next; its lines come apart, and its end wakes who waits for one that was read with another."""
-        assert self.process.stdout is not None
-        deadline = time.monotonic() + self._limit_s
-        while not select.select([self.process.stdout], [], [], 0.2)[0]:
-            if gateway is not None:
-                gateway.check()
-            if time.monotonic() > deadline:
-                raise RuntimeError("the feeder says nothing more")
-        line = self.process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"the feeder ended: exit code {self.process.wait()}")
-        return cast(dict[str, Any], json.loads(line))
-
-    def measure(self, gateway: "Gateway") -> Measured:
-        """Wait for the run to be over. RuntimeError if the gateway ended meanwhile."""
-        begun = self._line(gateway)["begin"]
-        before, started = cpu_ns(gateway.pid), time.monotonic_ns()
-        ended = self._line(gateway)["end"]
-        gateway.check()
-        used, took = cpu_ns(gateway.pid) - before, time.monotonic_ns() - started
-        result = self._line()
-        frames = max(1, ended - begun)
-        return Measured(used / 1000 / frames, used / took, result["sent"], result["lost"], result)
-
-    def close(self) -> None:
-        end(self.process, 0.5)
-
-
-class Gateway:
-    """One of the three programs at work."""
-
-    def __init__(
-        self,
-        context: Context,
-        program: str,
-        feeder: Feeder,
-        config: str = "",
-        dbc: Path = FIVE,
-        wrap: Callable[[list[str]], list[str]] = list,
-    ) -> None:
-        """``config``: further lines of our configuration, tables at their end. ``wrap`` makes another command of the command."""
-        self._folder = tempfile.TemporaryDirectory(prefix="kontronik-bench-")
-        self.folder = folder = Path(self._folder.name)
+def once(
+    context: Context,
+    program: str,
+    escs: int,
+    *options: str,
+    config: str = "",
+    dbc: Path = FIVE,
+    prefix: Sequence[str] = (),
+) -> Measured:
+    """One measurement. ``options``: of the feeder; ``config``: of ours; ``prefix``: in front of the gateway's command."""
+    bus, warmup = new_bus(), 0.5 if context.quick else 2.0
+    words = f"--bus {bus} --escs {escs} --seconds {context.seconds} --warmup {warmup} --priority {_PRIORITY}"
+    limited = ["timeout", context.seconds + warmup + 30, context.compiled("feeder.c", "-pthread")]
+    pipe, nothing = subprocess.PIPE, subprocess.DEVNULL
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kontronik-bench-")))
+        log = stack.enter_context((folder / "errors").open("w"))
+        feeding = started([*limited, *words.split(), *options], stdin=pipe, stdout=pipe)
+        feeder = stack.enter_context(feeding)
+        assert feeder.stdout is not None
+        ports = json.loads(feeder.stdout.readline())["ports"]
         if program == "c":
-            command = [str(context.compiled("gateway.c")), feeder.bus, *feeder.ports]
+            command: list[object] = [context.compiled("gateway.c"), bus, *ports]
+        elif program == "obvious":
+            command = standin(bus, program, FIVE, "lo", *ports)
         else:
-            command = [sys.executable, str(STANDIN), feeder.bus, program]
-            if program == "obvious":
-                command += [str(FIVE), "lo", *feeder.ports]
-            else:
-                text = config_text(feeder.ports, dbc, folder, config)
-                (folder / "gateway.toml").write_text(text)
-                command += ["run", "-c", str(folder / "gateway.toml")]
-        self._errors = (folder / "errors").open("w+")
-        # what is compiled at the first run is there from then on
-        same = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""}
-        nothing = subprocess.DEVNULL
-        self.process = start(
-            wrap(command), stdin=nothing, stdout=nothing, stderr=self._errors, env=same
-        )
-        self.program = program
-        self.pid = self.process.pid
+            command = standin(bus, program, "run", "-c", write_config(folder, ports, dbc, config))
+        streams = {"stdin": nothing, "stdout": nothing, "stderr": log, "env": ENVIRONMENT}
+        gateway = stack.enter_context(started([*prefix, *command], **streams))
 
-    def check(self) -> None:
-        """RuntimeError if it has ended."""
-        if self.process.poll() is not None:
-            raise RuntimeError(f"{self.program} ended by itself: {self.said()}")
+        def heard(is_last: bool = False) -> dict[str, Any]:
+            """The gateway may end with the bus, before the feeder has said all."""
+            line = feeder.stdout.readline() if feeder.stdout else ""
+            if not line or (gateway.poll() is not None and not is_last):
+                said = (folder / "errors").read_text().strip()[-2000:]
+                raise RuntimeError(f"{program} or the feeder ended: {said}")
+            found: dict[str, Any] = json.loads(line)
+            return found
 
-    def said(self) -> str:
-        """What it wrote to standard error."""
-        self._errors.flush()
-        return (self.folder / "errors").read_text().strip()[-2000:]
-
-    def close(self) -> None:
-        end(self.process)
-        self._errors.close()
-        self._folder.cleanup()
-
-
-def config_text(ports: Sequence[str], dbc: Path, folder: Path, further: str = "") -> str:
-    """Our configuration; the 1 Mbit/s are what its bus load is compared with."""
-    lines = ["[can]", 'interface = "socketcan"', 'channel = "lo"', "bitrate = 1000000"]
-    lines += ["[dbc]", f'file = "{dbc}"', further]
-    if "[statistics]" not in further:
-        lines += ["[statistics]", f'file = "{folder / "status.json"}"']
-    for index, port in enumerate(ports):
-        lines += ["[[esc]]", f'port = "{port}"', f'name = "e{index + 1}"', "pole_pairs = 7"]
-    return "\n".join(lines) + "\n"
-
-
-@contextlib.contextmanager
-def running(
-    context: Context, program: str, escs: int, *options: str, **further: Any
-) -> Iterator[tuple[Feeder, Gateway]]:
-    """A feeder and a gateway, both ended at the end."""
-    feeder = Feeder(context, escs, *options)
-    try:
-        gateway = Gateway(context, program, feeder, **further)
-        try:
-            yield feeder, gateway
-        except RuntimeError as error:
-            raise RuntimeError(f"{program}: {error}; it said: {gateway.said()}") from None
-        finally:
-            gateway.close()
-    finally:
-        feeder.close()
-
-
-def once(context: Context, program: str, escs: int, *options: str, **further: Any) -> Measured:
-    """One measurement."""
-    with running(context, program, escs, *options, **further) as (feeder, gateway):
-        measured = feeder.measure(gateway)
+        begun = heard()["begin"]
+        before, since = _cpu_ns(gateway.pid), time.monotonic_ns()
+        frames = max(1, heard()["end"] - begun)
+        used, took = _cpu_ns(gateway.pid) - before, time.monotonic_ns() - since
+        if not used:
+            raise LeftOut("this kernel counts CPU time by ticks, too coarse to compare")
+        rss = _rss_mb(gateway.pid)
+        measured = Measured(used / 1000 / frames, used / took, rss, heard(True))
     delay = measured.delay
-    context.say(
-        f"{program} {escs:3} ESC: {measured.cpu_us:7.1f} us/frame, {measured.cpu_share:5.1%} of a core, lost {measured.lost} of "
-        f"{5 * measured.sent}, delay {delay['p50']} / {delay['p99']} / {delay['max']:.0f} us"
+    say(
+        f"{program} {escs:3} ESC: {measured.cpu_us:7.1f} us/frame, {measured.cpu_share:5.1%} of a core, RSS {rss:.1f} MB, "
+        f"lost {measured.lost_share:.2%}, delay {delay['p50']} / {delay['p99']} / {delay['max']:.0f} us"
     )
     return measured
-
-
-def median(values: Sequence[float]) -> float:
-    """Of a few rounds."""
-    return float(statistics.median(values))

@@ -91,7 +91,7 @@ class Bench:
         """The gateway has started; what lets it run for so many seconds, and returns the time."""
         rng = random.Random(seed)
         gateway, now = self.gateway, START + rng.randrange(MS)
-        faults = Faults(noise=0.5, lost_bytes=0.002, flipped_bits=0.0002)
+        faults = Faults(flipped_bits=0.0005)
         escs = [
             SimulatedEsc(
                 EscOptions(device=rng.choice([Device.KOSMIK, Device.JIVEPRO]), faults=faults),

@@ -1,6 +1,5 @@
 """A gateway with DroneCAN nodes, without a clock; the package ``dronecan`` reads what it sends, and asks."""
 
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import pairwise
@@ -105,8 +104,6 @@ class Bench:
         self.live: list[LiveData | None] = [LIVE] * escs
         self.frames: list[tuple[int, CanFrame]] = []
         self.read: list[Transfer] = []
-        self.passes: Callable[[CanFrame], bool] = lambda _frame: True
-        """Which frames of ours the bus takes."""
         self._reader = Reader()
         for esc in range(escs):
             self.gateway.port(esc, True, self.now)
@@ -127,10 +124,9 @@ class Bench:
 
     def take(self) -> None:
         for frame in self.gateway.take_frames(self.now):
-            if self.passes(frame):
-                self.frames.append((self.now, frame))
-                if frame.extended and (found := self._reader.read(self.now, frame)) is not None:
-                    self.read.append(found)
+            self.frames.append((self.now, frame))
+            if frame.extended and (found := self._reader.read(self.now, frame)) is not None:
+                self.read.append(found)
 
     def run(self, seconds: float) -> "Bench":
         """Let time pass."""
@@ -162,6 +158,11 @@ class Bench:
         """Transfers of a type so far."""
         return [each for each in self.read if each.name == name and source in (None, each.source)]
 
+    def intervals(self, name: str, esc: int | None = None) -> list[int]:
+        """Between transfers of a type, of one ESC where they have its index."""
+        found = [e.at for e in self.of(name) if esc is None or e.payload.esc_index == esc]
+        return [after - before for before, after in pairwise(found)]
+
     def clear(self) -> None:
         self.read.clear()
         self.frames.clear()
@@ -174,7 +175,6 @@ class BenchDriver(dronecan.driver.common.AbstractDriver):  # type: ignore[misc]
         super().__init__()
         self._bench = bench
         self._seen = 0
-        self.is_dead = False
 
     def close(self) -> None:
         pass
@@ -184,7 +184,7 @@ class BenchDriver(dronecan.driver.common.AbstractDriver):  # type: ignore[misc]
         while self._seen < len(frames):
             frame = frames[self._seen][1]
             self._seen += 1
-            if frame.extended and not self.is_dead:
+            if frame.extended:
                 return CANFrame(frame.can_id, frame.data, True)
         return None
 
@@ -192,8 +192,7 @@ class BenchDriver(dronecan.driver.common.AbstractDriver):  # type: ignore[misc]
         self.send_frame(CANFrame(message_id, message, extended))
 
     def send_frame(self, frame: Any) -> None:
-        if not self.is_dead:
-            self._bench.receive(CanFrame(frame.id, bytes(frame.data), frame.extended))
+        self._bench.receive(CanFrame(frame.id, bytes(frame.data), frame.extended))
 
 
 class Peer:
@@ -231,8 +230,3 @@ def peers_frames(payload: Any, source: int, to: int | None = None, **more: Any) 
         discriminator=more.get("discriminator"),
     )
     return [CanFrame(each.message_id, bytes(each.bytes), True) for each in made.to_frames()]
-
-
-def intervals(transfers: Sequence[Transfer]) -> Iterator[int]:
-    times = [each.at for each in transfers]
-    return (after - before for before, after in pairwise(times))

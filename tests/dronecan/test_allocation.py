@@ -78,9 +78,13 @@ def test_without_an_allocator_it_asks_for_ever_and_says_nothing_else() -> None:
     assert line == f"DroneCAN kontronik_can_gw: waits for a node-ID, {len(times)} requests"
 
 
-def test_the_parts_go_out_one_after_the_other() -> None:
+def test_the_parts_go_out_one_after_the_other_and_anew_when_the_allocator_dies() -> None:
     bench = waiting().run(1.1)
     (own,) = unique_ids(bench)
+    bench.receive(*answers(0, own[:6]))
+    bench.run(5)  # nobody answers
+    firsts = [each.payload.first_part_of_unique_id for each in bench.of("Allocation")]
+    assert firsts[:3] == [True, False, True] and all(firsts[2:])
     for known in (6, 12):
         bench.clear()
         bench.receive(*answers(0, own[:known]))
@@ -90,35 +94,14 @@ def test_the_parts_go_out_one_after_the_other() -> None:
         assert part.at - asked <= 400 * MS
         assert not part.payload.first_part_of_unique_id
         assert bytes(part.payload.unique_id.to_bytes()) == own[known : known + 6]
+    for node_id in (0, 126, 127):  # none that a node can have
+        bench.receive(*answers(node_id, own))
+        assert node_ids(bench) == [None]
+    assert bench.output.facts()["node_ids_refused"] == 3
     bench.receive(*answers(77, own))
     assert node_ids(bench) == [77]
     assert [each.source for each in bench.run(0.1).of("NodeStatus")] == [77]
     assert bench.gateway.node_changes == 1
-
-
-def test_an_allocator_that_dies_in_between_is_asked_anew() -> None:
-    bench = waiting().run(1.1)
-    (own,) = unique_ids(bench)
-    bench.receive(*answers(0, own[:6]))
-    bench.run(5)
-    firsts = [each.payload.first_part_of_unique_id for each in bench.of("Allocation")]
-    assert firsts[:3] == [True, False, True]
-    assert all(firsts[2:])
-    for known in (6, 12):
-        bench.receive(*answers(0, own[:known]))
-        bench.run(0.41)
-    bench.receive(*answers(3, own))
-    assert node_ids(bench) == [3]
-
-
-@pytest.mark.parametrize("node_id", [0, 126, 127])
-def test_a_node_id_that_cannot_be_is_refused(node_id: int) -> None:
-    bench = waiting().run(1.1)
-    bench.receive(*answers(node_id, unique_ids(bench)[0]))
-    assert node_ids(bench) == [None]
-    assert bench.output.facts()["node_ids_refused"] == 1
-    bench.receive(*answers(5, unique_ids(bench)[0]))
-    assert node_ids(bench) == [5]
 
 
 def test_a_node_id_that_another_node_of_ours_has_is_refused() -> None:

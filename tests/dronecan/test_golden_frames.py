@@ -23,7 +23,7 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.transfer import transfer
 from kontronik_can_gw.slots import SlotSettings
 
-equipment, protocol = dronecan.uavcan.equipment, dronecan.uavcan.protocol
+protocol = dronecan.uavcan.protocol
 UNIQUE_ID = bytes(range(1, 17))
 
 
@@ -88,26 +88,6 @@ def test_a_golden_answer() -> None:
         "10010AAA#6A76640000000085 #EFBE010200000025 #0000000000000005 #0000000304010225 #0304050607080905"
         " #0A0B0C0D0E0F1025 #006F72672E657805 #616D706C652E6525 #736345"
     )
-
-
-@pytest.mark.parametrize(
-    ("kind", "named"),
-    [
-        (types.STATUS, equipment.esc.Status),
-        (types.STATUS_EXTENDED, equipment.esc.StatusExtended),
-        (types.NODE_STATUS, protocol.NodeStatus),
-        (types.CIRCUIT_STATUS, equipment.power.CircuitStatus),
-        (types.TEMPERATURE, equipment.device.Temperature),
-        (types.LOG_MESSAGE, protocol.debug.LogMessage),
-        (types.ALLOCATION, protocol.dynamic_node_id.Allocation),
-        (types.GET_NODE_INFO, protocol.GetNodeInfo.Request),
-        (types.RESTART_NODE, protocol.RestartNode.Request),
-        (types.GET_SET, protocol.param.GetSet.Request),
-    ],
-)
-def test_numbers_and_signatures_are_those_of_the_package(kind: DataType, named: object) -> None:
-    theirs = dronecan.get_dronecan_data_type(named())  # type: ignore[operator]
-    assert kind[:2] == (theirs.default_dtid, theirs.base_crc)
 
 
 def half(value: float) -> float:

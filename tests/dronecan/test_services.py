@@ -12,7 +12,7 @@ protocol = dronecan.uavcan.protocol
 GetSet = protocol.param.GetSet
 
 
-def test_node_info_says_who_it_is() -> None:
+def test_node_info_says_who_it_is_and_a_restart_is_refused() -> None:
     bench = Bench(2, per_esc_nodes=True, name="com.example.gw").run(2.2)
     peer = Peer(bench)
     infos = [peer.ask(protocol.GetNodeInfo.Request(), node_id) for node_id in (42, 43)]
@@ -22,6 +22,8 @@ def test_node_info_says_who_it_is() -> None:
     assert len({each[:6] for each in ids}) == 2  # what allocators are given first
     assert infos[0].status.uptime_sec == 2
     assert infos[0].hardware_version.major == 1
+    magic = protocol.RestartNode.Request().MAGIC_NUMBER
+    assert not peer.ask(protocol.RestartNode.Request(magic_number=magic), 42).ok  # refused
     other = Bench(given=loaded(name="com.example.gw.e0"))  # the same name: the same on this machine
     again = Peer(other.run(0.1)).ask(protocol.GetNodeInfo.Request(), 42)
     assert bytes(again.hardware_version.unique_id.to_bytes()) == ids[0]
@@ -67,12 +69,6 @@ def test_what_somebody_sets_stays_as_it_is() -> None:
     assert held(peer, "rpm") == "motor"
     bench.clear()
     assert len(bench.run(1).of("Status")) == 25
-
-
-def test_a_restart_is_refused() -> None:
-    bench = Bench().run(0.1)
-    request = protocol.RestartNode.Request(magic_number=protocol.RestartNode.Request().MAGIC_NUMBER)
-    assert not Peer(bench).ask(request, 42).ok
 
 
 def test_nothing_that_an_autopilot_commands_is_received() -> None:

@@ -11,8 +11,6 @@ from kontronik_can_gw.esc.decoder import EscProtocol, Field, FrameForm, Reading
 
 GAP_NS = 2_000_000
 _BODY = struct.Struct(">bHHHH")
-
-
 FORM = FrameForm(length=10)
 
 

@@ -2,7 +2,7 @@
 
 import re
 import termios
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,30 +96,6 @@ def test_both_protocols_reach_the_bus_side_by_side() -> None:
     }
 
 
-def test_who_reads_the_bus_takes_no_flag_that_the_protocol_has_not_for_a_good_sign() -> None:
-    flight = Flight()
-    flight.send(OLD, FRAME)
-    reader = SignalReader(flight.loaded.layout)
-    column = reader.column_of("undervoltage", 1)
-    assert column is not None
-    first, values = (reader.read(258, bytes(8)) or [])[0]
-    assert values[column - first] is None
-    (warning,) = [line for line in flight.loaded.warnings if "not supplied by" in line]
-    assert (
-        "KissMore: KissBecVoltage, KissUndervoltage: not supplied by the protocol kiss" in warning
-    )
-
-
-@pytest.mark.parametrize(
-    ("missing", "value"),
-    [("electrical_speed", "motor_run_time"), ("battery_current", "energy_used")],
-)
-def test_what_cannot_be_told_without_a_field_is_not_supplied(missing: str, value: str) -> None:
-    fields = tuple(field for field in KISS.fields if field.name != missing)
-    assert values_of(KISS)[value].supplied
-    assert not values_of(replace(KISS, fields=fields))[value].supplied
-
-
 def test_lost_telemetry_is_not_available_and_the_other_esc_goes_on() -> None:
     flight = Flight()
     flight.send(OLD, frame(20, 2_400, 0, 0, 0))
@@ -130,11 +106,35 @@ def test_lost_telemetry_is_not_available_and_the_other_esc_goes_on() -> None:
     assert flight.seen["OldBatteryVoltage"] == 25.0
 
 
-def test_a_node_shows_what_there_is_and_nothing_else() -> None:
+def test_who_reads_the_bus_takes_no_flag_that_the_protocol_has_not_for_a_good_sign() -> None:
+    loaded = Flight().loaded
+    reader = SignalReader(loaded.layout)
+    column = reader.column_of("undervoltage", 1)
+    assert column is not None
+    first, values = (reader.read(258, bytes(8)) or [])[0]
+    assert values[column - first] is None
+    (warning,) = [line for line in loaded.warnings if "not supplied by" in line]
+    assert (
+        "KissMore: KissBecVoltage, KissUndervoltage: not supplied by the protocol kiss" in warning
+    )
+
+
+@pytest.mark.parametrize(
+    ("missing", "value"),
+    [("electrical_speed", "motor_run_time"), ("battery_current", "energy_used")],
+)
+def test_what_cannot_be_known_without_a_field_is_not_supplied(missing: str, value: str) -> None:
+    fields = tuple(field for field in KISS.fields if field.name != missing)
+    assert values_of(KISS)[value].supplied
+    assert not values_of(replace(KISS, fields=fields))[value].supplied
+
+
+def test_node_status_and_tables_show_what_there_is_and_nothing_else() -> None:
     flight = Flight(canopen=shipped_canopen([1, 2]))
     flight.send(OLD, FRAME)
-    assert flight.gateway.nodes is not None
-    dictionary = flight.gateway.nodes.nodes[1].dictionary
+    gateway = flight.gateway
+    assert gateway.nodes is not None
+    dictionary = gateway.nodes.nodes[1].dictionary
     found: dict[int, object] = {}
     for sub in range(1, 17):
         read = dictionary.find(0x2000, sub).read
@@ -145,36 +145,19 @@ def test_a_node_shows_what_there_is_and_nothing_else() -> None:
     there = {sub: value for sub, value in found.items() if value is not None}
     assert there == {1: 21_000, 2: 2_400, 3: 123, 6: 55, 12: 20}
 
-
-def test_the_status_shows_it() -> None:
-    flight = Flight()
-    flight.send(OLD, FRAME)
     port = PortFacts("kiss", "/dev/zero", open=True)
-    document = _esc(flight.gateway.escs[1], port, flight.gateway.status, flight.now)
+    document = _esc(gateway.escs[1], port, gateway.status, flight.now)
     assert document["values"]["battery_current"] == 12.34
     assert document["values"]["bec_voltage"] is None
     assert document["counters"]["live"] == 1
     assert (document["operating_state"], document["errors"], document["device"]) == (None,) * 3
 
-
-def test_a_capture_names_the_protocol() -> None:
-    """One of 0.5.0 has none: the first."""
-    config = parse(MIXED, "mixed.toml")
-    setup = CaptureSetup(tuple(config.escs), ("a", "b"), None, DbcSettings(), False, False, None)
-    assert CaptureSetup.of(setup.header()).escs == tuple(config.escs)
-    old: Any = setup.header()
-    old["escs"] = [{k: v for k, v in esc.items() if k != "protocol"} for esc in old["escs"]]
-    assert [esc.protocol for esc in CaptureSetup.of(old).escs] == ["kontronik", "kontronik"]
-
-
-def test_a_table_has_its_values_by_name() -> None:
-    flight = Flight()
-    flight.send(OLD, FRAME)
-    escs, esc = [esc.settings for esc in flight.gateway.escs], flight.gateway.escs[1]
-    live = {}
-    for field, value in values_of_fields(fields_of_values(escs), escs):
-        if field.esc == 1 and VALUES[field.source].group is Group.LIVE:
-            live[field.source] = reader_of(value)(esc, flight.gateway.status, flight.now)
+    escs = [esc.settings for esc in gateway.escs]
+    live = {
+        field.source: reader_of(value)(gateway.escs[1], gateway.status, flight.now)
+        for field, value in values_of_fields(fields_of_values(escs), escs)
+        if field.esc == 1 and VALUES[field.source].group is Group.LIVE
+    }
     assert {name: value for name, value in live.items() if value is not None} == {
         "electrical_speed": 21_000,
         "battery_voltage": 24.0,
@@ -187,15 +170,21 @@ def test_a_table_has_its_values_by_name() -> None:
     }
 
 
+def test_a_capture_names_the_protocol() -> None:
+    """One of 0.5.0 has none: the first."""
+    escs = tuple(parse(MIXED, "mixed.toml").escs)
+    setup = CaptureSetup(escs, ("a", "b"), None, DbcSettings(), False, False, None)
+    assert CaptureSetup.of(setup.header()).escs == escs
+    old: Any = setup.header()
+    old["escs"] = [{k: v for k, v in esc.items() if k != "protocol"} for esc in old["escs"]]
+    assert [esc.protocol for esc in CaptureSetup.of(old).escs] == ["kontronik", "kontronik"]
+
+
 def test_its_line_is_set_without_parity() -> None:
-    with PtyEsc() as esc:
-        port = SerialPort(esc.path, KISS)
-        try:
-            flags, speed = (termios.tcgetattr(port.fileno())[at] for at in (2, 4))
-            assert not flags & termios.PARENB
-            assert speed == termios.B115200
-        finally:
-            port.close()
+    with PtyEsc() as esc, closing(SerialPort(esc.path, KISS)) as port:
+        flags, speed = (termios.tcgetattr(port.fileno())[at] for at in (2, 4))
+    assert not flags & termios.PARENB
+    assert speed == termios.B115200
 
 
 @pytest.mark.parametrize(

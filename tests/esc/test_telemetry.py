@@ -98,21 +98,6 @@ def value(name: str, telemetry: EscStream) -> float:
 # --- link states
 
 
-@pytest.mark.parametrize("layout", list(Layout))
-def test_the_first_live_frame_makes_the_link_ok(layout: Layout) -> None:
-    telemetry = esc()
-    states = [telemetry.link]
-    read(telemetry, NOISE, SECOND)
-    assert (telemetry.live, telemetry.age_ms(SECOND)) == (None, None)
-    states.append(telemetry.link)
-    events = read(telemetry, live(7, layout), SECOND)
-    assert events & Event.LINK and events & Event.LIVE
-    assert [*states, telemetry.link] == [LinkState.NEVER_SEEN, LinkState.SEARCHING, LinkState.OK]
-    assert telemetry.live is not None and telemetry.live.electrical_speed == 7
-    assert telemetry.age_ms(SECOND) == 0
-    assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[layout]
-
-
 @pytest.mark.parametrize(
     ("broken", "noise", "state"),
     [

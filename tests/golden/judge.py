@@ -263,32 +263,28 @@ class Judge:
         return esc
 
     def received(self, frame: drive.CanFrame) -> None:
-        """A frame from the bus: what a master writes by itself to 2100h of an ESC's node, or resets, is not followed."""
-        node = frame.can_id & 0x7F
-        if frame.can_id == 0 and frame.data[:1] == b"\x81":
+        """A frame from the bus: what a master writes by itself to 2100h, or resets, is not followed."""
+        is_write = frame.data[1:3] == b"\x00\x21" and frame.data[0] & 0xE0 in _DOWNLOADS
+        if is_write or (frame.can_id == 0 and frame.data[:1] == b"\x81"):
             for esc in self.escs:
                 esc.sure = False
-        elif frame.can_id & ~0x7F == 0x600 and frame.data[1:3] == b"\x00\x21":
-            writes = frame.data[0] & 0xE0 in _DOWNLOADS
-            if writes and node in self.node_ids:
-                self.escs[self.node_ids.index(node)].sure = False
 
     def setting(self, node: int, entry: int, data: bytes) -> None:
         """A confirmed download to 2100h."""
         if node not in self.node_ids:
             return
-        esc = self.escs[self.node_ids.index(node)]
-        value = int.from_bytes(data, "little")
-        if entry == 1:
-            esc.pole_pairs = value
-        elif entry == 2:
-            esc.gear = Fraction(value, esc.gear.denominator)
-        elif entry == 3:
-            esc.gear = Fraction(esc.gear.numerator, value)
-        elif entry == 4:
-            esc.timeout = value * 10**6
-        elif entry == 7:
-            esc.cells = value
+        esc, value = self.escs[self.node_ids.index(node)], int.from_bytes(data, "little")
+        match entry:
+            case 1:
+                esc.pole_pairs = value
+            case 2:
+                esc.gear = Fraction(value, esc.gear.denominator)
+            case 3:
+                esc.gear = Fraction(esc.gear.numerator, value)
+            case 4:
+                esc.timeout = value * 10**6
+            case 7:
+                esc.cells = value
 
     def sent(self, now: int, frame: drive.CanFrame) -> None:
         """A frame of the gateway."""

@@ -6,7 +6,6 @@ from pathlib import Path
 import judge
 import pytest
 import record
-import scenario
 
 HERE = record.HERE
 
@@ -67,23 +66,3 @@ def test_only_the_adapter_knows_the_product() -> None:
     assert [
         file.name for file in HERE.glob("*.py") if knowing.search(file.read_text(encoding="utf-8"))
     ] == ["drive.py"]
-
-
-@pytest.mark.parametrize(
-    ("frame", "sure"),
-    [
-        ("602#2F00210104000000", [True, False]),
-        ("602#2100210104000000", [True, False]),
-        ("602#C000210101000000", [True, False]),
-        ("602#4000210100000000", [True, True]),  # a read
-        ("582#2F00210104000000", [True, True]),
-        ("607#2F00210104000000", [True, True]),
-        ("000#8102", [False, False]),
-    ],
-)
-def test_a_master_that_writes_settings_of_a_node_makes_its_esc_unsure(
-    frame: str, sure: list[bool]
-) -> None:
-    escs = [judge.Esc("Left"), judge.Esc("Right")]
-    judge.Judge(escs, None, [1, 2]).received(scenario.read_frame(frame))
-    assert [esc.sure for esc in escs] == sure

@@ -24,7 +24,7 @@ def test_rows_frames_damage_and_text_are_those_of_python(
     native_library: Any, tmp_path: Path, group: int
 ) -> None:
     counts = [offline_equality.run(native_library, seed, tmp_path) for seed in range(group, 12, 4)]
-    assert sum(counts) > 500
+    assert sum(counts) > 200
 
 
 @pytest.mark.extended
@@ -33,7 +33,7 @@ def test_the_same_over_many_more_recordings(
     native_library: Any, tmp_path: Path, group: int
 ) -> None:
     seeds = range(1_000 + group, 1_040, 10)
-    assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 500
+    assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 200
 
 
 def test_what_it_does_not_play_python_plays(native_library: Any, tmp_path: Path) -> None:

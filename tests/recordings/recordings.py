@@ -32,7 +32,7 @@ def capture_bytes(
 @cache
 def dump_bytes(seconds: float = 4, faults: bool = False) -> bytes:
     """The bytes of one ESC."""
-    spoilt = Faults(noise=0.5, lost_bytes=0.002, flipped_bits=0.0002) if faults else Faults()
+    spoilt = Faults(flipped_bits=0.0005) if faults else Faults()
     esc = SimulatedEsc(EscOptions(device=Device.KOSMIK, faults=spoilt), seed=5)
     return b"".join(sent.wire for sent in esc.frames_until(int(seconds * SECOND)))
 

@@ -64,7 +64,7 @@ def test_it_is_ready_and_alive_outlives_a_hang_up_records_all_and_says_that_it_e
     captures = tmp_path / "captures"
     command = [*PROGRAM, "run", "-c", str(config), "--wait", "--record", str(captures)]
     with (
-        telemetry(EscOptions(faults=Faults(noise=0.5, lost_bytes=0.002)), EscOptions()) as ports,
+        telemetry(EscOptions(faults=Faults(flipped_bits=0.0005)), EscOptions()) as ports,
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening,
         errors.open("w") as log,
     ):

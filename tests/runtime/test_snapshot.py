@@ -78,7 +78,7 @@ def test_values_older_than_the_time_out_are_null() -> None:
 
 
 def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> None:
-    bench = Bench(1, options=EscOptions(faults=Faults(noise=0.5, flipped_bits=1e-4)))
+    bench = Bench(1, options=EscOptions(faults=Faults(flipped_bits=1e-4)))
     bench.run(3)
     document = bench.document()
     counters = document["escs"][0]["counters"]

@@ -108,13 +108,11 @@ class DemoBus(Source):
 
 
 def _flight(seed: int, start_ns: int) -> SimulatedEsc:
-    """A short flight, again and again, with noise, damaged frames, silences and errors."""
+    """A short flight, again and again, with damaged frames, silences and errors."""
     errors = tuple(
         ErrorWindow(_ERRORS[n % len(_ERRORS)], (6 + 13 * n) * SECOND_NS, 3 * SECOND_NS)
         for n in range(1000)
     )
-    faults = Faults(
-        noise=0.02, flipped_bits=1e-5, dropout=Dropout(SECOND_NS, 17 * SECOND_NS), errors=errors
-    )
+    faults = Faults(flipped_bits=1e-5, dropout=Dropout(SECOND_NS, 17 * SECOND_NS), errors=errors)
     profile = tuple(phase._replace(duration_s=max(1.5, phase.duration_s * 0.4)) for phase in FLIGHT)
     return SimulatedEsc(EscOptions(profile=profile, faults=faults), seed=seed, start_ns=start_ns)

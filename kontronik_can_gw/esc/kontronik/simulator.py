@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import NamedTuple
 
+from kontronik_can_gw.esc.decoder import SECOND_NS as SECOND_NS
 from kontronik_can_gw.esc.kontronik.codec import Layout as Layout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import Data
@@ -23,7 +24,6 @@ from kontronik_can_gw.esc.kontronik.states import Device as Device
 from kontronik_can_gw.esc.kontronik.states import OperatingError as OperatingError
 from kontronik_can_gw.esc.kontronik.states import SelfTestError as SelfTestError
 
-SECOND_NS = 1_000_000_000
 BYTE_NS = 11 * SECOND_NS // 115_200
 """Wire time of a byte: start, 8 data, parity, stop."""
 
@@ -55,10 +55,6 @@ class Swap(NamedTuple):
 class Faults:
     """What goes wrong."""
 
-    noise: float = 0.0
-    """Mean number of random bytes in front of a frame, 0..1000."""
-    lost_bytes: float = 0.0
-    """Share of the frames' bytes that get lost, 0..1."""
     flipped_bits: float = 0.0
     """Share of the frames' bits that are flipped, 0..1."""
     dropout: Dropout | None = None
@@ -97,11 +93,12 @@ class Sent(NamedTuple):
     frame: bytes
     """The frame as built."""
     wire: bytes
-    """What goes out: noise in front, then the frame less lost bytes, with flipped bits."""
-    intact: bool
-    """The frame is whole in ``wire``. Where False, a receiver rejects the frame, with two exceptions: in the legacy layout a
-    flipped bit in the last bytes before the CRC (live: 32, 33; info: 36) is not covered, and is accepted; and a lost last
-    byte may happen to be replaced by what follows, which is then missing there."""
+    """What goes out: the frame with flipped bits."""
+
+    @property
+    def intact(self) -> bool:
+        """Where False, a receiver rejects the frame, but for flips of bits that the legacy layout's CRC does not cover."""
+        return self.wire == self.frame
 
 
 class SimulatedEsc:
@@ -123,9 +120,7 @@ class SimulatedEsc:
         self._model = self._powered_up(options.device, seed)
         self._swaps = list(reversed(faults.swaps))
         self._faults = faults
-        self._random = Random(f"faults {seed}")
-        self._noise_step = math.log(faults.noise / (1 + faults.noise)) if faults.noise else 0.0
-        self._losses, self._flips = Random(f"losses {seed}"), Random(f"flips {seed}")
+        self._flips = Random(f"flips {seed}").random
 
     def frames_until(self, now_ns: int) -> list[Sent]:
         """What leaves up to and including ``now_ns`` and was not returned yet, in order."""
@@ -161,7 +156,8 @@ class SimulatedEsc:
             duration, interval = self._faults.dropout
             if since_start % interval >= interval - duration:
                 return None
-        return self._spoiled(now_ns, data, encode(data, self.layout))
+        frame = encode(data, self.layout)
+        return Sent(now_ns, data, frame, self._spoiled(frame))
 
     def _plug_in(self, swap: Swap) -> None:
         self.device = swap.device
@@ -181,27 +177,9 @@ class SimulatedEsc:
                 word |= 1 << bit
         return word
 
-    def _spoiled(self, now_ns: int, data: Data, frame: bytes) -> Sent:
-        flips = _hits(self._faults.flipped_bits, self._flips, 8 * len(frame))
-        losses = _hits(self._faults.lost_bytes, self._losses, len(frame))
-        body = bytearray(frame)
-        for bit in flips:
-            body[bit // 8] ^= 1 << bit % 8
-        for at in reversed(losses):
-            del body[at]
-        noise = self._noise() if self._noise_step else b""
-        return Sent(now_ns, data, frame, noise + body, not flips and not losses)
-
-    def _noise(self) -> bytes:
-        """Random bytes, geometric in number; one in eight ends with the beginning of a header."""
-        random = self._random
-        noise = random.randbytes(int(math.log(1 - random.random()) / self._noise_step))
-        if noise and random.random() < 0.125:
-            start = b"KODL"[: random.randint(1, min(4, len(noise)))]
-            noise = noise[: len(noise) - len(start)] + start
-        return noise
-
-
-def _hits(probability: float, random: Random, length: int) -> list[int]:
-    """Which of the next ``length`` places are hit, each with this probability."""
-    return [at for at in range(length) if random.random() < probability] if probability else []
+    def _spoiled(self, frame: bytes) -> bytes:
+        share = self._faults.flipped_bits
+        if not share:
+            return frame
+        flips = sum(1 << bit for bit in range(8 * len(frame)) if self._flips() < share)
+        return (int.from_bytes(frame, "little") ^ flips).to_bytes(len(frame), "little")
