@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.dbc import database as canopen_database
+from kontronik_can_gw.canopen.dbc import dbc_text as canopen_text
 from kontronik_can_gw.canopen.dbc import waiting_for_lss
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
@@ -51,10 +51,9 @@ def main(args: argparse.Namespace) -> int:
         args.config = announced_config(with_nodes=args.canopen)
     escs = [EscSettings(f"esc{number}") for number in range(1, (args.esc or 1) + 1)]
     if args.canopen:
-        database = _canopen(args.config, escs)
+        text = _canopen(args.config, escs)
     else:
-        database = _messages(args.config, source or shipped("dbc/kontronik_esc.dbc"), escs)
-    text = dbc_text(database)
+        text = dbc_text(_messages(args.config, source or shipped("dbc/kontronik_esc.dbc"), escs))
     encoding = "cp1252"  # what tools assume; usually the text is ASCII
     try:
         text.encode(encoding)
@@ -67,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _canopen(config: Path | None, escs: list[EscSettings]) -> "Database":
+def _canopen(config: Path | None, escs: list[EscSettings]) -> str:
     if config is not None:
         loaded = load_all(config)
         setup, escs = canopen_of(loaded), loaded.escs
@@ -79,7 +78,7 @@ def _canopen(config: Path | None, escs: list[EscSettings]) -> "Database":
         say(
             f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to describe"
         )
-    return canopen_database(nodes, escs)
+    return canopen_text(nodes, escs)
 
 
 def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> "Database":
