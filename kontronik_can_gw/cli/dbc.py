@@ -4,7 +4,6 @@ import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen.dbc import dbc_text as canopen_text
 from kontronik_can_gw.canopen.dbc import waiting_for_lss
@@ -13,16 +12,13 @@ from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, 
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
-from kontronik_can_gw.dbc.expand import copies_of, expand
+from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-
-if TYPE_CHECKING:
-    from cantools.database.can import Database
 
 _ESCS = number_from(1, 127, "number of ESCs", kind=int)
 # fmt: off
@@ -53,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
     if args.canopen:
         text = _canopen(args.config, escs)
     else:
-        text = dbc_text(_messages(args.config, source or shipped("dbc/kontronik_esc.dbc"), escs))
+        text = _messages(args.config, source or shipped("dbc/kontronik_esc.dbc"), escs)
     encoding = "cp1252"  # what tools assume; usually the text is ASCII
     try:
         text.encode(encoding)
@@ -81,7 +77,7 @@ def _canopen(config: Path | None, escs: list[EscSettings]) -> str:
     return canopen_text(nodes, escs)
 
 
-def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> "Database":
+def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> str:
     """The messages of a configuration, else of these ESCs by a DBC for one. UserError for mistakes that the gateway refuses."""
     settings = DbcSettings()
     if config is not None:
@@ -98,7 +94,6 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> "
         layout = prepare(plain, str(file), escs, settings, fd_allowed=True)
         for line in (*ignored, *layout.warnings):
             say(f"warning: {line}")
-    database = expand(plain, copies_of(plain, layout.file, escs, settings))
-    version = re.sub(" ?layout [0-9A-F]{8}$", "", database.version or "")
-    database.version = f"{version} layout {layout.fingerprint}".strip()
-    return database
+    version = re.sub(" ?layout [0-9A-F]{8}$", "", plain.version or "")
+    copies = copies_of(plain, layout.file, escs, settings)
+    return dbc_text(plain, copies, f"{version} layout {layout.fingerprint}".strip())

@@ -1,9 +1,7 @@
 """Copies a one-ESC DBC for several ESCs: names prefixed, ids moved, nothing lost."""
 
 import fnmatch
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from copy import copy, deepcopy
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.binding import Binder
@@ -11,13 +9,11 @@ from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import MAX_NAME, esc_prefix
 from kontronik_can_gw.dbc.reader import choose_node, listed
 from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.dbc.writer import frame_id
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
-    from cantools.database.can.formats.dbc import DbcSpecifics
 
 
 def copies_of(
@@ -79,37 +75,6 @@ def _chosen(database: "Database", node: str, patterns: Sequence[str], file: str)
     return [m for m in database.messages if m.name in chosen or m.name not in ours]
 
 
-def expand(database: "Database", copies: Sequence[Copy]) -> "Database":
-    """The database with these copies for its messages."""
-    import cantools.database.can
-
-    return cantools.database.can.Database(
-        messages=[_message(made) for made in copies],
-        nodes=database.nodes,
-        buses=database.buses,
-        version=database.version,
-        dbc_specifics=_relations(database.dbc, copies),
-        strict=False,
-        sort_signals=None,
-    )
-
-
-def _message(made: Copy) -> "Message":
-    """A copy as cantools has it; the database that it gets into refreshes what cantools derives of it."""
-    message = copy(made.message)
-    message.name, message.frame_id = made.name, made.frame_id
-    message._signals = [copy(signal) for signal in made.message.signals]
-    for signal in message._signals:
-        signal.name = made.prefix + signal.name
-        if signal.multiplexer_signal is not None:
-            signal.multiplexer_signal = made.prefix + signal.multiplexer_signal
-    if message.signal_groups is not None:
-        message.signal_groups = [copy(group) for group in message.signal_groups]
-        for group in message.signal_groups:
-            group.signal_names = [made.prefix + name for name in group.signal_names]
-    return message
-
-
 def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
     """Ids outside the range of CAN ids, and names that become too long with a prefix: a line for all of them."""
     ours = [made for made in copies if node in made.message.senders]
@@ -132,29 +97,6 @@ def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
     if names:
         what = f"longer than {MAX_NAME} characters with the ESC's name in front"
         yield f"{what}: {listed(names)}. Shorten the name of the ESC, or those in the DBC."
-
-
-def _relations(specifics: "DbcSpecifics | None", copies: Sequence[Copy]) -> "DbcSpecifics | None":
-    """Copies attributes of relations (BA_REL_), which refer to messages and signals by id and name."""
-    specifics = deepcopy(specifics)
-    relations = specifics.relation_attributes if specifics is not None else None
-    if relations is None:
-        return specifics
-    moved: dict[int, list[Copy]] = {}
-    for made in copies:
-        moved.setdefault(frame_id(made.message), []).append(made)
-    signals, messages = relations.node_signal_relations, relations.node_message_relations
-    old_signals, old_messages = dict(signals), dict(messages)
-    signals.clear()
-    messages.clear()
-    for number, by_signal in old_signals.items():
-        for made in moved.get(number, []):
-            renamed = ((made.prefix + name, nodes) for name, nodes in by_signal.items())
-            signals[number + made.distance] = OrderedDict(renamed)
-    for number, by_node in old_messages.items():
-        for made in moved.get(number, []):
-            messages[number + made.distance] = by_node
-    return specifics
 
 
 def _step(ids: Sequence[tuple[int, bool, bool]], count: int, wanted: int | None, file: str) -> int:

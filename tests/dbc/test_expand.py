@@ -37,7 +37,7 @@ def multiplied(
 ) -> tuple[Database, str]:
     plain = read(text)
     copies = expand.copies_of(plain, "my.dbc", escs, DbcSettings(node=node, **more))
-    out = writer.dbc_text(expand.expand(plain, copies))
+    out = writer.dbc_text(plain, copies)
     return read(out), out
 
 
