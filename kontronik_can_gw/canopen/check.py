@@ -1,6 +1,6 @@
 """What an EDS must hold so that a node of ours can be built from it: found at start, each mistake by object."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import SdoAbort
@@ -12,7 +12,7 @@ from kontronik_can_gw.canopen.data_types import (
     WHOLE,
     range_of,
 )
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
+from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.node_settings import NodeSettings, configured_settings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
@@ -134,32 +134,25 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     node = Nodes(setup, escs, status, Slots(escs, status).add, lambda *_: None).nodes[0]
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
-    checks: list[tuple[Variable, Callable[[int], object] | None]]
-    checks = [(v, v.check) for v in dictionary.variables.values() if v.entry.index in CHECKED]
+    for variable in dictionary.variables.values():
+        entry, check, value = variable.entry, variable.check, variable.value
+        if entry.index in CHECKED and check is not None and isinstance(value, int):
+            try:
+                check(value)
+            except SdoAbort as error:
+                of = f" (node-ID {node_id})" if entry.relative else ""
+                said = f"DefaultValue {value:#x}{of} is not allowed ({error})."
+                yield f"{entry.place} {entry.name}: {said}"
     for tpdo in node.tpdos:
-        count = dictionary.number(tpdo.indices[1])
-        checks += [(variable, tpdo.resolve) for variable in tpdo.mappings[:count]]
-    refused = False
-    for variable, check in checks:
-        entry = variable.entry
-        if check is None or not isinstance(value := variable.value, int):
-            continue
-        try:
-            check(value)
-        except SdoAbort as error:
-            of = f" (node-ID {node_id})" if entry.relative else ""
-            maps = entry.index in _MAPPINGS
-            remedy = " Map an object with PDOMapping=1, in its own length." if maps else ""
-            said = f"DefaultValue {value:#x}{of} is not allowed ({error}).{remedy}"
-            yield f"{entry.place} {entry.name}: {said}"
-            refused = True
-    for tpdo in () if refused else node.tpdos:
         try:
             tpdo.read()
             tpdo.check()
         except SdoAbort as error:
             index, mapping = tpdo.indices
-            yield f"TPDO {tpdo.number + 1}: the defaults of {index:04X}h and {mapping:04X}h do not make a PDO of node {node_id} ({error})."
+            yield (
+                f"TPDO {tpdo.number + 1}: the defaults of {index:04X}h and {mapping:04X}h do not make a PDO of node {node_id} ({error}). "
+                "Map objects with PDOMapping=1, in their own lengths, 64 bits in all, at a COB-ID that is free."
+            )
 
 
 def _shared_ids(dictionary: Dictionary, node_ids: Sequence[int]) -> Iterator[str]:

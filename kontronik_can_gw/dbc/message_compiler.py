@@ -99,7 +99,7 @@ def _signals(job: Compilation, copy: Copy) -> list[SignalPlan]:
 
 def _placement_problems(message: "Message", where: str) -> Iterator[str]:
     """The first signal outside the message, or that overlaps another one on a page, as cantools finds it."""
-    from cantools.database import Error
+    from cantools.database.errors import Error
 
     try:
         message.refresh(strict=True)

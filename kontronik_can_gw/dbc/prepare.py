@@ -142,8 +142,6 @@ def _timing_warnings(job: Compilation, plans: Sequence[MessagePlan]) -> Iterator
         yield (
             f"{job.file}: sent once at the start, without a cycle and a value that changes: {listed(once)}"
         )
-    if names := job.while_active:
-        yield f"{job.file}: sent all the time, not only while something is active: {listed(names)}"
 
 
 def check_load(
