@@ -173,13 +173,13 @@ class PythonCore:
     def advance(self, now: int) -> None:
         if now >= self._next_expiry:
             self.expire(now)
-        if now >= self.messages.schedule.next_due:
+        if now >= self.messages.next_due:
             self.messages.advance(now)
         self.slots.advance(now)
 
     def next_deadline(self) -> int:
         due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
-        return min(due, self.messages.schedule.next_due, self.slots.next_deadline())
+        return min(due, self.messages.next_due, self.slots.next_deadline())
 
     def take(self, now: int) -> list[CanFrame]:
         slots, messages = self.slots.take(now), self.messages.take(now)

@@ -25,8 +25,6 @@ class Identity:
         boot: Callable[[int], None],
     ) -> None:
         self.active_node_id = UNCONFIGURED
-        stored = parameters.set_node_id
-        self.pending_node_id = settings.node_id if stored is None else stored
         self._dictionary = dictionary
         self._settings = settings
         self._parameters = parameters
@@ -34,9 +32,16 @@ class Identity:
         self._boot = boot
         bind = dictionary.bind
         bind(at.NODE_ID, 1, read=lambda _now: self.active_node_id)
-        bind(at.NODE_ID, 2, read=self._pending, check=self._check_node_id, written=self._written)
+        check, read = self._check_node_id, lambda _now: self.pending_node_id
+        bind(at.NODE_ID, 2, read=read, check=check, written=self._written)
         bind(at.NODE_ID, 3, read=lambda _now: settings.bitrate)
         bind(at.NODE_ID, 4, read=lambda _now: settings.bitrate)
+
+    @property
+    def pending_node_id(self) -> int:
+        """The node-ID from the next reset communication on: as set over the bus, else as configured."""
+        given = self._parameters.set_node_id
+        return self._settings.node_id if given is None else given
 
     @property
     def identity(self) -> tuple[int, int, int, int]:
@@ -54,7 +59,7 @@ class Identity:
         """A new node-ID for the next reset communication. False where writing is switched off or another node of ours has it."""
         if self._settings.read_only or (node_id != UNCONFIGURED and self._taken(node_id)):
             return False
-        self._set_pending(node_id)
+        self._parameters.set_node_id = node_id
         return True
 
     def store_configuration(self) -> bool:
@@ -69,18 +74,11 @@ class Identity:
         if self.active_node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
             self._boot(now)
 
-    def _set_pending(self, node_id: int) -> None:
-        self.pending_node_id = node_id
-        self._parameters.set_node_id = node_id
-
     def _check_node_id(self, value: int) -> None:
         if not 1 <= value <= 127:
             raise SdoAbort(Abort.VALUE)
         if self._taken(value):
             raise SdoAbort(Abort.INCOMPATIBLE)
 
-    def _pending(self, _now: int) -> int:
-        return self.pending_node_id
-
     def _written(self, _now: int) -> None:
-        self._set_pending(self._dictionary.number(at.NODE_ID, 2))
+        self._parameters.set_node_id = self._dictionary.number(at.NODE_ID, 2)

@@ -20,32 +20,30 @@ Choices where the standard leaves room:
 * An unused bit ("x") of a command is ignored, so any command with specifier 4 is an abort; an abort is never answered.
 """
 
+from collections import deque
 from collections.abc import Callable
-from typing import TypeVar
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.sdo_transfers import (
     BLOCK_SIZE,
-    BlockDownload,
-    BlockUpload,
-    InFlight,
-    Pace,
-    SegmentedDownload,
-    SegmentedUpload,
+    SubBlock,
+    Transfer,
+    block_download,
+    block_upload,
     check_block_size,
+    segmented_download,
+    segmented_upload,
 )
 from kontronik_can_gw.output import NEVER
 
 TIMEOUT_NS = 2_000_000_000
 """A transfer ends with 05040000h this long after the last frame of either side."""
+BURST = 4
+"""Paced block upload segments sent without a pause."""
 
 _CLIENT_ABORT = 0x80
 _NO_MULTIPLEXER = b"\0\0\0"
-
-
-_Transfer = SegmentedDownload | SegmentedUpload | BlockDownload | BlockUpload
-_T = TypeVar("_T", SegmentedDownload, SegmentedUpload, BlockDownload, BlockUpload)
 
 
 class SdoServer:
@@ -60,17 +58,19 @@ class SdoServer:
     ) -> None:
         self._objects = objects
         self._send = send
-        self._pace = Pace(segment_ns)
-        self._transfer: _Transfer | None = None
+        self._segment_ns = segment_ns
+        self._transfer: Transfer | None = None
         self._confirming = False
         """All data is here, the result of the dictionary is pending."""
         self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
-        self._index = 0
-        self._sub = 0
         self._answer = b""  # what confirms a download
         self._ticket = 0
-        self._in_flight = InFlight()
+        self._outgoing: deque[bytes] = deque()
+        """Segments of a block upload's sub-block."""
+        self._next_burst = 0
+        """When more of them may be sent; of all uploads: one that begins anew has not more of the bus."""
+        self._sub_block = SubBlock()
 
     @property
     def busy(self) -> bool:
@@ -89,12 +89,10 @@ class SdoServer:
         if now >= self._deadline:
             self._abort(Abort.TIMEOUT)
         try:
-            download = self._open_block_download()
-            if download is not None and data[0] != _CLIENT_ABORT:
-                self._in_flight.segment_seen(now)
-                if answer := download.take(data):
-                    self._send(answer)
-            elif not self._in_flight.swallow(data[0], now):
+            if self._sub_block.next_segment is not None and data[0] != _CLIENT_ABORT:
+                self._sub_block.seen(now)
+                self._go_on(data, now)
+            elif not self._sub_block.swallow(data[0], now):
                 self._serve(data, now)
         except SdoAbort as abort:
             self._abort(abort.code)
@@ -119,164 +117,77 @@ class SdoServer:
         """Let time pass: the time-out of a transfer, and the paced segments of a block upload."""
         if now < self.due:
             return
-        if (upload := self._bursting) is None:
-            self._abort(Abort.TIMEOUT)
-        else:
-            upload.advance(now)
+        if self._outgoing:
+            self._send_burst(now)
             self._deadline = now + TIMEOUT_NS
+        else:
+            self._abort(Abort.TIMEOUT)
 
     @property
     def due(self) -> int:
         """When ``advance`` has something to do."""
-        upload = self._bursting
-        return self._deadline if upload is None else self._pace.next_burst
+        return self._next_burst if self._outgoing else self._deadline
 
-    @property
-    def _bursting(self) -> BlockUpload | None:
-        """A block upload in the midst of a sub-block."""
-        transfer = self._transfer
-        return transfer if isinstance(transfer, BlockUpload) and transfer.bursts else None
+    def reset(self) -> None:
+        """Drop any transfer without an answer."""
+        self._transfer, self._confirming = None, False
+        self._sub_block.close()
+        self._outgoing.clear()
+        self._deadline = NEVER
+        self._multiplexer = _NO_MULTIPLEXER
 
     # ---- requests
 
     def _serve(self, data: bytes, now: int) -> None:
         command = data[0]
         match command >> 5:
-            case 0:
-                self._take_segment(data, now)
             case 1:
                 self._initiate_download(data, now)
             case 2:
-                self._begin(data)
-                self._start_upload(self._objects.upload(self._index, self._sub, now))
-            case 3:
-                self._give_segment(command)
+                self._start_upload(self._upload(data, now))
             case 4:
                 self.reset()
-                self._in_flight.expect(0)  # a client that aborts sends no more segments
-            case 5:
-                self._serve_block_upload(data, now)
-            case 6 if command & 1:
-                self._store(self._running(BlockDownload).end(data), b"\xa1" + bytes(7), now)
-            case 6:
-                self._initiate_block_download(data, now)
+                self._sub_block.forget()
+            case 5 if not command & 3:
+                self._initiate_block_upload(data, now)
+            case 6 if not command & 1:
+                # 110x xCs0 (C: CRC), multiplexer, size. Answer: A4h (CRC supported), multiplexer, block size, 0 (3)
+                sizes = self._check_download(data, bool(command & 2))
+                self._sub_block.seen(now)
+                answer = self._initiated(0xA4, bytes((BLOCK_SIZE,)))
+                self._start(block_download(answer, *sizes, bool(command & 4), self._sub_block))
             case _:
-                raise SdoAbort(Abort.COMMAND)
+                self._go_on(data, now)
 
-    def _begin(self, data: bytes) -> None:
-        """Leave what is going on for the transfer that an initiate request names."""
+    def _start(self, transfer: Transfer) -> None:
+        self._transfer = transfer
+        self._send(next(transfer))
+
+    def _go_on(self, data: bytes, now: int) -> None:
+        """A request that belongs to the present transfer; 05040001h where there is none."""
+        if self._transfer is None:
+            raise SdoAbort(Abort.COMMAND)
+        try:
+            answer = self._transfer.send(data)
+        except StopIteration as end:
+            whole, answer = end.value
+            if whole is not None:
+                self._store(whole, answer, now)
+                return
+            self.reset()
+        if answer:
+            self._send(answer)
+        self._send_burst(now)
+
+    def _begin(self, data: bytes) -> tuple[int, int]:
+        """Leave what is going on for the transfer that an initiate request names: index and sub-index."""
         self.reset()
         self._multiplexer = data[1:4]
-        self._index = int.from_bytes(data[1:3], "little")
-        self._sub = data[3]
+        return self._place
 
-    def _running(self, kind: type[_T]) -> _T:
-        """The transfer that goes on; 05040001h where it is of another kind, or there is none."""
-        if not isinstance(self._transfer, kind):
-            raise SdoAbort(Abort.COMMAND)
-        return self._transfer
-
-    def _open_block_download(self) -> BlockDownload | None:
-        """A block download that waits for segments."""
-        transfer = self._transfer
-        return transfer if isinstance(transfer, BlockDownload) and not transfer.complete else None
-
-    # ---- download, expedited and segmented
-
-    def _initiate_download(self, data: bytes, now: int) -> None:
-        """001n nnes, multiplexer, data or size. Answer: 60h, multiplexer, 0 (4)."""
-        self._begin(data)
-        command = data[0]
-        expedited, indicated = command & 2, command & 1
-        if expedited:
-            size = 4 - (command >> 2 & 3) if indicated else None
-            limit = self._objects.check_download(self._index, self._sub, size)
-            # without a size the object's own length counts (e = 1, s = 0: "unspecified number of bytes")
-            value = data[4 : 4 + (min(4, limit) if size is None else size)]
-            self._store(value, self._initiated(0x60), now)
-            return
-        size = int.from_bytes(data[4:8], "little") if indicated else None
-        limit = self._objects.check_download(self._index, self._sub, size)
-        self._transfer = SegmentedDownload(size, limit if size is None else size)
-        self._send(self._initiated(0x60))
-
-    def _take_segment(self, data: bytes, now: int) -> None:
-        download = self._running(SegmentedDownload)
-        answer = download.take(data)
-        if download.complete:
-            self._store(download.whole(), answer, now)
-        else:
-            self._send(answer)
-
-    def _store(self, data: bytes, answer: bytes, now: int) -> None:
-        """Hand all data to the dictionary; ``answer`` confirms it."""
-        # waiting before the dictionary is asked, so that it may confirm or reset from within the call
-        self._transfer, self._confirming = None, True
-        self._ticket += 1
-        self._answer = answer
-        ticket = self._ticket
-        if self._objects.download(self._index, self._sub, data, now):
-            self.confirm(None, ticket)
-
-    # ---- upload, expedited and segmented
-
-    def _start_upload(self, data: bytes) -> None:
-        """Request 010x xxxx, multiplexer, 0 (4). Answer: 0100 nnes, multiplexer, data or size."""
-        if 1 <= len(data) <= 4:
-            self._send(self._initiated(0x43 | (4 - len(data)) << 2, data))
-            self.reset()
-            return
-        self._transfer = SegmentedUpload(data)
-        self._send(self._initiated(0x41, len(data).to_bytes(4, "little")))
-
-    def _give_segment(self, command: int) -> None:
-        upload = self._running(SegmentedUpload)
-        self._send(upload.give(command))
-        if upload.complete:
-            self.reset()
-
-    # ---- block transfers
-
-    def _initiate_block_download(self, data: bytes, now: int) -> None:
-        """110x xCs0 (C: CRC), multiplexer, size. Answer: A4h (CRC supported), multiplexer, block size, 0 (3)."""
-        self._begin(data)
-        size = int.from_bytes(data[4:8], "little") if data[0] & 2 else None
-        limit = self._objects.check_download(self._index, self._sub, size)
-        self._transfer = BlockDownload(size, limit if size is None else size, bool(data[0] & 4))
-        self._in_flight.segment_seen(now)
-        self._send(self._initiated(0xA4, bytes((BLOCK_SIZE,))))
-
-    def _serve_block_upload(self, data: bytes, now: int) -> None:
-        command = data[0] & 3
-        if command == 0:
-            self._initiate_block_upload(data, now)
-            return
-        upload = self._running(BlockUpload)
-        if command == 1:
-            upload.end()
-            self.reset()
-        elif command == 2:
-            upload.acknowledge(data[1], data[2], now)
-        else:
-            upload.start(now)
-
-    def _initiate_block_upload(self, data: bytes, now: int) -> None:
-        """101x xC00 (C: CRC), multiplexer, block size, threshold, 0 (2). Answer: C6h (CRC, size), multiplexer, size.
-
-        With a threshold other than 0 a value of at most that many bytes goes by expedited or segmented upload instead.
-        """
-        self._begin(data)
-        block_size, threshold = data[4], data[5]
-        check_block_size(block_size)
-        value = self._objects.upload(self._index, self._sub, now)
-        if threshold and len(value) <= threshold:
-            self._start_upload(value)
-            return
-        with_crc = bool(data[0] & 4)
-        self._transfer = BlockUpload(value, block_size, with_crc, self._pace, self._send)
-        self._send(self._initiated(0xC6, len(value).to_bytes(4, "little")))
-
-    # ---- all transfers
+    @property
+    def _place(self) -> tuple[int, int]:
+        return int.from_bytes(self._multiplexer[:2], "little"), self._multiplexer[2]
 
     def _initiated(self, command: int, data: bytes = b"") -> bytes:
         """An answer with the multiplexer of the present transfer."""
@@ -288,10 +199,75 @@ class SdoServer:
         self.reset()
         self._send(answer)
 
-    def reset(self) -> None:
-        """Drop any transfer without an answer."""
-        if (download := self._open_block_download()) is not None:
-            self._in_flight.expect(download.next_segment)
-        self._transfer, self._confirming = None, False
-        self._deadline = NEVER
-        self._multiplexer = _NO_MULTIPLEXER
+    # ---- download
+
+    def _check_download(self, data: bytes, indicated: bool) -> tuple[int | None, int]:
+        """Begin a download of several segments: the size that the client indicates, and how many bytes there can be."""
+        size = int.from_bytes(data[4:8], "little") if indicated else None
+        limit = self._objects.check_download(*self._begin(data), size)
+        return size, limit if size is None else size
+
+    def _initiate_download(self, data: bytes, now: int) -> None:
+        """001n nnes, multiplexer, data or size. Answer: 60h, multiplexer, 0 (4)."""
+        command = data[0]
+        if not command & 2:
+            sizes = self._check_download(data, bool(command & 1))
+            self._start(segmented_download(self._initiated(0x60), *sizes))
+            return
+        size = 4 - (command >> 2 & 3) if command & 1 else None
+        limit = self._objects.check_download(*self._begin(data), size)
+        # without a size the object's own length counts (e = 1, s = 0: "unspecified number of bytes")
+        value = data[4 : 4 + (min(4, limit) if size is None else size)]
+        self._store(value, self._initiated(0x60), now)
+
+    def _store(self, data: bytes, answer: bytes, now: int) -> None:
+        """Hand all data to the dictionary; ``answer`` confirms it."""
+        # waiting before the dictionary is asked, so that it may confirm or reset from within the call
+        self._transfer, self._confirming = None, True
+        self._ticket += 1
+        self._answer = answer
+        ticket = self._ticket
+        if self._objects.download(*self._place, data, now):
+            self.confirm(None, ticket)
+
+    # ---- upload
+
+    def _upload(self, data: bytes, now: int) -> bytes:
+        """Begin an upload: the value."""
+        return self._objects.upload(*self._begin(data), now)
+
+    def _start_upload(self, data: bytes) -> None:
+        """Request 010x xxxx, multiplexer, 0 (4). Answer: 0100 nnes, multiplexer, data or size."""
+        if 1 <= len(data) <= 4:
+            self._send(self._initiated(0x43 | (4 - len(data)) << 2, data))
+            self.reset()
+        else:
+            answer = self._initiated(0x41, len(data).to_bytes(4, "little"))
+            self._start(segmented_upload(answer, data))
+
+    def _initiate_block_upload(self, data: bytes, now: int) -> None:
+        """101x xC00 (C: CRC), multiplexer, block size, threshold, 0 (2). Answer: C6h (CRC, size), multiplexer, size.
+
+        With a threshold other than 0 a value of at most that many bytes goes by expedited or segmented upload instead.
+        """
+        self._begin(data)
+        block_size, threshold = data[4], data[5]
+        check_block_size(block_size)
+        value = self._upload(data, now)
+        if threshold and len(value) <= threshold:
+            self._start_upload(value)
+        else:
+            answer = self._initiated(0xC6, len(value).to_bytes(4, "little"))
+            with_crc = bool(data[0] & 4)
+            self._start(block_upload(answer, value, block_size, with_crc, self._outgoing))
+
+    def _send_burst(self, now: int) -> None:
+        """Send of a sub-block what its time has come for."""
+        if not self._outgoing or now < self._next_burst:
+            return
+        count = len(self._outgoing)
+        if self._segment_ns:
+            count = min(count, BURST)
+        for _ in range(count):
+            self._send(self._outgoing.popleft())
+        self._next_burst = now + count * self._segment_ns

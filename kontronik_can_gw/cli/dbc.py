@@ -4,25 +4,21 @@ import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.dbc import database as canopen_database
+from kontronik_can_gw.canopen.dbc import dbc_text as canopen_text
 from kontronik_can_gw.canopen.dbc import waiting_for_lss
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
-from kontronik_can_gw.dbc.expand import copies_of, expand
+from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-
-if TYPE_CHECKING:
-    from cantools.database.can import Database
 
 _ESCS = number_from(1, 127, "number of ESCs", kind=int)
 # fmt: off
@@ -51,10 +47,9 @@ def main(args: argparse.Namespace) -> int:
         args.config = announced_config(with_nodes=args.canopen)
     escs = [EscSettings(f"esc{number}") for number in range(1, (args.esc or 1) + 1)]
     if args.canopen:
-        database = _canopen(args.config, escs)
+        text = _canopen(args.config, escs)
     else:
-        database = _messages(args.config, source or shipped("dbc/kontronik_esc.dbc"), escs)
-    text = dbc_text(database)
+        text = _messages(args.config, source or shipped("dbc/kontronik_esc.dbc"), escs)
     encoding = "cp1252"  # what tools assume; usually the text is ASCII
     try:
         text.encode(encoding)
@@ -67,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _canopen(config: Path | None, escs: list[EscSettings]) -> "Database":
+def _canopen(config: Path | None, escs: list[EscSettings]) -> str:
     if config is not None:
         loaded = load_all(config)
         setup, escs = canopen_of(loaded), loaded.escs
@@ -79,10 +74,10 @@ def _canopen(config: Path | None, escs: list[EscSettings]) -> "Database":
         say(
             f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to describe"
         )
-    return canopen_database(nodes, escs)
+    return canopen_text(nodes, escs)
 
 
-def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> "Database":
+def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> str:
     """The messages of a configuration, else of these ESCs by a DBC for one. UserError for mistakes that the gateway refuses."""
     settings = DbcSettings()
     if config is not None:
@@ -99,7 +94,6 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> "
         layout = prepare(plain, str(file), escs, settings, fd_allowed=True)
         for line in (*ignored, *layout.warnings):
             say(f"warning: {line}")
-    database = expand(plain, copies_of(plain, layout.file, escs, settings))
-    version = re.sub(" ?layout [0-9A-F]{8}$", "", database.version or "")
-    database.version = f"{version} layout {layout.fingerprint}".strip()
-    return database
+    version = re.sub(" ?layout [0-9A-F]{8}$", "", plain.version or "")
+    copies = copies_of(plain, layout.file, escs, settings)
+    return dbc_text(plain, copies, f"{version} layout {layout.fingerprint}".strip())

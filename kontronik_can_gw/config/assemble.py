@@ -160,7 +160,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         with collecting(problems):
             plain = nodes.plain_setup(config)
             of_nodes = plain.esc_settings(config.escs)
-            taken, bits[_NODES], ignored = nodes.needs(plain, of_nodes)
+            taken, bits[_NODES] = nodes.needs(plain, of_nodes)
         if plain is not None and not problems:
             kept = nodes.read_stored(config, store)
             escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
@@ -180,7 +180,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
         canopen, given_way = nodes.with_stored(plain, kept.stored, config, escs, foreign)
         if canopen is not plain:
-            _, bits[_NODES], _ = nodes.needs(canopen, escs)
+            _, bits[_NODES] = nodes.needs(canopen, escs)
         warnings += [
             *given_way,
             *kept.warnings,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.canopen.check import check_eds, without_objects
+from kontronik_can_gw.canopen.check import check_eds
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
@@ -46,11 +46,13 @@ def load_eds(config: Config) -> Eds:
         raise UserError(
             f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file."
         ) from None
+    shipped_file = shipped("eds/kontronik_esc.eds")
     eds = eds_of(data, str(path))
+    reference = eds if path == shipped_file else eds_of(shipped_file.read_bytes(), "")
     if not config.canopen.cia402_mirrors:
         eds = eds_of(without(data, range(0x6000, 0x6800)), str(path))
     node_ids = [node_id for node_id in config.node_ids if node_id != UNCONFIGURED]
-    check_eds(eds, config.escs, node_ids)
+    check_eds(eds, reference, config.escs, node_ids)
     return eds
 
 
@@ -89,14 +91,11 @@ def plain_setup(config: Config) -> CanopenSetup:
     )
 
 
-def needs(
-    setup: CanopenSetup, escs: Sequence[EscSettings]
-) -> tuple[dict[int, str], float, list[str]]:
-    """COB-IDs of the nodes and what each is for, what they need of the bus in bit/s, and warnings for objects that the EDS lacks."""
+def needs(setup: CanopenSetup, escs: Sequence[EscSettings]) -> tuple[dict[int, str], float]:
+    """COB-IDs of the nodes and what each is for, and what they need of the bus in bit/s."""
     made = setup.nodes(escs)
-    lacks = [f"{setup.eds.name}: {line}" for line in without_objects(made)]
     ids = {cob_id: what for node in made.nodes for cob_id, what, *_ in uses(node)}
-    return ids, made.traffic()[1], lacks
+    return ids, made.traffic()[1]
 
 
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
@@ -192,6 +191,6 @@ def load_of_stored(
 
 def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:
     """Nodes from the shipped EDS, without a configuration."""
-    file = shipped("eds/kontronik_esc.eds")
     settings = tuple(NodeSettings(node_id, version=__version__) for node_id in node_ids)
+    file = shipped("eds/kontronik_esc.eds")
     return CanopenSetup(eds_of(file.read_bytes(), str(file)), settings, (Stored(),) * len(settings))

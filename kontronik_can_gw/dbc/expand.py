@@ -1,26 +1,19 @@
 """Copies a one-ESC DBC for several ESCs: names prefixed, ids moved, nothing lost."""
 
 import fnmatch
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from copy import copy, deepcopy
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.binding import Binder
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import MAX_NAME, esc_prefix
-from kontronik_can_gw.dbc.reader import choose_node
+from kontronik_can_gw.dbc.reader import choose_node, listed
 from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.dbc.writer import frame_id
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
-    from cantools.database.can.formats.dbc import DbcSpecifics
-
-_SDO_END, _RESTRICTED = 0x67F, 0x6E0
-"""CiA 301 uses no 11-bit ids in this range: it is after the SDO requests and before the restricted ids."""
 
 
 def copies_of(
@@ -56,14 +49,8 @@ def copies_of(
             continue
         for index, esc in enumerate(escs):
             copies.append(Copy(message, distance + index * step, index, esc_prefix(esc.name)))
-    if each or settings.base_id is not None:
-        moved = [made for made in copies if node in made.message.senders]
-        problems = [
-            *_id_problems(moved, len(escs), settings.base_id),
-            *_length_problems(copies, escs),
-        ]
-        if problems:
-            raise UserError(*(f"{file}: {problem}" for problem in problems))
+    if problems := [f"{file}: {problem}" for problem in _problems(copies, node)]:
+        raise UserError(*problems)
     return copies
 
 
@@ -88,109 +75,28 @@ def _chosen(database: "Database", node: str, patterns: Sequence[str], file: str)
     return [m for m in database.messages if m.name in chosen or m.name not in ours]
 
 
-def expand(database: "Database", copies: Sequence[Copy]) -> "Database":
-    """The database with these copies for its messages."""
-    import cantools.database.can
-
-    return cantools.database.can.Database(
-        messages=[_message(made) for made in copies],
-        nodes=database.nodes,
-        buses=database.buses,
-        version=database.version,
-        dbc_specifics=_relations(database.dbc, copies),
-        strict=False,
-        sort_signals=None,
-    )
-
-
-def _message(made: Copy) -> "Message":
-    """A copy as cantools has it; the database that it gets into refreshes what cantools derives of it."""
-    message = copy(made.message)
-    message.name, message.frame_id = made.name, made.frame_id
-    message._signals = [copy(signal) for signal in made.message.signals]
-    for signal in message._signals:
-        signal.name = made.prefix + signal.name
-        if signal.multiplexer_signal is not None:
-            signal.multiplexer_signal = made.prefix + signal.multiplexer_signal
-    if message.signal_groups is not None:
-        message.signal_groups = [copy(group) for group in message.signal_groups]
-        for group in message.signal_groups:
-            group.signal_names = [made.prefix + name for name in group.signal_names]
-    return message
-
-
-def among_canopen(copies: Sequence[Copy], node: str) -> str:
-    """A warning where 11-bit ids of ``node`` are moved out of the range that CANopen leaves free (CiA 301, 7.3.5), else empty."""
-    low, high = _SDO_END + 1, _RESTRICTED - 1
-    ours = [
-        made
-        for made in copies
-        if node in made.message.senders and not made.message.is_extended_frame
+def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
+    """Ids outside the range of CAN ids, and names that become too long with a prefix: a line for all of them."""
+    ours = [made for made in copies if node in made.message.senders]
+    limits = [0x1FFFFFFF if made.message.is_extended_frame else 0x7FF for made in ours]
+    outside = [
+        f"{made.frame_id:X}h"
+        for made, limit in zip(ours, limits, strict=True)
+        if not 0 <= made.frame_id <= limit
     ]
-    known = {made.message.frame_id for made in ours}
-    outside = {made.frame_id for made in ours if not low <= made.frame_id <= high}
-    left = outside - known
-    if not left or not any(low <= can_id <= high for can_id in known):
-        return ""
-    return (
-        f"{len(left)} of {len(ours)} ids leave {low:X}h..{high:X}h, up to {max(left):X}h, where CANopen has its own. "
-        "Take fewer ESCs, a DBC with 29-bit ids, or an explicit lowest id (dbc.base_id)."
-    )
-
-
-def _id_problems(copies: Sequence[Copy], count: int, base_id: int | None) -> Iterator[str]:
-    """A line for ids outside the range of CAN ids."""
-    why = f"for {count} ESCs" if base_id is None else f"with {base_id:X}h as the lowest id"
-    every = [made.frame_id for made in copies]
-    for extended, limit in ((False, 0x7FF), (True, 0x1FFFFFFF)):
-        ids = [m.frame_id for m in copies if m.message.is_extended_frame is extended]
-        if outside := [can_id for can_id in ids if not 0 <= can_id <= limit]:
-            span = max(every) - min(every)
-            remedy = f" The lowest id can be at most {limit - span:X}h." if limit > span else ""
-            yield f"{why}, {len(outside)} of {len(every)} messages lie outside 0..{limit:X}h, up to {max(outside):X}h.{remedy}"
-
-
-def _length_problems(copies: Sequence[Copy], escs: Sequence[EscSettings]) -> list[str]:
-    """One line for all names that become too long with a prefix."""
-    stems = {
-        name.removeprefix(made.prefix)
+    if outside:
+        what = f"{len(outside)} of {len(ours)} ids are out of range: {listed(outside)}."
+        yield f"{what} Take fewer ESCs or another dbc.base_id."
+    names = [
+        name
         for made in copies
         if made.prefix
         for name in (made.name, *(name for _, name in made.signals()))
-    }
-    longest = max(sorted(stems), key=len, default="")
-    room = MAX_NAME - len(longest)
-    long = [esc.name for esc in escs if len(esc_prefix(esc.name)) > room]
-    if not stems or not long:
-        return []
-    remedy = (
-        f"Take ESC names of at most {room} letters" if room > 0 else "Shorten the names in the DBC"
-    )
-    which = f"names are longer than {MAX_NAME} characters, as that of {longest}"
-    return [f"ESC name {' and '.join(long)}: with it in front, {which}. {remedy}."]
-
-
-def _relations(specifics: "DbcSpecifics | None", copies: Sequence[Copy]) -> "DbcSpecifics | None":
-    """Copies attributes of relations (BA_REL_), which refer to messages and signals by id and name."""
-    specifics = deepcopy(specifics)
-    relations = specifics.relation_attributes if specifics is not None else None
-    if relations is None:
-        return specifics
-    moved: dict[int, list[Copy]] = {}
-    for made in copies:
-        moved.setdefault(frame_id(made.message), []).append(made)
-    signals, messages = relations.node_signal_relations, relations.node_message_relations
-    old_signals, old_messages = dict(signals), dict(messages)
-    signals.clear()
-    messages.clear()
-    for number, by_signal in old_signals.items():
-        for made in moved.get(number, []):
-            renamed = ((made.prefix + name, nodes) for name, nodes in by_signal.items())
-            signals[number + made.distance] = OrderedDict(renamed)
-    for number, by_node in old_messages.items():
-        for made in moved.get(number, []):
-            messages[number + made.distance] = by_node
-    return specifics
+        if len(name) > MAX_NAME
+    ]
+    if names:
+        what = f"longer than {MAX_NAME} characters with the ESC's name in front"
+        yield f"{what}: {listed(names)}. Shorten the name of the ESC, or those in the DBC."
 
 
 def _step(ids: Sequence[tuple[int, bool, bool]], count: int, wanted: int | None, file: str) -> int:

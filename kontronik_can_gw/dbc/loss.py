@@ -1,12 +1,11 @@
 """What signals hide: flags without a code for "not available" where nothing reports lost telemetry, values that a protocol lacks."""
 
-import math
 from collections.abc import Sequence
 
 from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Group
-from kontronik_can_gw.signals.packer import float_of
+from kontronik_can_gw.signals.packer import has_code
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
 
 _OF_LINK = frozenset({"link_state", "data_age"})
@@ -30,19 +29,9 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
         assert flag.source is not None
         if source.name in _OF_LINK and flag.source.group is Group.LIVE:
             return signal
-        if source.group is flag.source.group and not source.optional and _has_code(signal):
+        if source.group is flag.source.group and not source.optional and has_code(signal):
             return signal
     return None
-
-
-def _has_code(signal: SignalPlan) -> bool:
-    """True where "not available" is a code of its own, outside the values."""
-    if signal.is_float:
-        value = float_of(signal.not_available, signal.length)
-        return math.isnan(value) or not signal.limits[0] <= value <= signal.limits[1]
-    if signal.numbers is not None:
-        return signal.not_available not in signal.numbers.values()
-    return not signal.low <= signal.not_available <= signal.high
 
 
 def unreported(layout: Layout, silent: bool) -> list[str]:

@@ -1,12 +1,11 @@
 """Compiles one message of a DBC: its frame, its times, its pages, its signals, its E2E protection."""
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import is_e2e
-from kontronik_can_gw.dbc.raw_values import bits, raw_range
+from kontronik_can_gw.dbc.raw_values import raw_range
 from kontronik_can_gw.dbc.settings import Compilation
 from kontronik_can_gw.dbc.signal_compiler import SignalCompiler
 from kontronik_can_gw.dbc.timing import timing
@@ -99,29 +98,13 @@ def _signals(job: Compilation, copy: Copy) -> list[SignalPlan]:
 
 
 def _placement_problems(message: "Message", where: str) -> Iterator[str]:
-    """Signals outside the message, and signals that overlap on a page."""
-    room = message.length * 8
-    used: Counter[int | None] = Counter()
-    """Bit mask of the used bits, for each page."""
-    placed: list[tuple[str, int, set[int | None]]] = []
-    every = {None, *(page for s in message.signals for page in s.multiplexer_ids or ())}
-    for signal in message.signals:
-        mask = sum(1 << bit for bit in bits(signal)) if signal.length <= room else 1 << room
-        if mask.bit_length() > room:
-            yield (
-                f"{where}.{signal.name}: lies outside the message's {message.length} bytes. "
-                "Move or shorten it."
-            )
-            continue
-        pages: set[int | None] = set(signal.multiplexer_ids or every)
-        left = mask if any(used[page] & mask for page in pages) else 0
-        for other, others_mask, others_pages in placed if left else ():
-            if others_mask & left and others_pages & pages and other != signal.name:
-                yield f"{where}.{signal.name}: overlaps {other}. Move one of them."
-                left &= ~others_mask
-        for page in pages:
-            used[page] |= mask
-        placed.append((signal.name, mask, pages))
+    """The first signal outside the message, or that overlaps another one on a page, as cantools finds it."""
+    from cantools.database.errors import Error
+
+    try:
+        message.refresh(strict=True)
+    except Error as error:
+        yield f"{where}: {error} Move or shorten it."
 
 
 def _page_problems(

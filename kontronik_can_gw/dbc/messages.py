@@ -1,21 +1,25 @@
 """The messages of a layout: what makes each of them pending, and its frame when it is handed over.
 
 Pure: ``on_event`` and time (``advance``) mark messages as pending, ``take`` packs what is pending: newest wins. A message is handed
-over at most once in a step: in the order of the times at which the messages became due, then of their index.
+over at most once in a step: in the order of the times at which the messages became due, then of their index. Cyclic messages have
+spread phases, and none is sent closer than its minimum distance.
 """
 
 from collections.abc import Sequence
-from operator import itemgetter
 
-from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.output import Owner
+from kontronik_can_gw.output import NEVER, Owner
 from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
 
+_LONG_AGO = -(1 << 62)
+_CYCLE, _REQUEST = 1, 2
+"""Why a message is pending: its cycle, sent in any case, or a request, sent where it is news."""
+_MIN_DISTANCE_NS = 1_000_000
+"""Minimum distance between frames of a message that are not caused by an event."""
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
     Group.INFO: Event.INFO,
@@ -53,6 +57,18 @@ class Traits:
                 self.triggers |= Event.SECOND  # counters, rates and ages change all the time
 
 
+def phases(cycles: Sequence[int]) -> list[int]:
+    """A phase for each message within its cycle: messages of one cycle are spaced evenly, and the groups interleave."""
+    members: dict[int, list[int]] = {}
+    for index, cycle in enumerate(cycles):
+        members.setdefault(cycle, []).append(index)
+    found = [0] * len(cycles)
+    for number, (cycle, indices) in enumerate(sorted(members.items())):
+        for place, index in enumerate(indices):
+            found[index] = cycle * (place * len(members) + number) // (len(indices) * len(members))
+    return found
+
+
 class _Message(Traits):
     """One message at work.
 
@@ -60,14 +76,55 @@ class _Message(Traits):
     places of the pages that have to follow without waiting for an event.
     """
 
-    def __init__(self, plan: MessagePlan, silent: bool) -> None:
+    def __init__(self, index: int, plan: MessagePlan, silent: bool, first_cycle: int) -> None:
         super().__init__(plan, silent)
+        self.index = index
         self.plan = plan
         self.frame = compile_frame(plan)
         self.place = 0
         self.pages_to_send: set[int] = set()
         self.alive = 0
         self.last: dict[int, CanFrame] = {}
+        self.why = 0
+        self._sent_ns = _LONG_AGO
+        self._cycle_due = first_cycle if plan.cycle_ns else NEVER
+        self._deferred_until = NEVER
+        self._cycle_deferred = False
+
+    @property
+    def due(self) -> int:
+        """When ``take_due`` has something to do."""
+        return min(self._cycle_due, self._deferred_until)
+
+    def may_go(self, now: int) -> bool:
+        """True if the minimum distance to its last frame is over."""
+        return now >= self._sent_ns + self.plan.delay_ns
+
+    def defer(self) -> None:
+        """Put it off until its minimum distance is over."""
+        if self._deferred_until == NEVER:
+            self._deferred_until = self._sent_ns + self.plan.delay_ns
+
+    def sent(self, now: int) -> None:
+        """A frame of it was sent; what was put off is done, but for pages that have to follow."""
+        self._sent_ns, self._cycle_deferred = now, False
+        distance = max(self.plan.delay_ns, _MIN_DISTANCE_NS)
+        self._deferred_until = now + distance if self.pages_to_send else NEVER
+
+    def take_due(self, now: int) -> tuple[int, int]:
+        """When it became due, and why; a late call skips missed cycles."""
+        when, why = NEVER, 0
+        if (until := self._deferred_until) <= now:
+            when, why = until, _CYCLE | _REQUEST if self._cycle_deferred else _REQUEST
+            self._deferred_until, self._cycle_deferred = NEVER, False
+        if (start := self._cycle_due) <= now:
+            cycle = self.plan.cycle_ns
+            self._cycle_due += cycle * ((now - start) // cycle + 1)
+            if self.may_go(now):
+                return min(when, start), why | _CYCLE
+            self.defer()
+            self._cycle_deferred = True
+        return when, why
 
     def follows(self, events: int, up: bool) -> bool:
         """Whether these events of an ESC are news to it. ``up``: the ESC's live data is fresh."""
@@ -122,18 +179,24 @@ class Messages:
     ) -> None:
         self._escs = escs
         self._gateway = gateway
-        self._messages = [_Message(plan, silent) for plan in layout.messages]
-        self._of_gateway = [(i, m) for i, m in enumerate(self._messages) if m.follows_gateway]
-        self._of_esc = [
-            [(i, m) for i, m in enumerate(self._messages) if esc in m.plan.escs]
-            for esc in range(len(escs))
+        first = phases([plan.cycle_ns for plan in layout.messages])
+        self._messages = [
+            _Message(index, plan, silent, now + phase)
+            for index, (plan, phase) in enumerate(zip(layout.messages, first, strict=True))
         ]
-        self.schedule = Schedule(layout.messages, now)
+        self._of_gateway = [m for m in self._messages if m.follows_gateway]
+        self._of_esc = [
+            [m for m in self._messages if esc in m.plan.escs] for esc in range(len(escs))
+        ]
+        self._timed = [m for m in self._messages if not m.is_free]
         self.pending: dict[int, int] = {}
         """Messages that ``take`` hands over, and since when."""
-        self._why: dict[int, int] = {}
-        """Of pending messages CYCLE, it is sent in any case, REQUEST, where it is news, or both."""
         self._stopping = False
+
+    @property
+    def next_due(self) -> int:
+        """When ``advance`` has something to do; NEVER for never."""
+        return min([message.due for message in self._timed], default=NEVER)
 
     # --- what makes messages pending
 
@@ -143,63 +206,65 @@ class Messages:
         up = state.live is not None
         # no further event brings the other pages
         is_last = not up or (events & Event.INFO and state.info is None)
-        for index, message in self._of_esc[esc]:
+        for message in self._of_esc[esc]:
             if message.follows(events, up):
                 if is_last and message.by_event:
                     message.add_all_pages()
-                self._request(index, now)
+                self._request(message, now)
 
     def on_gateway_change(self, now: int, each_second: bool = False) -> None:
         """The gateway's own state changed; ``each_second``: only its counters, which is news for messages that have no cycle."""
-        for index, message in self._of_gateway:
+        for message in self._of_gateway:
             if not (each_second and message.plan.cycle_ns):
-                self._request(index, now)
+                self._request(message, now)
 
     def repeat(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
-        for index, message in enumerate(self._messages):
+        for message in self._messages:
             message.last.clear()
             if not message.plan.cycle_ns:
                 message.add_all_pages()
-                self._request(index, now)
+                self._request(message, now)
 
     def stop(self, now: int) -> None:
         """What the gateway says of itself goes out once more, all pages at once, without regard to minimum distances."""
         self._stopping = True
-        for index, message in self._of_gateway:
+        for message in self._of_gateway:
             if message.by_event:
                 message.add_all_pages()
-            self._let_go(index, now, REQUEST)
+            self._let_go(message, now, _REQUEST)
 
     def advance(self, now: int) -> None:
         """Let time pass: cycles, and what a minimum distance has put off."""
-        for when, index, why in self.schedule.due(now):
-            self._let_go(index, when, why)
+        for message in self._timed:
+            when, why = message.take_due(now)
+            if why:
+                self._let_go(message, when, why)
 
-    def _request(self, index: int, now: int) -> None:
+    def _request(self, message: _Message, now: int) -> None:
         """Let a message be handed over as soon as its minimum distance allows."""
-        if self.schedule.may_go(index, now):
-            self._let_go(index, now, REQUEST)
-        elif self._is_news(self._messages[index], now):
-            self.schedule.defer(index)
+        if message.may_go(now):
+            self._let_go(message, now, _REQUEST)
+        elif self._is_news(message, now):
+            message.defer()
 
-    def _let_go(self, index: int, since: int, why: int) -> None:
-        self.pending[index] = min(since, self.pending.get(index, since))
-        self._why[index] = self._why.get(index, 0) | why
+    def _let_go(self, message: _Message, since: int, why: int) -> None:
+        self.pending[message.index] = min(since, self.pending.get(message.index, since))
+        message.why |= why
 
     # --- frames
 
     def take(self, now: int) -> list[CanFrame]:
         """The frames of what is pending, as they are now."""
         pending, self.pending = self.pending, {}
-        why, self._why = self._why, {}
         frames: list[CanFrame] = []
-        for index, _ in sorted(pending.items(), key=itemgetter(1, 0)):
+        for _, index in sorted((since, index) for index, since in pending.items()):
             message = self._messages[index]
-            if self._is_sent(message, why[index], now):
-                frames.append(self._frame(index, message, now))
+            why, message.why = message.why, 0
+            if self._is_sent(message, why, now):
+                frames.append(self._frame(message, now))
                 while self._stopping and message.pages_to_send:
-                    frames.append(self._frame(index, message, now))
+                    frames.append(self._frame(message, now))
         return frames
 
     def _is_sent(self, message: _Message, why: int, now: int) -> bool:
@@ -207,10 +272,10 @@ class Messages:
         if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
             message.pages_to_send.clear()
             return False
-        is_news = bool(why & REQUEST) and self._is_news(message, now)
-        if why & CYCLE:
+        is_news = bool(why & _REQUEST) and self._is_news(message, now)
+        if why & _CYCLE:
             message.turn_page()
-        return is_news or bool(why & CYCLE)
+        return is_news or bool(why & _CYCLE)
 
     def _is_news(self, message: _Message, now: int) -> bool:
         """False for a message that is sent on change and has not changed; of several pages those that have follow."""
@@ -225,7 +290,7 @@ class Messages:
             message.pages_to_send.update(changed)
         return bool(changed or message.pages_to_send)
 
-    def _frame(self, index: int, message: _Message, now: int) -> CanFrame:
+    def _frame(self, message: _Message, now: int) -> CanFrame:
         """The frame of the page that is next; what it changes is noted."""
         place = message.take_place()
         frame = message.frame(self._escs, self._gateway, now, message.alive, place)
@@ -233,7 +298,5 @@ class Messages:
             message.last[place] = message.frame(self._escs, self._gateway, now, 0, place)
         if message.alive_modulus:
             message.alive = (message.alive + 1) % message.alive_modulus
-        self.schedule.sent(index, now)
-        if message.pages_to_send:
-            self.schedule.wait(index, now)
+        message.sent(now)
         return frame

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.binding import Binder
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.expand import among_canopen, copies_of
+from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.message_compiler import compile_message
 from kontronik_can_gw.dbc.reader import choose_node, listed
 from kontronik_can_gw.dbc.settings import Compilation, DbcSettings
@@ -54,8 +54,6 @@ def prepare(
     if job.problems:
         raise UserError(*dict.fromkeys(job.problems))
     job.warnings += _timing_warnings(job, plans)
-    if settings.base_id is None and (reason := among_canopen(copies, node)):
-        job.warnings.append(f"{file}: for {len(escs)} ESCs, {reason}")
     return Layout(file, node, tuple(plans), tuple(dict.fromkeys(job.warnings)))
 
 
@@ -144,8 +142,6 @@ def _timing_warnings(job: Compilation, plans: Sequence[MessagePlan]) -> Iterator
         yield (
             f"{job.file}: sent once at the start, without a cycle and a value that changes: {listed(once)}"
         )
-    if names := job.while_active:
-        yield f"{job.file}: sent all the time, not only while something is active: {listed(names)}"
 
 
 def check_load(

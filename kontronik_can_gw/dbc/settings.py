@@ -51,7 +51,5 @@ class Compilation:
     units: set[str] = field(default_factory=set)
     """Unit texts of our signals."""
     send_types: set[str] = field(default_factory=set)
-    while_active: list[str] = field(default_factory=list)
-    """Messages whose send type means: only while a signal is active."""
     unbound: set[str] = field(default_factory=set)
     """Signals without a source."""

@@ -26,35 +26,31 @@ _TABLE = Path(__file__).with_name("send_types.tsv")
 
 
 @cache
-def _meanings() -> dict[str, tuple[str, bool]]:
-    """By a normalized spelling its meaning, and whether it holds only while a signal is active."""
-    found = {"": (_BY_CYCLE, False)}
-    for line in _TABLE.read_text(encoding="ascii").splitlines()[2:]:
+def _meanings() -> dict[str, str]:
+    """Meanings by normalized spellings."""
+    found = {"": _BY_CYCLE}
+    for line in _TABLE.read_text(encoding="ascii").splitlines()[1:]:
         name, spellings = line.split("\t")
-        meaning = name.rstrip("*-"), name.endswith("*")
-        found |= {normalize(text): meaning for text in spellings.split()}
+        found |= {normalize(text): name.strip("-") for text in spellings.split()}
     return found
 
 
 def timing(job: Compilation, message: "Message", where: str) -> tuple[SendType, int, int]:
     """Send type, cycle time and minimum distance in ms."""
-    cycle = _time(job, message, "GenMsgCycleTime", where)
+    cycle = 0
+    # the last two: of what is sent only while something is active; it is sent always
+    for attribute_name in ("GenMsgCycleTime", "GenMsgCycleTimeFast", "GenMsgCycleTimeActive"):
+        cycle = cycle or _time(job, message, attribute_name, where)
     delay = _time(job, message, "GenMsgDelayTime", where)
     text = str(attribute(message, "GenMsgSendType", job.database) or "")
     job.send_types.add(text)
-    name, while_active = _meanings().get(normalize(text), (None, False))
-    if text in job.settings.send_types:
-        name, while_active = job.settings.send_types[text], False
+    name = job.settings.send_types.get(text, _meanings().get(normalize(text)))
     if name is None:
         job.problems.append(
             f"{where}: GenMsgSendType {text!r} is not known. Say what it means: dbc.send_type.{text!r} = "
             f"one of {', '.join(SEND_TYPES)}."
         )
         return SendType.EVENT, cycle, delay
-    if while_active:
-        for other in ("GenMsgCycleTimeFast", "GenMsgCycleTimeActive"):
-            cycle = cycle or _time(job, message, other, where)
-        job.while_active.append(message.name)
     if name == _BY_CYCLE:
         return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
     send_type = SEND_TYPES[name]

@@ -13,8 +13,7 @@ from functools import lru_cache
 from itertools import accumulate
 from typing import Any
 
-from kontronik_can_gw.dbc.messages import Traits
-from kontronik_can_gw.dbc.schedule import phases
+from kontronik_can_gw.dbc.messages import Traits, phases
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings

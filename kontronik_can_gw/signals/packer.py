@@ -6,12 +6,11 @@ clipped. Bit 0 of the integer is bit 0 of byte 0.
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
-from kontronik_can_gw.esc.values import Group, divisor, steps
+from kontronik_can_gw.esc.values import divisor, steps
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals import e2e
@@ -83,8 +82,7 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
 def _page(plan: MessagePlan, page: int | None) -> tuple[int, list[tuple[tuple[Piece, ...], _Raw]]]:
     """The constant bits of a page, and where the raw value of each of its sources stands."""
     constant = 0
-    sources: list[SignalPlan] = []
-    flags: dict[tuple[int | None, Group, int, int], dict[int, SignalPlan]] = {}
+    sources = []
     for signal in plan.signals:
         if signal.role is Role.MULTIPLEXER:
             constant |= place(signal.pieces, page or 0)
@@ -92,39 +90,9 @@ def _page(plan: MessagePlan, page: int | None) -> tuple[int, list[tuple[tuple[Pi
             continue
         elif signal.role is Role.CONSTANT:
             constant |= place(signal.pieces, signal.constant)
-        elif (source := signal.source) is not None:
-            if (bit := _plain_flag(signal)) is None:
-                sources.append(signal)
-                continue
-            together = (signal.esc, source.group, source.words[0], signal.pieces[0].at - bit)
-            flags.setdefault(together, {})[bit] = signal
-    sources += [_as_one(distance, each) for (*_, distance), each in flags.items()]
-    return constant, [(signal.pieces, _raw(signal)) for signal in sources]
-
-
-def _plain_flag(signal: SignalPlan) -> int | None:
-    """The bit of its word that a signal shows as it stands; None for any other signal."""
-    source = signal.source
-    assert source is not None
-    plain = (signal.length, signal.low, signal.high) == (1, 0, 1) and signal.slope == 1
-    plain &= signal.intercept == 0 and signal.error == signal.not_available
-    return source.bit if plain and source.supplied else None
-
-
-def _as_one(distance: int, flags: Mapping[int, SignalPlan]) -> SignalPlan:
-    """Flags of one word, by their bits, that move up by the same distance as one signal: an ESC has 24 of them."""
-    mask = sum(1 << bit for bit in flags)
-    codes = sum(flag.not_available << bit for bit, flag in flags.items())
-    least, first = min(flags), next(iter(flags.values()))
-    assert first.source is not None
-    return replace(
-        first,
-        source=replace(first.source, shift=0, mask=mask),
-        pieces=(Piece(least, max(flags) + 1 - least, least + distance),),
-        high=mask,
-        not_available=codes,
-        error=codes,
-    )
+        elif signal.source is not None:
+            sources.append((signal.pieces, _raw(signal)))
+    return constant, sources
 
 
 def _raw(signal: SignalPlan) -> _Raw:
@@ -185,6 +153,16 @@ def float_bits(number: float | Fraction, length: int) -> int | None:
     except (KeyError, OverflowError):
         return None
     return int.from_bytes(packed, "little")
+
+
+def has_code(signal: SignalPlan) -> bool:
+    """True where "not available" is a code of its own, outside the values."""
+    if signal.is_float:
+        value = float_of(signal.not_available, signal.length)
+        return math.isnan(value) or not signal.limits[0] <= value <= signal.limits[1]
+    if signal.numbers is not None:
+        return signal.not_available not in signal.numbers.values()
+    return not signal.low <= signal.not_available <= signal.high
 
 
 def float_of(bits: int, length: int) -> float:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.signals.packer import float_of, place, take
+from kontronik_can_gw.signals.packer import float_of, has_code, place, take
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 Value = int | float | str | None
@@ -215,7 +215,7 @@ def _lost_flags(signals: Sequence[SignalPlan]) -> list[tuple[list[int], int, int
         flags, others = groups.setdefault((signal.esc, source.group), ([], []))
         if _is_flag(signal):
             flags.append(index)
-        elif signal.is_float or not signal.low <= signal.not_available <= signal.high:
+        elif has_code(signal):
             others.append(signal)
     return [
         (

@@ -44,7 +44,7 @@ def described(bench: dialogue.Bench) -> str:
     """The DBC of the nodes as they are at this moment."""
     assert bench.gateway.nodes is not None
     settings = [esc.settings for esc in bench.gateway.escs]
-    text = dbc_text(canopen_dbc.database(bench.gateway.nodes, settings))
+    text = canopen_dbc.dbc_text(bench.gateway.nodes, settings)
     assert text.isascii()
     return text
 

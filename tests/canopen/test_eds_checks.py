@@ -7,6 +7,7 @@ from typing import Any
 
 import eds_text
 import pytest
+from dialogue import shipped_eds
 from eds_text import SHIPPED, variable
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ def problems(text: str | bytes) -> tuple[str, ...]:
     """What is wrong with an EDS that nodes 1 and 2 are to have, () for nothing."""
     data = text if isinstance(text, bytes) else text.encode("ascii")
     try:
-        check_eds(reader.load(data, "mine.eds"), [EscSettings()], (1, 2))
+        check_eds(reader.load(data, "mine.eds"), shipped_eds(), [EscSettings()], (1, 2))
     except UserError as error:
         return error.problems
     return ()

@@ -6,12 +6,9 @@ import pytest
 from dialogue import Bench, changed, info, live, shipped_eds
 from eds_text import SHIPPED, with_key
 
-from kontronik_can_gw.canopen.check import check_eds, without_objects
+from kontronik_can_gw.canopen.check import check_eds
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.eds import load
-from kontronik_can_gw.canopen.node_settings import NodeSettings
-from kontronik_can_gw.canopen.nodes import CanopenSetup
-from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -41,7 +38,7 @@ def pdos_with(index: int) -> frozenset[int]:
 def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
     """What a node says, with its times, to a session in which every service has something to do. No SDO: that shows what is there."""
     eds = changed(load(without(DATA, dropped), "my.eds"), EVERY_SYNC)
-    check_eds(eds, [EscSettings()])
+    check_eds(eds, shipped_eds(), [EscSettings()])
     bench = Bench(eds=eds, boot=False, self_start=self_start)
     bench.can_state("ERROR_ACTIVE")
     bench.put(0, "01 00")
@@ -103,7 +100,7 @@ def test_only_the_objects_of_a_pdo_take_it_away(number: int) -> None:
 
 def problems(data: bytes, node_ids: tuple[int, ...] = (1,)) -> list[str]:
     with pytest.raises(UserError) as caught:
-        check_eds(load(data, "my.eds"), [EscSettings()], node_ids)
+        check_eds(load(data, "my.eds"), shipped_eds(), [EscSettings()], node_ids)
     return list(caught.value.problems)
 
 
@@ -112,18 +109,10 @@ def test_cob_ids_of_one_node_only_and_of_what_is_not_in_the_eds_are_judged() -> 
     (said,) = problems(without(text.encode(), {0x1014}))
     assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in said
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
-    check_eds(load(text.encode(), "my.eds"), [EscSettings()], [1])
+    check_eds(load(text.encode(), "my.eds"), shipped_eds(), [EscSettings()], [1])
     said = problems(text.encode(), (3,))[0]
     assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in said
-    check_eds(shipped_eds(), [EscSettings()], range(1, 128))
-
-
-def test_a_default_pdo_that_maps_nothing_is_named() -> None:
-    data = changed(shipped_eds(), {(0x1A01, 0): {"default": 0}})
-    check_eds(data, [EscSettings()])  # a board that ran so with 0.5.0 goes on
-    setup = CanopenSetup(data, (NodeSettings(5),), (Stored(),), (EscSettings(),))
-    (said,) = without_objects(setup.nodes(setup.esc_settings((EscSettings(),))))
-    assert said.startswith("TPDO 2 is never sent: 1A01h maps nothing, so 1801h:01 cannot be valid.")
+    check_eds(shipped_eds(), shipped_eds(), [EscSettings()], range(1, 128))
 
 
 def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
@@ -131,10 +120,10 @@ def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -
     for key, value in (("DataType", "0x0005"), ("HighLimit", "0xFF"), ("DefaultValue", "0xFA")):
         text = with_key(text, "2100sub4", key, value)
     eds = load(text.encode(), "my.eds")
-    check_eds(eds, [EscSettings()])
+    check_eds(eds, shipped_eds(), [EscSettings()])
     said = "2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"
     with pytest.raises(UserError, match=said):
-        check_eds(eds, [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
+        check_eds(eds, shipped_eds(), [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
 
 
 def test_the_session_hears_every_service() -> None:

@@ -37,7 +37,7 @@ def multiplied(
 ) -> tuple[Database, str]:
     plain = read(text)
     copies = expand.copies_of(plain, "my.dbc", escs, DbcSettings(node=node, **more))
-    out = writer.dbc_text(expand.expand(plain, copies))
+    out = writer.dbc_text(plain, copies)
     return read(out), out
 
 
@@ -171,10 +171,9 @@ def refused(text: str, escs: list[EscSettings] = PAIR, **more: Any) -> str:
         (simple(0x100, 0x101), PAIR, {"id_step": 1}, "moved by 1"),
         (simple(0x100, gateway=(0x110,)), PAIR, {"id_step": 0x10}, "clash"),
         (simple(0x100), PAIR, {"id_step": 0}, "clash"),
-        (simple(0x7FF), PAIR, {}, "1 of 2 messages lie outside 0..7FFh, up to 800h"),
-        (simple(0x1FFFFFFF, extended=True), PAIR, {}, "outside 0..1FFFFFFFh"),
-        (simple(0x100, 0x200, 0x700), ONE, {"base_id": 0x700}, "2 of 3 messages"),
-        (simple(0x100, 0x200, 0x700), ONE, {"base_id": 0x700}, "at most 1FFh"),
+        (simple(0x7FF), PAIR, {}, "1 of 2 ids are out of range: 800h"),
+        (simple(0x1FFFFFFF, extended=True), PAIR, {}, "out of range: 20000000h"),
+        (simple(0x100, 0x200, 0x700), ONE, {"base_id": 0x700}, "2 of 3 ids"),
     ],
 )
 def test_ids_that_clash_or_leave_their_range_are_refused(
@@ -183,35 +182,12 @@ def test_ids_that_clash_or_leave_their_range_are_refused(
     assert words in refused(text, escs, **more)
 
 
-@pytest.mark.parametrize(
-    ("text", "count", "base", "words"),
-    [
-        (SHIPPED, 8, None, ""),
-        (SHIPPED, 9, 0x680, ""),
-        (SHIPPED, 9, None, "for 9 ESCs, 52 of 101 ids leave 680h..6DFh, up to 748h"),
-        (simple(0x6DF), 2, None, "1 of 2 ids leave"),
-        (simple(0x700), 2, None, ""),  # it was there before
-    ],
-)
-def test_ids_that_move_among_those_of_canopen_are_named(
-    text: str, count: int, base: int | None, words: str
-) -> None:
-    """A gateway that ran so with 0.5.0 runs."""
-    many = escs(*(f"esc{number}" for number in range(1, count + 1)))
-    layout = prepare(read(text), "test.dbc", many, DbcSettings(base_id=base))
-    said = [line for line in layout.warnings if "ids leave" in line]
-    assert len(said) == bool(words)
-    assert all(words in line and "dbc.base_id" in line for line in said)
-
-
 def test_names_of_more_than_32_characters_are_refused() -> None:
     text = dbc_text([Msg("EscM", 1, 8, [Sig("LimitBatteryVoltageMinimum", 0, 1)])])
     assert multiplied(text, escs("abcdef", "b"))[0]
     line = refused(text, escs("abcdefg", "b", "ghijklm"))
-    assert "abcdefg and ghijklm: with it" in line
-    assert "longer than 32 characters, as that of LimitBatteryVoltageMinimum" in line
-    assert "at most 6 letters" in line
-    assert "as that of Message" in refused(text.replace("EscM", "EscMessage" + "X" * 22))
+    assert "longer than 32 characters" in line
+    assert "AbcdefgLimitBatteryVoltageMinimum, GhijklmLimitBatteryVoltageMinimum." in line
     # what stands in the file with a longer name is left as it is
     long = text.replace("EscM", "M" * 40)
     assert multiplied(long, ONE, base_id=0x100)[0].messages[0].name == "M" * 40

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get
 
-from kontronik_can_gw.dbc.schedule import phases
+from kontronik_can_gw.dbc.messages import phases
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
