@@ -39,7 +39,7 @@ class ParameterStore:
         path = parameter_file(self._folder, name)
         try:
             _make_folder(path.parent)
-            self._lock_files.append(lock_file(str(path.with_suffix(".lock"))))
+            self._lock_files.append(lock_file(path.with_suffix(".lock")))
         except Taken:
             raise RunError(
                 f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
