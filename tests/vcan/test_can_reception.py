@@ -21,10 +21,8 @@ def peer_on(interface: str) -> RawBus:
 
 
 @contextmanager
-def port_on(
-    interface: str, ids: Sequence[int], fd: bool = False, own: bool = False
-) -> Iterator[CanPort]:
-    port = open_can(CanConfig("socketcan", interface, fd=fd, options={"receive_own_messages": own}))
+def port_on(interface: str, ids: Sequence[int]) -> Iterator[CanPort]:
+    port = open_can(CanConfig("socketcan", interface))
     try:
         port.set_receive_ids(frozenset(ids))
         yield port
@@ -70,7 +68,7 @@ def test_600_ids_are_merged_and_exactly_they_come_in_plain_frames(vcan: str) -> 
 
 def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vcan: str) -> None:
     with (
-        port_on(vcan, [0x581], own=True) as port,
+        port_on(vcan, [0x581]) as port,
         port_on(vcan, [0x581]) as second,
         peer_on(vcan) as peer,
     ):
