@@ -1,8 +1,8 @@
 """What only one gateway on this machine may have: a node-ID, the DBC's messages, a file that is written, an MQTT topic.
 
 A lock is a file with flock(2) on it, in a folder where only gateways write: it ends with the process whatever ends it, and nobody who may
-not write there can have one. The files stay: one that is removed could be locked by two. Their names hold the network namespace, for
-interfaces of the same name in two of them are two interfaces. Where no lock can be made the gateway goes on without, and says so once.
+not write there can have one. Its name holds the network namespace, for interfaces of the same name in two of them are two interfaces.
+Where no lock can be made the gateway goes on without, and says so once.
 """
 
 import contextlib
@@ -64,7 +64,10 @@ def lock_file(path: Path) -> int:
     except BaseException as error:
         os.close(fd)
         raise Taken from None if isinstance(error, BlockingIOError) else error
-    return fd
+    if os.fstat(fd).st_nlink:
+        return fd
+    os.close(fd)  # its holder removed it just now: the name stands for another file
+    return lock_file(path)
 
 
 class Locks:
@@ -73,13 +76,16 @@ class Locks:
     def __init__(self, report: Callable[[str], None] = log.warning) -> None:
         self._report = report
         self._reported: set[str] = set()
-        self._held: dict[str, int] = {}
+        self._held: dict[str, tuple[Path, int]] = {}
 
     def hold(self, names: Iterable[str]) -> list[str]:
         """Have exactly these from now on. Returns those that another gateway has."""
         wanted = dict.fromkeys(names)
         for name in self._held.keys() - wanted.keys():
-            os.close(self._held.pop(name))
+            path, fd = self._held.pop(name)
+            with contextlib.suppress(OSError):  # while it is locked nobody else can have this name
+                path.unlink()
+            os.close(fd)
         return [name for name in wanted if name not in self._held and not self._take(name)]
 
     def close(self) -> None:
@@ -89,9 +95,10 @@ class Locks:
     def _take(self, name: str) -> bool:
         """Have one lock, or do without; False where another gateway has it."""
         folder = lock_folder()
+        path = folder / file_name(name)
         try:
             folder.mkdir(mode=0o755, parents=True, exist_ok=True)
-            self._held[name] = lock_file(folder / file_name(name))
+            self._held[name] = path, lock_file(path)
         except Taken:
             return False
         except OSError as error:

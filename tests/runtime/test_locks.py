@@ -1,5 +1,6 @@
 """Node-IDs and messages belong to one gateway on a machine; nobody but a gateway can take one."""
 
+import fcntl
 import os
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import locks
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.locks import Locks, file_name
+from kontronik_can_gw.runtime.locks import Locks, Taken, file_name, lock_file
 from kontronik_can_gw.runtime.poller import Poller
 
 CHANNEL = "can0"
@@ -31,14 +32,34 @@ def test_what_one_has_another_cannot_have_until_it_is_given_back(folder: Path) -
     first, second = Locks(), Locks()
     assert first.hold(NODES[:2]) == []
     assert first.hold(NODES[:2]) == []
+    mode = {0: 0o660}.get(os.geteuid(), 0o600)
+    assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {mode}
     assert second.hold(NODES[1:]) == [NODES[1]]
     assert first.hold(NODES[:1]) == []
     assert second.hold(NODES[1:]) == []
     first.close()
     assert second.hold(NODES[:1]) == []
     second.close()
-    mode = {0: 0o660}.get(os.geteuid(), 0o600)
-    assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {mode}
+    assert list(folder.iterdir()) == []
+
+
+def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The holder removes its file between our opening and our locking: what we have locked is nothing."""
+    path, real = tmp_path / "x", fcntl.flock
+
+    def flock(fd: int, operation: int) -> None:
+        monkeypatch.undo()
+        path.unlink()
+        real(fd, operation)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    fd = lock_file(path)
+    assert os.path.samestat(os.fstat(fd), path.stat())
+    with pytest.raises(Taken):
+        lock_file(path)
+    os.close(fd)
 
 
 @pytest.mark.parametrize("what", ["dbc", "canopen", "dronecan"])
