@@ -186,25 +186,6 @@ def test_each_way_into_bus_off_is_counted_once(port: CanPort, fake: FakeSocket) 
     assert port.bus_off_count == 3
 
 
-def test_frames_lost_in_controller_or_socket_are_noticed(port: CanPort, fake: FakeSocket) -> None:
-    port.set_receive_ids({1})
-    fake.inbox = [packet(ERROR | 0x04, b"\0\x01" + bytes(6))]
-    port.receive()
-    assert (port.overruns, port.state) == (1, CanState.UNKNOWN)
-    fake.drops = 5
-    fake.inbox = [packet(1)] * 100
-    port.receive()
-    port.receive()
-    assert port.overruns == 2
-    fake.drops = 50
-    fake.inbox = [packet(1)] * 300
-    port.discard()
-    assert fake.inbox == []
-    fake.inbox = [packet(1)] * 100
-    port.receive()
-    assert port.overruns == 2, "what was to be thrown away is not missed"
-
-
 @pytest.mark.parametrize("number", [errno.ENETDOWN, errno.ENODEV, errno.EIO])
 def test_an_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number: int) -> None:
     port.set_receive_ids({1})
