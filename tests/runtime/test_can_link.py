@@ -301,7 +301,7 @@ def test_a_bus_that_stood_still_gets_no_backlog(
 
 def test_a_saturated_bus_is_no_dead_adapter(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
-    monkeypatch.setattr(Port, "reports_full", False)
+    monkeypatch.setattr(Port, "is_socket", False)
     bench.start()
     port, before = bench.port, bench.can.port
     for n in range(3000):

@@ -391,7 +391,7 @@ def test_one_thread_brings_the_wanted_frames_in_order() -> None:
         port.set_receive_ids({0x601})
         port.set_receive_ids({0x601, 0x602, id_block(0x80AA, 0xFFFF)})
         assert len(readers()) == 1
-        assert not port.reports_full, "a descriptor to wait on says nothing of sending"
+        assert not port.is_socket, "a descriptor to wait on says nothing of sending"
         for n in range(100):
             other.send(message(0x123, b"foreign"))
             other.send(message(0x601, is_extended_id=True))
