@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from operator import attrgetter
 from typing import Any
 
-from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
+from kontronik_can_gw.capture.format import COUNTERS, Kind, frame_data, numbers_data
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
@@ -109,7 +109,7 @@ class RecordedGateway(Gateway):
         for esc, (state, known) in enumerate(zip(self.escs, self._line_errors, strict=True)):
             if state.line_errors != known:
                 self._line_errors[esc] = state.line_errors
-                self._put(now, Kind.LINE_ERRORS, esc, number_data(state.line_errors), 0, None)
+                self._put(now, Kind.LINE_ERRORS, esc, numbers_data(state.line_errors), 0, None)
 
     def _note(
         self,
@@ -127,4 +127,4 @@ class RecordedGateway(Gateway):
         counters = _counters_of(self.status)
         if counters != self._counters:
             self._counters = counters
-            self._put(now, Kind.COUNTERS, 0, counters_data(counters), 0, None)
+            self._put(now, Kind.COUNTERS, 0, numbers_data(*counters), 0, None)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.capture.format import SUFFIX, Kind, json_payload, number_data
+from kontronik_can_gw.capture.format import SUFFIX, Kind, json_payload, numbers_data
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
@@ -188,13 +188,13 @@ class Recorder:
         last = items[-1][0]
         if (lost := self._overflowed + self._unwritten - self._recorded_losses) > 0:
             self._recorded_losses += lost
-            items.append((last, Kind.LOST, 0, number_data(lost), 0, None))
+            items.append((last, Kind.LOST, 0, numbers_data(lost), 0, None))
         if now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
             offset = time.time_ns() - self._clock()
             if abs(offset - self._offset) > _STEP_NS:
                 self._offset = offset
-                items.append((last, Kind.CLOCK, 0, number_data(last + offset), 0, None))
+                items.append((last, Kind.CLOCK, 0, numbers_data(last + offset), 0, None))
 
     def _fail(self, error: Exception, now: int) -> None:
         file, self._file = self._file, None

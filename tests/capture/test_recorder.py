@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture.format import Entry, Kind, read_number
+from kontronik_can_gw.capture.format import Entry, Kind, read_numbers
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
@@ -46,7 +46,7 @@ class Bed:
         """At the end: the bytes in the files, how many entries they say are lost, beginnings and ends of problems."""
         self.it.close()
         found = recorded(self.folder)
-        lost = sum(read_number(e.data) for e in found if e.kind == Kind.LOST)
+        lost = sum(sum(read_numbers(e.data)) for e in found if e.kind == Kind.LOST)
         begins = [report.begins for report in self.it.reports(0)]
         return [e for e in found if e.kind == Kind.BYTES], lost, begins
 
