@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.frames import MAX_EXTENDED_ID, block_of, ids_in_words
+from kontronik_can_gw.frames import block_of, ids_in_words
 from kontronik_can_gw.output import NEVER, NO_IDS, Output, Owner
 
 _OVER_NS = 10 * SECOND
@@ -26,11 +26,6 @@ class Conflict:
     last: int
     count: int = 0
     over: bool = False
-
-    @property
-    def can_id(self) -> int:
-        """Of a block the lowest."""
-        return self.key & MAX_EXTENDED_ID
 
     @property
     def ids(self) -> str:

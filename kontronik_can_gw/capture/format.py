@@ -50,7 +50,6 @@ _ENTRY = struct.Struct("<QBBHI")
 _COUNT = struct.Struct("<I")
 _FRAME = struct.Struct("<IB")
 _FD, _REMOTE = 1, 2
-_COUNTERS = struct.Struct("<8Q")
 _NUMBER = struct.Struct("<Q")
 
 
@@ -77,7 +76,7 @@ class Kind(IntEnum):
     """Parameters were stored; flags 1: storing failed (UTF-8: why)."""
     DAMAGED = 13
     COUNTERS = 14
-    """The gateway's own counters were changed from outside (``counters_data``)."""
+    """The gateway's own counters were changed from outside (``COUNTERS``)."""
     LINE_ERRORS = 15
     """Total line errors of an ESC's port (u64)."""
     CLOCK = 16
@@ -219,18 +218,6 @@ def read_frame(data: bytes) -> CanFrame:
     )
 
 
-def counters_data(counters: tuple[int, ...]) -> bytes:
-    """The gateway's counters (``COUNTERS``) as the data of an entry."""
-    return _COUNTERS.pack(*counters)
-
-
-def read_counters(data: bytes) -> tuple[int, ...]:
-    """ValueError where the length is wrong."""
-    if len(data) != _COUNTERS.size:
-        raise ValueError("has other counters")
-    return _COUNTERS.unpack(data)
-
-
 COUNTERS = (
     "sent_frames",
     "replaced_frames",
@@ -241,19 +228,20 @@ COUNTERS = (
     "id_conflicts",
     "started_ns",
 )
-"""Attributes of GatewayStatus in a COUNTERS entry, in its order; each a u64."""
+"""Attributes of GatewayStatus in a COUNTERS entry, in its order."""
 
 
-def number_data(number: int) -> bytes:
-    return _NUMBER.pack(max(0, number))
+def numbers_data(*numbers: int) -> bytes:
+    """Numbers as the data of an entry; each a u64."""
+    return struct.pack(f"<{len(numbers)}Q", *[max(0, number) for number in numbers])
 
 
-def read_number(data: bytes) -> int:
-    """ValueError where the length is wrong."""
-    if len(data) != _NUMBER.size:
-        raise ValueError("is no number")
-    number: int = _NUMBER.unpack(data)[0]
-    return number
+def read_numbers(data: bytes) -> tuple[int, ...]:
+    """ValueError where the length is none of numbers."""
+    count, rest = divmod(len(data), _NUMBER.size)
+    if rest:
+        raise ValueError("are no numbers")
+    return struct.unpack(f"<{count}Q", data)
 
 
 class Scanner:

@@ -11,10 +11,9 @@ from kontronik_can_gw.capture.format import (
     COUNTERS,
     Entry,
     Kind,
-    read_counters,
     read_frame,
     read_json,
-    read_number,
+    read_numbers,
 )
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -112,12 +111,12 @@ class Replay:
             gateway.stop(now)
             self._take(now)
         elif kind == Kind.COUNTERS:
-            for name, value in zip(COUNTERS, read_counters(data), strict=True):
+            for name, value in zip(COUNTERS, read_numbers(data), strict=True):
                 setattr(gateway.status, name, value)
         elif kind == Kind.LINE_ERRORS:
-            gateway.escs[esc].line_errors = read_number(data)
+            (gateway.escs[esc].line_errors,) = read_numbers(data)
         elif kind == Kind.LOST:
-            self.lost += read_number(data)
+            self.lost += sum(read_numbers(data))
         elif kind == Kind.STATE:
             if self._midway:
                 self._midway = False

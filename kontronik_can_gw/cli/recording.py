@@ -6,13 +6,11 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.config.keys import Config
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.machine import state_folder
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings, state_of
+from kontronik_can_gw.runtime.recorder import Recorder, state_of
 
-_MB = 1_000_000
 _STATE = "state"
 
 
@@ -36,16 +34,9 @@ def recorded(
     loaded: Loaded, given: Path | None, now: int, silent: bool
 ) -> tuple[Gateway, Recorder]:
     """The gateway of a configuration, and what records it in the folder that is given or configured."""
-    record, folder = loaded.config.record, record_folder(loaded.config, given)
+    folder = record_folder(loaded.config, given)
     assert folder is not None
-    settings = RecordSettings(
-        folder,
-        part_bytes=record.part_mb * _MB,
-        part_ns=record.part_minutes * 60 * SECOND,
-        keep_bytes=record.keep_mb * _MB,
-        min_free_bytes=record.min_free_mb * _MB,
-    )
-    recorder = Recorder(settings)
+    recorder = Recorder(folder, loaded.config.record)
     recorder.words = in_words(loaded.config, folder)
     gateway = RecordedGateway(
         *(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.canopen),

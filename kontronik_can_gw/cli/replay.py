@@ -18,8 +18,8 @@ from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.id_locks import names_of
-from kontronik_can_gw.runtime.locks import Locks, in_use
+from kontronik_can_gw.runtime.id_locks import in_use, names_of
+from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.open_can import check_interface, open_can
 from kontronik_can_gw.transmit_queue import Sent
 

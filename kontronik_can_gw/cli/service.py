@@ -33,7 +33,7 @@ from kontronik_can_gw.cli.service_files import (
 )
 from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.runtime.locks import is_held
+from kontronik_can_gw.runtime.disk import is_locked
 
 _WANTS = f"{UNITS}/multi-user.target.wants"
 _BOOTED = Path("/run/systemd/system")
@@ -239,9 +239,8 @@ def _uninstall(args: argparse.Namespace) -> int:
         found += (path for place in OBSOLETE for path in root.glob(place))
         for path, text in owned.items():
             take_away(path, text)
-        held = Path("/proc/locks").read_text()
         for folder in (root / f"run/{NAME}", *root.glob(f"run/{NAME}-*")):
-            if not any(is_held(file.lstat(), held) for file in folder.glob("lock/*")):
+            if not any(map(is_locked, folder.glob("lock/*"))):
                 remove(folder)
         places = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*", NETWORK)
         there = (path for place in places for path in root.glob(place))

@@ -3,7 +3,6 @@
 It has an interface of its own beside whatever else uses it (a gateway, for one), with receive filters for the ids that were asked for.
 """
 
-import errno
 import logging
 import select
 import time
@@ -14,7 +13,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.open_can import open_can
-from kontronik_can_gw.runtime.socketcan_port import fault_of, socketcan_error
+from kontronik_can_gw.runtime.socketcan_port import fault_of
 
 RETRY_S = 0.5
 """How often an interface that does not work is tried again, and one that works is checked."""
@@ -82,14 +81,12 @@ class BusListener:
         self.problem = ""
 
     def _check(self) -> None:
-        """Whether the interface works; open it anew where it is gone."""
+        """Whether the interface works; open it anew where it does not."""
         config = self._config
         fault = fault_of(config.channel) if config.interface == "socketcan" else 0
-        if self._port is not None and (fault == errno.ENODEV or self._port.gone):
+        if self._port is not None and (fault or self._port.gone):
             self.close()
-        if fault:
-            self.problem = socketcan_error(config, fault).problems[0]
-        elif self._port is None:
+        if self._port is None:
             try:
                 self._open()
             except UserError as error:
@@ -106,7 +103,7 @@ class BusListener:
         self._port.overruns = 0
         if self._port.gone:
             self.close()
-            self.problem = self._gone()
+            self.problem = f"CAN interface {self._config.channel}: went away. Trying again."
         elif frames:
             self.problem = ""
             if self._port.state in (CanState.BUS_OFF, CanState.DOWN):
@@ -121,9 +118,3 @@ class BusListener:
         poll = select.poll()
         poll.register(fd, select.POLLIN)
         poll.poll(max(0.0, seconds) * 1000)
-
-    def _gone(self) -> str:
-        config = self._config
-        if config.interface == "socketcan":
-            return socketcan_error(config, errno.ENODEV).problems[0]
-        return f"CAN {config.interface} {config.channel}: the adapter does not answer any more. Plug it in again."

@@ -30,9 +30,10 @@ class CanPort(ABC):
     """An open interface that is up."""
 
     is_socket = False
-    """True where ``fileno`` is a socket that takes struct can_frame and canfd_frame."""
-    reports_full = True
-    """False where a send that fails for want of room and one on a dead adapter look the same."""
+    """True where ``fileno`` is a socket that takes struct can_frame and canfd_frame.
+
+    Elsewhere a send that fails for want of room and one on a dead adapter look the same.
+    """
 
     def __init__(self) -> None:
         self.state = CanState.UNKNOWN

@@ -1,14 +1,16 @@
-"""One file of a capture while it is written."""
+"""The files of captures: one while it is written, and the oldest, which are removed."""
 
 import contextlib
 import errno
 import fcntl
 import os
+import re
 from pathlib import Path
 
-from kontronik_can_gw.capture.format import block, data_payload
-from kontronik_can_gw.runtime.disk import sync_folder, write_all
+from kontronik_can_gw.capture.format import SUFFIX, block, data_payload
+from kontronik_can_gw.runtime.disk import is_locked, sync_folder, write_all
 
+_OURS = re.compile(rf"[0-9]{{8}}T[0-9]{{6}}Z-[0-9a-f]{{6}}-[0-9]+{SUFFIX}")
 Item = tuple[int, int, int, bytes, int, int | None]
 """(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
 
@@ -76,3 +78,23 @@ class CapturePart:
         """Close without writing any more."""
         with contextlib.suppress(OSError):
             os.close(self._fd)
+
+
+def remove_oldest(folder: Path, keep_bytes: int) -> None:
+    """Keep the folder below a size, 0: any; what is being written, by any process, stays."""
+    if not keep_bytes:
+        return
+    found: list[tuple[int, str, int, Path]] = []
+    for path in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # another gateway has removed it
+            if _OURS.fullmatch(path.name) and not path.is_symlink() and path.is_file():
+                status = path.stat()
+                found.append((status.st_mtime_ns, path.name, status.st_size, path))
+    total = sum(size for _, _, size, _ in found)
+    for _, _, size, path in sorted(found):
+        if total <= keep_bytes:
+            return
+        if not is_locked(path):  # it is being written
+            with contextlib.suppress(OSError):
+                path.unlink()
+                total -= size

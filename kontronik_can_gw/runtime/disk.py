@@ -1,5 +1,6 @@
 """What the threads that write files have in common."""
 
+import fcntl
 import os
 from pathlib import Path
 
@@ -36,3 +37,18 @@ def sync_folder(folder: Path) -> None:
 def reason_of(error: Exception) -> str:
     """Why it failed, for a log line."""
     return error.strerror or str(error) if isinstance(error, OSError) else repr(error)
+
+
+def is_locked(path: Path) -> bool:
+    """True for a file that somebody has locked (flock), here or in another process."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:  # it has gone
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(fd)
+    return False

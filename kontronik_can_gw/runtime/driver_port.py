@@ -34,8 +34,6 @@ _MAX_END_S = 1.0
 class DriverPort(CanPort):
     """A bus of python-can. A thread reads it as soon as there is an id to receive, until ``close`` or until the interface fails."""
 
-    reports_full = False
-
     def __init__(self, bus: "can.BusABC") -> None:
         super().__init__()
         self._bus = bus

@@ -9,7 +9,7 @@ from kontronik_can_gw.esc.telemetry import SECOND
 log = logging.getLogger("kontronik_can_gw")
 
 FLAPPING = 6
-"""Beginnings within a minute from which a condition is summed up once a minute."""
+"""Beginnings within a minute from which nothing is said of a condition until it has not begun for a minute."""
 MINUTE = 60 * SECOND
 REMEMBERED = 20
 
@@ -20,7 +20,8 @@ class _Condition:
         self.reason = ""
         self.begins: deque[int] = deque(maxlen=FLAPPING)
         self.count = 0
-        self.total = 0
+        """Beginnings of which nothing was said."""
+        self.flaps = False
 
 
 class FaultLog:
@@ -30,8 +31,6 @@ class FaultLog:
         self.recent: deque[str] = deque(maxlen=REMEMBERED)
         self._held: list[tuple[int, str]] | None = None
         self._known: dict[str, _Condition] = {}
-        self._summing: dict[str, int] = {}
-        """Conditions that come and go: when their next sum is due."""
 
     def begin(
         self,
@@ -55,14 +54,12 @@ class FaultLog:
         if quiet:
             return
         condition.begins.append(now)
-        condition.count += 1
-        if name in self._summing:
+        if condition.flaps:
+            condition.count += 1
             return
-        often = len(condition.begins) == FLAPPING and now - condition.begins[0] < MINUTE
-        if often:
-            condition.count = condition.total = 0
-            self._summing[name] = now + MINUTE
-            text = f"{text.removesuffix('.')}. This comes and goes: from now on it is summed up once a minute."
+        if len(condition.begins) == FLAPPING and now - condition.begins[0] < MINUTE:
+            condition.flaps = True
+            text = f"{text.removesuffix('.')}. This comes and goes: the next line is when it has not begun for a minute."
         self.say(level, text)
 
     def event(self, name: str, text: str, now: int, level: int = logging.WARNING) -> None:
@@ -75,10 +72,8 @@ class FaultLog:
         condition = self._known.get(name)
         if condition is None or condition.begun is None:
             return
-        lasted = now - condition.begun
-        condition.begun = None
-        condition.total += lasted
-        if name not in self._summing:
+        lasted, condition.begun = now - condition.begun, None
+        if not condition.flaps:
             self.say(logging.INFO, f"{text}, after {duration(lasted)}{counts}")
 
     def forget(self, name: str) -> None:
@@ -96,24 +91,15 @@ class FaultLog:
         return self._known[name].reason if self.is_on(name) else ""
 
     def advance(self, now: int) -> None:
-        """Say the sums that are due."""
-        for name in [name for name, due in self._summing.items() if now >= due]:
-            condition = self._known[name]
-            total = condition.total
-            if condition.begun is not None:
-                total += now - max(condition.begun, now - MINUTE)
-            if condition.count:
-                in_all = f", {duration(total)} in all" if total else ""
-                self.say(
-                    logging.WARNING,
-                    f"{name}: {condition.count} more times in the last minute{in_all}; the last: {condition.reason}",
-                )
-                self._summing[name] = now + MINUTE
-                condition.count = condition.total = 0
-                continue
-            del self._summing[name]
-            state = f"it lasts: {condition.reason}" if condition.begun is not None else "it is over"
-            self.say(logging.INFO, f"{name}: no longer comes and goes, {state}")
+        """Say what no longer comes and goes."""
+        for name, condition in self._known.items():
+            if condition.flaps and now - condition.begins[-1] >= MINUTE:
+                lasts = condition.begun is not None
+                state = f"it lasts: {condition.reason}" if lasts else "it is over"
+                text = f"{name}: no longer comes and goes, {condition.count} more times; {state}"
+                self.say(logging.INFO, text)
+                condition.flaps, condition.count = False, 0
+                condition.begins.clear()
 
     def say(self, level: int, text: str) -> None:
         """A line, remembered too."""

@@ -3,22 +3,33 @@
 import logging
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.frames import ids_in_words
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.locks import Locks, ids_lock, in_use, messages_lock, node_lock
+from kontronik_can_gw.runtime.locks import Locks
 
 
 def names_of(gateway: Gateway, channel: str) -> list[str]:
     """The names of the locks on the ids that a gateway has now."""
+    conflicts = gateway.conflicts
     names = [
-        node_lock(channel, node_id)
+        f"CANopen node {node_id}"
         for node_id, _, _ in gateway.node_states()
         if node_id != UNCONFIGURED
     ]
-    if (first := gateway.conflicts.first_own_id()) is not None:
-        names.append(messages_lock(channel, first))
-    return names + [ids_lock(channel, block) for block in gateway.conflicts.own_blocks()]
+    if (first := conflicts.first_own_id()) is not None:
+        names.append(f"messages from {first:X}h on")
+    names += [ids_in_words(block) for block in conflicts.own_blocks()]
+    return [f"{channel}: {name}" for name in names]
+
+
+def in_use(name: str) -> RunError:
+    """What is said of a lock that another gateway has."""
+    return RunError(
+        f"CAN {name}: another gateway on this machine sends this. End it, or change node-ID or dbc.base_id."
+    )
 
 
 class IdLocks:

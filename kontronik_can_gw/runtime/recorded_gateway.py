@@ -1,18 +1,13 @@
 """A gateway whose every call is handed to a recorder: played again in their order they give the same frames (capture/replay.py)."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import Any
 
-from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.capture.format import COUNTERS, Kind, frame_data, numbers_data
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway, MakeOutput
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
-from kontronik_can_gw.signals.plan import Layout
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.nodes import CanopenSetup
 
 Put = Callable[[int, int, int, bytes, int, int | None], None]
 """(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""
@@ -28,20 +23,12 @@ class RecordedGateway(Gateway):
 
     is_recorded = True
 
-    def __init__(
-        self,
-        put: Put,
-        escs: Sequence[EscSettings],
-        layout: Layout,
-        now: int,
-        silent_on_loss: bool = False,
-        canopen: "CanopenSetup | None" = None,
-        further: Sequence[MakeOutput] = (),
-    ) -> None:
-        super().__init__(escs, layout, now, silent_on_loss, canopen, further)
+    def __init__(self, put: Put, *args: Any, **more: Any) -> None:
+        """``args``, ``more``: as a Gateway takes them."""
+        super().__init__(*args, **more)
         self._put = put
         self._counters = _counters_of(self.status)
-        self._line_errors = [0] * len(escs)
+        self._line_errors = [0] * len(self.escs)
 
     def start(self, now: int, can_open: bool = True) -> None:
         self._note(now, Kind.START, flags=int(can_open))
@@ -122,7 +109,7 @@ class RecordedGateway(Gateway):
         for esc, (state, known) in enumerate(zip(self.escs, self._line_errors, strict=True)):
             if state.line_errors != known:
                 self._line_errors[esc] = state.line_errors
-                self._put(now, Kind.LINE_ERRORS, esc, number_data(state.line_errors), 0, None)
+                self._put(now, Kind.LINE_ERRORS, esc, numbers_data(state.line_errors), 0, None)
 
     def _note(
         self,
@@ -140,4 +127,4 @@ class RecordedGateway(Gateway):
         counters = _counters_of(self.status)
         if counters != self._counters:
             self._counters = counters
-            self._put(now, Kind.COUNTERS, 0, counters_data(counters), 0, None)
+            self._put(now, Kind.COUNTERS, 0, numbers_data(*counters), 0, None)

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.capture.format import SUFFIX, Kind, json_payload, number_data
+from kontronik_can_gw.capture.format import SUFFIX, Kind, json_payload, numbers_data
+from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.capture_folder import make_folder, remove_oldest
-from kontronik_can_gw.runtime.capture_part import CapturePart, Item
+from kontronik_can_gw.runtime.capture_part import CapturePart, Item, remove_oldest
 from kontronik_can_gw.runtime.disk import reason_of
 from kontronik_can_gw.runtime.worker import Report, Worker
 
@@ -29,26 +29,13 @@ PERIOD_S = 0.5
 _AT_ONCE = 5000
 """Entries taken together, so that other threads have their turn between."""
 _CLOSE_S = 0.35
-_RETRY_NS = 5 * SECOND
-_CHECK_SPACE_NS = 5 * SECOND
+_CHECK_NS = 5 * SECOND
+"""How often the folder is looked at, and a disk tried again that failed."""
 _CLOCK_NS = 10 * SECOND
 _STATE_NS = 2 * SECOND
 _STEP_NS = MS
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
-
-
-@dataclass(frozen=True)
-class RecordSettings:
-    """How captures are written. Sizes in bytes, 0: no bound."""
-
-    folder: Path
-    part_bytes: int = 64 * _MB
-    part_ns: int = 3600 * SECOND
-    keep_bytes: int = 0
-    """The oldest captures of the folder are removed when all together are larger."""
-    min_free_bytes: int = 100 * _MB
-    """With less than this free nothing is written."""
 
 
 @dataclass
@@ -68,50 +55,43 @@ class Recorder:
     """Writes what it is given from ``start`` until ``close``."""
 
     def __init__(
-        self, settings: RecordSettings, clock: Callable[[], int] = time.monotonic_ns
+        self, folder: Path, config: RecordConfig, clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        self.settings = settings
         self.facts = RecorderFacts()
         self.header: Mapping[str, Any] = {}
         """What is known of gateway and ESCs, set before ``start``; a part's own numbers are added."""
-        self.words = str(settings.folder)
+        self.words = str(folder)
         """What is logged when it begins."""
+        self._folder, self._config = folder, config
         self._clock = clock
         self._entries: deque[Item] = deque()
-        self._overflowed = 0
+        self._overflowed = self._reported_overflow = 0
         """Entries that found no room: the loop's count."""
-        self._unwritten = 0
+        self._unwritten = self._recorded_losses = 0
         """Entries that could not be written: the thread's count."""
-        self._reported_overflow = 0
-        self._state_ns = 0
+        self._state_ns = self._check_ns = self._clock_ns = self._offset = 0
         self._devices: list[Any] = []
         self._recorded_devices: list[Any] = []
         self._worker: Worker[None] = Worker(
-            "recorder", self._work, wait=self._wait, ended=self._end, clock=clock
+            "recorder", self._work, wait=self._wait, ended=self._end_part, clock=clock
         )
-        self._faults = self._worker.faults
+        self._is_usable = False
+        """The folder was, when it was last looked at."""
         self._file: CapturePart | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
         self._part = 0
-        self._retry_ns = 0
-        self._space_ns = 0
-        self._clock_ns = 0
-        self._offset = 0
-        self._full = False
-        self._recorded_losses = 0
 
     # --- the loop's side
 
     def start(self, wait: bool = False) -> None:
         """Begin to write. RunError where the folder cannot be used, unless ``wait``: then it is tried again and again."""
-        folder = self.settings.folder
         try:
-            make_folder(folder)
+            self._make_folder()
         except OSError as error:
             if not wait:
                 raise RunError(
-                    f"captures: {folder}: {error.strerror}. Give another folder (record.directory, --record)."
+                    f"captures: {self._folder}: {error.strerror}. Give another folder (record.directory, --record)."
                 ) from None
         if not self._worker.start():
             raise RunError("captures: the system gives no thread to write them")
@@ -134,7 +114,7 @@ class Recorder:
 
     def reports(self, now: int) -> list[Report]:
         """Take what went wrong, or is right again, since the last call."""
-        taken = self._worker.reports(f"captures: {self.settings.folder}", _SLOW_NS, now)
+        taken = self._worker.reports(f"captures: {self._folder}", _SLOW_NS, now)
         if self._overflowed >= max(1, 2 * self._reported_overflow):
             self._reported_overflow = self._overflowed
             text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
@@ -165,20 +145,13 @@ class Recorder:
             if not entries or self._file is None:
                 break
 
-    def _end(self) -> None:
-        try:
-            self._end_part()
-        except Exception as error:  # whatever it is, the gateway is ending
-            self._fail(error, self._clock())
-
     def _write(self, items: list[Item], now: int) -> None:
-        if not self._may_write(now):
+        if now >= self._check_ns:
+            self._check(now)
+        if not self._is_usable:
             self._unwritten += len(items)
             return
-        if self._file is None:
-            self._begin_part(items[0][0] if items else now)
-        file = self._file
-        assert file is not None
+        file = self._file = self._file or self._new_part(items[0][0] if items else now)
         if self._devices != self._recorded_devices:
             self._recorded_devices = self._devices
             file.write(b"I", json_payload({"devices": self._recorded_devices}))
@@ -189,59 +162,56 @@ class Recorder:
         self.facts.file = str(file.path)
         if self.facts.problem:
             self._note_problem("", f"{file.path} is written")
-        settings = self.settings
-        is_large = settings.part_bytes and file.size >= settings.part_bytes
-        is_old = settings.part_ns and now - file.begun >= settings.part_ns
-        if is_large or is_old:
+        is_old = now - file.begun >= self._config.part_minutes * 60 * SECOND
+        if is_old or file.size >= self._config.part_mb * _MB:
             self._end_part()
+
+    def _check(self, now: int) -> None:
+        """Whether something may be written to the folder from now on. OSError where it cannot be used."""
+        self._check_ns, self._is_usable = now + _CHECK_NS, False
+        self._make_folder()
+        remove_oldest(self._folder, self._config.keep_mb * _MB)
+        found, minimum = os.statvfs(self._folder), self._config.min_free_mb
+        self._is_usable = found.f_bavail * found.f_frsize >= minimum * _MB
+        if not self._is_usable:
+            self._end_part()
+            text = f"{self._folder}: less than {minimum} MB are free: nothing is recorded"
+            self._note_problem(text)
+
+    def _make_folder(self) -> None:
+        self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+        if not os.access(self._folder, os.W_OK | os.X_OK):
+            raise PermissionError(1, "may not be written to")
 
     def _remark(self, items: list[Item], now: int) -> None:
         """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
         last = items[-1][0]
         if (lost := self._overflowed + self._unwritten - self._recorded_losses) > 0:
             self._recorded_losses += lost
-            items.append((last, Kind.LOST, 0, number_data(lost), 0, None))
+            items.append((last, Kind.LOST, 0, numbers_data(lost), 0, None))
         if now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
             offset = time.time_ns() - self._clock()
             if abs(offset - self._offset) > _STEP_NS:
                 self._offset = offset
-                items.append((last, Kind.CLOCK, 0, number_data(last + offset), 0, None))
-
-    def _may_write(self, now: int) -> bool:
-        if self._file is None and now < self._retry_ns:
-            return False
-        if now >= self._space_ns:
-            make_folder(self.settings.folder)
-            self._space_ns = now + _CHECK_SPACE_NS
-            remove_oldest(self.settings.folder, self.settings.keep_bytes)
-            found = os.statvfs(self.settings.folder)
-            free = found.f_bavail * found.f_frsize
-            self._full = free < self.settings.min_free_bytes
-            if self._full:
-                self._end_part()
-                minimum = self.settings.min_free_bytes // _MB
-                self._note_problem(
-                    f"{self.settings.folder}: less than {minimum} MB are free: nothing is recorded"
-                )
-        return not self._full
+                items.append((last, Kind.CLOCK, 0, numbers_data(last + offset), 0, None))
 
     def _fail(self, error: Exception, now: int) -> None:
         file, self._file = self._file, None
         if file is not None:
             file.abandon()
         self.facts.file = ""
-        self._retry_ns = self._space_ns = now + _RETRY_NS
-        folder, reason = self.settings.folder, reason_of(error)
-        self._note_problem(f"{folder}: cannot be written: {reason}. Trying again.")
+        self._check_ns, self._is_usable = now + _CHECK_NS, False
+        reason = reason_of(error)
+        self._note_problem(f"{self._folder}: cannot be written: {reason}. Trying again.")
 
     def _note_problem(self, problem: str, over: str = "") -> None:
         """Nothing is recorded now because of a problem, or it is again."""
         self.facts.problem = problem
-        self._faults.note("captures: folder", bool(problem), f"captures: {problem or over}")
+        self._worker.faults.note("captures: folder", bool(problem), f"captures: {problem or over}")
 
-    def _begin_part(self, since: int) -> None:
-        """``since``: time of the part's first entry."""
+    def _new_part(self, since: int) -> CapturePart:
+        """``since``: time of its first entry."""
         now = self._clock()
         self._offset = time.time_ns() - now
         self._clock_ns = now
@@ -257,9 +227,8 @@ class Recorder:
             "wall_ns": wall,
             "devices": self._recorded_devices,
         }
-        base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
-        self._file = CapturePart(base.with_name(base.name + SUFFIX), json_payload(header), now)
-        remove_oldest(self.settings.folder, self.settings.keep_bytes)
+        name = f"{self._stamp}-{self._run[:6]}-{part:05d}{SUFFIX}"
+        return CapturePart(self._folder / name, json_payload(header), now)
 
     def _end_part(self) -> None:
         file, self._file = self._file, None

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import os
 import socket
 import struct
 import time
@@ -46,14 +47,13 @@ _SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
 
 
 class SocketCanPort(CanPort):
-    """A raw socket that is bound to an interface. ``close`` is called at the end: what else it takes to give the interface back."""
+    """A raw socket that is bound to an interface."""
 
     is_socket = True
 
-    def __init__(self, opened: socket.socket, close: Callable[[], object]) -> None:
+    def __init__(self, opened: socket.socket) -> None:
         super().__init__()
         self._socket = opened
-        self._give_back = close
         # until ids are asked for only error frames (the socket asks for them) wake the process
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
@@ -67,9 +67,7 @@ class SocketCanPort(CanPort):
         return self._socket.fileno()
 
     def close(self) -> None:
-        with contextlib.suppress(Exception):
-            # of an interface that is gone: nothing is left to do
-            self._give_back()
+        self._socket.close()
 
     def _filter(self) -> None:
         packed = b"".join(_FILTER.pack(*each) for each in kernel_filters(self._ids))
@@ -216,35 +214,8 @@ def fault_of(name: str) -> int:
         return 0
 
 
-def _has_socketcan() -> bool:
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (AttributeError, OSError):
-        return False
-    return True
-
-
 def open_socketcan(config: CanConfig) -> SocketCanPort:
-    """Open an interface by a socket of our own: without 8 MB and 80 ms of python-can. RunError where that fails."""
-    try:
-        opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        try:
-            if config.fd:
-                opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
-            opened.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, MAX_EXTENDED_ID)
-            opened.bind((config.channel,))
-            return SocketCanPort(opened, opened.close)
-        except OSError:
-            opened.close()
-            raise
-    except OSError as error:
-        raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
-    except AttributeError:  # a Python that was built without it
-        raise socketcan_error(config, errno.EAFNOSUPPORT) from None
-
-
-def check_socketcan(config: CanConfig) -> None:
-    """RunError where the interface cannot be used: known before it is tried, which takes a while."""
+    """Open an interface by a socket of our own: without 8 MB and 80 ms of python-can. RunError where that fails, or where it is down."""
     name = config.channel
     mtu = Path("/sys/class/net", name, "mtu")
     if config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
@@ -252,8 +223,23 @@ def check_socketcan(config: CanConfig) -> None:
             f"CAN interface {name}: does not do CAN FD. Adapter: sudo ip link set {name} up type can bitrate {config.bitrate} "
             f"dbitrate {config.data_bitrate} fd on; vcan: sudo ip link set {name} mtu {_FD.size}; or set can.fd = false."
         )
-    if number := fault_of(name):
-        raise socketcan_error(config, number if _has_socketcan() else errno.EAFNOSUPPORT)
+    try:
+        with contextlib.ExitStack() as undone:
+            opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+            undone.enter_context(opened)
+            if number := fault_of(name):
+                raise OSError(number, os.strerror(number))
+            if config.fd:
+                opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+            opened.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, MAX_EXTENDED_ID)
+            opened.bind((name,))
+            port = SocketCanPort(opened)
+            undone.pop_all()
+            return port
+    except OSError as error:
+        raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
+    except AttributeError:  # a Python that was built without it
+        raise socketcan_error(config, errno.EAFNOSUPPORT) from None
 
 
 def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:

@@ -1,8 +1,7 @@
 """The parameter files of all nodes in one folder: read at start, written by a thread of its own.
 
 What may touch what: everything is called by the loop's thread; only ``_write_all`` and what it calls run in the worker's. Savings and
-results are handed over without waiting, so no disk, be it full, read-only or slow, holds the loop up. Both know the names of unusable
-files, to which the loop's thread adds only before the first saving of that name.
+results are handed over without waiting, so no disk, be it full, read-only or slow, holds the loop up.
 
 A file is replaced, never changed: temporary file in the same folder, write, fsync, rename, fsync of the folder. After a loss of power at
 any instant the old content is there or the new one; once a saving is reported as on disk, it is the new one. After a failed saving it is
@@ -27,8 +26,6 @@ class ParameterStore:
         self._folder = folder
         self._worker: Worker[tuple[str, bytes]] = Worker("parameter-store", self._write_all)
         self._results: Handover[tuple[str, str | None]] = Handover()
-        # Names whose file could not be used and is still in its place: it is moved aside before a new one takes that.
-        self._unusable: set[str] = set()
         self._lock_files: list[int] = []
 
     def lock(self, name: str) -> str | None:
@@ -39,7 +36,7 @@ class ParameterStore:
         path = parameter_file(self._folder, name)
         try:
             _make_folder(path.parent)
-            self._lock_files.append(lock_file(str(path.with_suffix(".lock"))))
+            self._lock_files.append(lock_file(path.with_suffix(".lock")))
         except Taken:
             raise RunError(
                 f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
@@ -52,7 +49,8 @@ class ParameterStore:
         """Read what a node kept; to be called before its first saving.
 
         A missing file is an empty ``Stored``, a damaged or unreadable one too, and then the reason is there. A damaged file is kept as
-        ``NAME.params.damaged``, in place of an older one of that name. What a killed writer left half is removed.
+        ``NAME.params.damaged``, in place of an older one of that name; an unreadable one, which may be so only now, stays until something
+        is saved. What a killed writer left half is removed.
         """
         path = parameter_file(self._folder, name)
         with contextlib.suppress(OSError):
@@ -62,15 +60,11 @@ class ParameterStore:
         except FileNotFoundError:
             return Stored(), None
         except OSError as error:
-            # perhaps only for now: it is not touched before something is to be saved
-            self._unusable.add(name)
             return Stored(), f"{path}: {reason_of(error)}"
         except ValueError as error:
-            try:
-                _keep_damaged(path)
+            with contextlib.suppress(OSError):
+                path.replace(path.with_name(path.name + ".damaged"))
                 sync_folder(path.parent)
-            except OSError:
-                self._unusable.add(name)
             return Stored(), f"{path}: {error}"
 
     def save(self, name: str, data: bytes) -> bool:
@@ -114,9 +108,6 @@ class ParameterStore:
         try:
             _make_folder(self._folder)
             write_new(temporary, data, 0o600, is_synced=True)
-            if name in self._unusable:
-                _keep_damaged(path)
-                self._unusable.remove(name)
             temporary.replace(path)
             sync_folder(self._folder)
         except OSError as error:
@@ -133,11 +124,6 @@ def parameter_file(folder: Path, name: str) -> Path:
 
 def _temporary(path: Path) -> Path:
     return path.with_name(path.name + ".tmp")
-
-
-def _keep_damaged(path: Path) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        path.replace(path.with_name(path.name + ".damaged"))
 
 
 def _make_folder(folder: Path) -> None:

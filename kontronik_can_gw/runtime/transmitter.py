@@ -111,7 +111,7 @@ class Transmitter:
         self._busy_since = self._busy_since or now
         waits = LASTING_BUSY_NS - (now - self._busy_since)
         if waits <= 0:
-            if not port.reports_full:
+            if not port.is_socket:
                 return Sent.GONE
             self._stall(now)
         # a full one becomes writable when there is room

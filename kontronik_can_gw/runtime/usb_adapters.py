@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from serial.tools.list_ports_linux import SysFS
+
 
 class Identity(NamedTuple):
     """What identifies a USB adapter, whatever its number is: vendor, product, serial number, or place where it has none."""
@@ -28,26 +30,14 @@ def find_adapter(identity: Identity) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def adapters(root: Path = Path("/")) -> Iterator[tuple[str, Identity]]:
-    """USB adapters that are plugged in: path and identity. The loop waits for this, so it reads no more than is needed."""
-    names = []
-    with contextlib.suppress(OSError):
-        listed = os.listdir(root / "sys/class/tty")  # noqa: PTH208
-        names = [name for name in listed if name.startswith(("ttyUSB", "ttyACM"))]
-    for name in names:
-        with contextlib.suppress(OSError, ValueError):  # one is being unplugged
-            folder = Path(os.path.realpath(root / "sys/class/tty" / name / "device"))
-            interface = ""
-            while not (folder / "idVendor").exists() and folder.name:
-                interface = folder.name if ":" in folder.name else interface  # as 1-1.2:1.0
-                folder = folder.parent
-            if not folder.name:
-                continue
-            vendor, product = (
-                int((folder / file).read_text(), 16) for file in ("idVendor", "idProduct")
-            )
-            file = folder / "serial"
-            serial_number = file.read_text().strip() if file.exists() else ""
-            # an adapter with several ports has one serial number for all
-            place = interface.partition(":")[2] if serial_number else interface
-            yield f"/dev/{name}", Identity(vendor, product, serial_number, place)
+def adapters() -> Iterator[tuple[str, Identity]]:
+    """USB adapters that are plugged in: path and identity. The loop waits for this, so ports of other kinds are not asked."""
+    for kind in ("USB", "ACM"):
+        for path in sorted(Path("/dev").glob(f"tty{kind}*")):
+            with contextlib.suppress(OSError, ValueError, TypeError):  # one is being unplugged
+                found = SysFS(str(path))
+                if found.vid is not None and found.pid is not None:
+                    serial_number, place = found.serial_number or "", found.location or ""
+                    # an adapter with several ports has one serial number for all
+                    place = place.partition(":")[2] if serial_number else place
+                    yield str(path), Identity(found.vid, found.pid, serial_number, place)

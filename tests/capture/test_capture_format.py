@@ -19,10 +19,9 @@ from kontronik_can_gw.capture.format import (
     block,
     data_payload,
     frame_data,
-    read_counters,
     read_entries,
     read_frame,
-    read_number,
+    read_numbers,
 )
 from kontronik_can_gw.frames import CanFrame
 
@@ -126,7 +125,7 @@ def test_a_can_frame_comes_back(frame: CanFrame) -> None:
     assert read_frame(frame_data(frame)) == frame
 
 
-@pytest.mark.parametrize("read", [read_frame, read_number, read_counters])
+@pytest.mark.parametrize("read", [read_frame, read_numbers])
 def test_data_that_is_too_short_is_refused(read: Callable[[bytes], object]) -> None:
     with pytest.raises(ValueError):
         read(b"abc")

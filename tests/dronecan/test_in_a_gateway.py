@@ -24,7 +24,7 @@ from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.dronecan.transport import Assembler
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.frames import CanFrame, id_block
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime import locks
 from kontronik_can_gw.runtime.snapshot import snapshot
 from kontronik_can_gw.signals.plan import Layout
@@ -192,8 +192,8 @@ def test_a_replay_and_a_gateway_do_not_send_as_one_node(
     monkeypatch.setattr(locks, "lock_folder", lambda: tmp_path / "lock")
     setup, layout = capture_bench.made(2, dronecan=ON)
     gateway, capture = locks.Locks(), SimpleNamespace(setup=setup, sent_layout=layout, created_ns=0)
-    assert not gateway.hold([locks.ids_lock("can7", id_block(43, 0x7F))])
-    with pytest.raises(RunError, match=r"can7: another gateway .* 29-bit ids with 2Bh"):
+    assert not gateway.hold(["can7: 29-bit ids with 2Bh in their bits 7Fh"])
+    with pytest.raises(RunError, match=r"can7: 29-bit ids with 2Bh .* another gateway"):
         replay._hold(locks.Locks(), "can7", cast("Any", capture))
     gateway.close()
 

@@ -6,7 +6,7 @@
 
    In:   {"call": NAME, ...}   one of the functions in `calls`; calls are done one after the other
    Out:  {"result": ...} or {"error": TEXT, "code": ABORT CODE or LSS error}   for each call, in their order
-         {"event": "heartbeat" | "emergency" | "pdo", ...}
+         {"event": "heartbeat" | "emergency", ...}
    Bytes are hexadecimal texts. Ends with its input. */
 
 const path = require('path');
@@ -27,13 +27,9 @@ master.addListener('message', (m) => channel.send({ id: m.id, data: m.data, ext:
 channel.start();
 master.start();
 master.lss.start();
-master.nmt.startNode(); // itself, or it would take no PDO
 master.nmt.on('heartbeat', ({ deviceId, state }) => tell({ event: 'heartbeat', node: deviceId, state }));
 master.emcy.on('emergency', ({ cobId, em }) => tell({
     event: 'emergency', cob_id: cobId, code: em.code, register: em.register, info: Buffer.from(em.info).toString('hex'),
-}));
-master.pdo.on('pdo', ({ cobId, dataObjects }) => tell({
-    event: 'pdo', cob_id: cobId, values: dataObjects.map((o) => [o.parameterName, o.value]),
 }));
 
 const address = ({ node, index, sub = 0, block = false }) =>
@@ -41,7 +37,6 @@ const address = ({ node, index, sub = 0, block = false }) =>
 // [sub-index, variable]; the package's own subIndex is wrong from 10 on
 const variables = (entry) => Array.from((entry.subNumber ? entry._subObjects : [entry]).entries()).filter(([, v]) => v);
 
-let nextReceived = 0x3000;
 const calls = {
     /** Take a node under control: its SDO server, its heartbeat, its emergencies. */
     add({ node }) {
@@ -59,21 +54,6 @@ const calls = {
     },
     async download(request) {
         await master.sdo.download({ ...address(request), data: Buffer.from(request.data, 'hex') });
-    },
-    /** Receive a node's TPDO as the node itself tells its COB-ID and mapping; names and types are those of the EDS. */
-    async receivePdo({ node, file, number }) {
-        const eds = Eds.fromFile(file);
-        const ask = (index, sub) => master.sdo.upload(address({ node, index: index + number - 1, sub }));
-        const cobId = (await ask(0x1800, 1)).readUInt32LE() & 0x7ff;
-        const count = (await ask(0x1a00, 0)).readUInt8();
-        const dataObjects = [];
-        for (let i = 1; i <= count; ++i) {
-            const mapped = (await ask(0x1a00, i)).readUInt32LE();
-            const { parameterName, dataType } = eds.getEntry(mapped >>> 16).at((mapped >> 8) & 0xff);
-            dataObjects.push(master.eds.addEntry(nextReceived++, { parameterName, dataType }));
-        }
-        master.eds.addReceivePdo({ cobId, dataObjects });
-        return cobId;
     },
     /** startNode, stopNode, enterPreOperational, resetNode, resetCommunication */
     nmt({ command, node }) {

@@ -147,7 +147,7 @@ class Drive:
         ]
         for conflict in gateway.conflicts.take():
             found.append(
-                f"conflict {conflict.can_id:03X} {conflict.whose}{' is over' if conflict.over else ''}"
+                f"conflict {conflict.key & 0x1FFFFFFF:03X} {conflict.whose}{' is over' if conflict.over else ''}"
             )
         gateway.take_link_changes()
         return found

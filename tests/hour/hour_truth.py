@@ -18,7 +18,7 @@ from capture_bench import START, Bench, capture_file, made
 from esc.sheet import INFO_FIELDS, LIVE_FIELDS
 from numpy.typing import NDArray
 
-from kontronik_can_gw.capture.format import Entry, Kind, number_data
+from kontronik_can_gw.capture.format import Entry, Kind, numbers_data
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import (
@@ -121,7 +121,7 @@ class Truth:
 
         lost, again = self.unplugged
         trouble, wall = START + self.length // 4, self.clock_set_ns - START + WALL + CLOCK_STEP
-        clock = Entry(self.clock_set_ns, Kind.CLOCK, 0, number_data(wall))
+        clock = Entry(self.clock_set_ns, Kind.CLOCK, 0, numbers_data(wall))
         happenings: list[tuple[int, Callable[[int], object]]] = [
             (trouble, lambda at: gateway.set_can_state(CanState.ERROR_WARNING, at)),
             (trouble + 2 * SECOND, lambda at: gateway.set_can_state(CanState.ERROR_ACTIVE, at)),

@@ -120,12 +120,6 @@ def test_an_interface_that_opens_slowly_is_no_hold_up(
     made.loop.close()
 
 
-def test_a_transfer_that_cannot_go_on_is_aborted(bench: Bench) -> None:
-    assert bench.ask("21 17 10 00 02 00 00 00").startswith("60")
-    bench.hold_up(3 * SECOND)
-    assert of(bench.take(), ANSWER) == [(ANSWER, "80 17 10 00 00 00 04 05")]
-
-
 def test_syncs_that_waited_are_counted_and_not_answered(bench: Bench) -> None:
     bench.write(
         "23 00 18 01 81 01 00 c0",  # 1800h:1: off
@@ -227,14 +221,3 @@ def test_within_a_turn_the_rest_is_late_but_answers_are_not_lost(
         if int.from_bytes(data[:3], "little") == number and can_id == SPEED
     ] == []
     assert any(can_id == SPEED for can_id, _ in late), "and told that there is nothing"
-
-
-def test_a_bus_that_takes_nothing_is_reported_after_a_second(bench: Bench) -> None:
-    bench.world.bus.frame_ns = 10 * SECOND  # a few are in the kernel, and stay there
-    wire, begun = bench.wire, bench.world.now
-    wire.stream(begun, begun + 2 * SECOND, 10 * MS)
-    transmitter = bench.loop.can.transmitter
-    bench.run(990 * MS)
-    assert not transmitter.is_stalled
-    bench.run(60 * MS)
-    assert transmitter.is_stalled

@@ -206,17 +206,6 @@ def test_a_controller_that_nobody_restarts_costs_nothing_and_is_said_with_the_re
     assert sum("restart-ms is 0" in line for line in caplog.messages) == 1
 
 
-def test_an_interface_that_comes_late_makes_one_boot_up(bench: Bench, kernel: Kernel) -> None:
-    bench.changes(LinkFacts(exists=False), there=False)
-    bench.start()
-    bench.turn(3000)
-    bench.changes(ACTIVE)
-    bench.turn(2)
-    assert told(bench.take()) == ["boot-up"]
-    bench.turn(2000)
-    assert told(bench.take()) == []
-
-
 def test_old_news_of_a_link_does_not_close_what_was_opened(bench: Bench, kernel: Kernel) -> None:
     bench.begin()
     bench.changes(LinkFacts(exists=False), there=False)
@@ -312,7 +301,7 @@ def test_a_bus_that_stood_still_gets_no_backlog(
 
 def test_a_saturated_bus_is_no_dead_adapter(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
-    monkeypatch.setattr(Port, "reports_full", False)
+    monkeypatch.setattr(Port, "is_socket", False)
     bench.start()
     port, before = bench.port, bench.can.port
     for n in range(3000):

@@ -7,6 +7,7 @@ import termios
 from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -237,27 +238,26 @@ def test_a_diagnosis_is_said_once_and_is_over_while_telemetry_comes(
     assert (esc.facts().diagnosis or "").startswith("no bytes")
 
 
-def test_a_usb_adapter_is_known_by_numbers_and_interface(
-    tmp_path: Path,
+def test_a_usb_adapter_is_known_by_its_numbers_or_its_place(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def plug(tty: str, place: str, serial_number: str) -> None:
-        usb = tmp_path / "sys/devices/pci0/usb1" / place
-        interface = usb / f"{place}:1.0"
-        (interface / tty).mkdir(parents=True)
-        (usb / "idVendor").write_text("0403\n")
-        (usb / "idProduct").write_text("6001\n")
-        if serial_number:
-            (usb / "serial").write_text(f"{serial_number}\n")
-        (tmp_path / "sys/class/tty" / tty).mkdir(parents=True)
-        (tmp_path / "sys/class/tty" / tty / "device").symlink_to(interface / tty)
+    plugged = {
+        "/dev/ttyUSB0": (0x403, 0x6001, "A1", "1-1"),
+        "/dev/ttyUSB1": (0x403, 0x6011, "A1", "1-2:1.3"),
+        "/dev/ttyUSB2": (0x403, 0x6001, None, "1-1.2"),
+        "/dev/ttyUSB3": (None, None, None, None),  # being unplugged
+    }
 
-    plug("ttyUSB0", "1-1", "A1")
-    plug("ttyUSB1", "1-1.2", "")
-    (tmp_path / "sys/class/tty/ttyS0").mkdir()
-    (tmp_path / "sys/class/tty/ttyACM9").mkdir()  # being unplugged
-    assert dict(usb_adapters.adapters(tmp_path)) == {
-        "/dev/ttyUSB0": Identity(0x403, 0x6001, "A1", "1.0"),
-        "/dev/ttyUSB1": Identity(0x403, 0x6001, "", "1-1.2:1.0"),
+    def found(path: str) -> SimpleNamespace:
+        names = ("vid", "pid", "serial_number", "location")
+        return SimpleNamespace(**dict(zip(names, plugged[path], strict=True)))
+
+    monkeypatch.setattr(usb_adapters, "SysFS", found)
+    monkeypatch.setattr(Path, "glob", lambda _, kind: map(Path, plugged) if "USB" in kind else ())
+    assert dict(usb_adapters.adapters()) == {
+        "/dev/ttyUSB0": Identity(0x403, 0x6001, "A1", ""),
+        "/dev/ttyUSB1": Identity(0x403, 0x6011, "A1", "1.3"),
+        "/dev/ttyUSB2": Identity(0x403, 0x6001, "", "1-1.2"),
     }
 
 

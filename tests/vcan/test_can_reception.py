@@ -21,10 +21,8 @@ def peer_on(interface: str) -> RawBus:
 
 
 @contextmanager
-def port_on(
-    interface: str, ids: Sequence[int], fd: bool = False, own: bool = False
-) -> Iterator[CanPort]:
-    port = open_can(CanConfig("socketcan", interface, fd=fd, options={"receive_own_messages": own}))
+def port_on(interface: str, ids: Sequence[int], fd: bool = False) -> Iterator[CanPort]:
+    port = open_can(CanConfig("socketcan", interface, fd=fd))
     try:
         port.set_receive_ids(frozenset(ids))
         yield port
@@ -70,7 +68,7 @@ def test_600_ids_are_merged_and_exactly_they_come_in_plain_frames(vcan: str) -> 
 
 def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vcan: str) -> None:
     with (
-        port_on(vcan, [0x581], own=True) as port,
+        port_on(vcan, [0x581]) as port,
         port_on(vcan, [0x581]) as second,
         peer_on(vcan) as peer,
     ):
@@ -80,6 +78,13 @@ def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vca
         assert all_of(second, vcan) == [CanFrame(0x581, b"own"), CanFrame(0x581, b"other")]
         assert port.send(CanFrame(0x702, b"", remote=True)) is Sent.OK
         assert [peer.receive(LIMIT_S) for _ in range(2)] == [(0x581, b"own"), (0x702 | REMOTE, b"")]
+
+
+def test_long_frames_leave_and_come_as_can_fd(vcan: str) -> None:
+    long, short = CanFrame(0x123456, bytes(range(64)), True, fd=True), CanFrame(0x10, b"short")
+    with port_on(vcan, [], fd=True) as port, port_on(vcan, [long.key, 0x10], fd=True) as other:
+        assert [port.send(frame) for frame in (long, short)] == [Sent.OK, Sent.OK]
+        assert all_of(other, vcan) == [long, short]
 
 
 def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(

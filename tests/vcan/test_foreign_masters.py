@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from encoding import Identity
 from foreign_tools import NODE_CANOPEN, NodeMaster, has_tshark, need, refusal, tshark
 from harness import PtyPort
 from vcan_tools import (
@@ -39,7 +38,7 @@ BOOTED = [BOOT_UP, PRE_OPERATIONAL]
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
 WRITE_ONLY, NO_OBJECT, NO_SUB = 0x06010001, 0x06020000, 0x06090011
 TOO_HIGH, TOO_LOW, TOO_LONG = 0x06090031, 0x06090032, 0x06070012
-NO_DATA, DEVICE_STATE = 0x08000024, 0x08000022
+NO_DATA = 0x08000024
 
 
 @pytest.fixture
@@ -101,47 +100,6 @@ def test_node_canopen_reads_every_object_of_the_eds_and_writes_in_every_way(
             master("nmt", command="resetNode", node=5)
             wait_for(lambda n=begin: master.states(5)[n:] == BOOTED, "a boot-up")  # type: ignore[misc]
             assert master.upload(5, 0x2100, 2) == u32(kept)
-
-
-def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
-    vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
-) -> None:
-    with feeding(tmp_path) as ports:
-        (esc,) = ports
-        esc.identity = Identity(1, alarms=True)
-        master("add", node=7)
-        start_nodes(vcan, start_gateway, ports, tmp_path / "store", 7)
-        wait_for(lambda: master.states(7) == BOOTED, "boot-up and heartbeat")
-        ids = [master("receivePdo", node=7, file=str(EDS), number=n) for n in (1, 2, 3, 4)]
-        assert ids == [0x187, 0x287, 0x387, 0x487]
-        assert not master.of("pdo")
-        master("nmt", command="startNode", node=7)
-
-        def pdos(cob_id: int) -> list[tuple[float, ...]]:
-            told = [each for each in master.of("pdo") if each["cob_id"] == cob_id]
-            return [tuple(value for _, value in each["values"]) for each in told]
-
-        wait_for(lambda: all(len(pdos(cob_id)) >= 3 for cob_id in ids), "changes in all four PDOs")
-        wait_for(lambda: master.of("emergency") != [], "an emergency")
-        esc.identity = Identity(1)
-        wait_for(lambda: len(master.of("emergency")) >= 2, "its end")
-        wait_for(lambda: master.states(7)[-1] == OPERATIONAL, "OPERATIONAL")
-        esc.on = False
-        wait_for(lambda: len(master.of("emergency")) >= 3, "telemetry lost")
-        assert refusal(master.upload, 7, 0x2000, 1) == DEVICE_STATE
-        assert master.upload(7, 0x2020, 1)[0] & 0x3F == 4  # lost
-        count = len(pdos(0x187))
-        sent = sent_by(esc)
-        assert set(pdos(0x187)) <= {tuple(d[:3]) for d in sent}
-        assert set(pdos(0x287)) <= {
-            (d.motor_current, d.peak_current, d.consumed_charge, d.throttle, d.output_opening)
-            for d in sent
-        }
-        esc.on = True
-        wait_for(lambda: len(master.of("emergency")) >= 4, "telemetry back")
-        wait_for(lambda: len(pdos(0x187)) > count + 3, "PDO 1 again")
-        emergencies = [(told["cob_id"], told["code"]) for told in master.of("emergency")[:4]]
-        assert emergencies == [(0x87, code) for code in (0x3220, 0, 0x7510, 0)]
 
 
 IDENTITY = {"vendorId": 0, "productCode": PRODUCT, "revisionNumber": REVISION}

@@ -71,12 +71,6 @@ class GatewayProcess(LoggedProcess):
         return self.wait()
 
 
-def program(*words: object) -> subprocess.CompletedProcess[str]:
-    """A command that ends by itself."""
-    command = [*PROGRAM, *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=2 * LIMIT_S, check=False)
-
-
 class Recorded(NamedTuple):
     """A frame, and when the kernel had it."""
 

@@ -18,7 +18,7 @@ from kontronik_can_gw.capture.format import (
     entry_at,
     read_entries,
     read_json,
-    read_number,
+    read_numbers,
 )
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
@@ -168,7 +168,8 @@ class CaptureInput(PlayedInput):
             return None
         if is_clock:
             # it stands after what was written by the clock before
-            self._offsets.append((time_ns + 1, read_number(entry.data) - time_ns))
+            (wall_ns,) = read_numbers(entry.data)
+            self._offsets.append((time_ns + 1, wall_ns - time_ns))
         if time_ns < self._last_ns:
             return entry._replace(time_ns=self._last_ns)
         self._last_ns = time_ns
