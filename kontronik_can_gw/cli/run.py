@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli import need_descriptors
 from kontronik_can_gw.cli.arguments import CONFIG, config_file, option
 from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
 from kontronik_can_gw.config.assemble import Loaded
@@ -87,7 +86,7 @@ class _Run:
     def main(self) -> None:
         """Run until a signal ends it."""
         sys.setswitchinterval(_LOCK_SWITCH_S)
-        with stopping_on_signals(self._stop, is_service=True):
+        with stopping_on_signals(self._stop):
             loop = self._opened()
             settle_memory()
             loop.run()
@@ -110,7 +109,6 @@ class _Run:
         if loaded.canopen is not None:
             gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config
-        need_descriptors(2 * len(config.esc))
         wait = self._args.wait or config.run.wait_for_devices
         _begin_realtime(config.run.realtime_priority, wait)
         gateway, recorder = self._gateway(loaded)
