@@ -22,7 +22,7 @@ from email.utils import formatdate
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cli.service_files import COMPANIONS, PLAIN, planned
+from kontronik_can_gw.cli.service_files import PLAIN, planned
 from kontronik_can_gw.native.objects import shared_object
 
 HERE = Path(__file__).resolve().parent
@@ -106,7 +106,7 @@ def compressed(text: str | bytes) -> bytes:
 
 def put_service(tree: Path) -> None:
     """Units and the like, as `service install` writes them for a program in /usr/bin."""
-    for place, text in planned(f"/usr/bin/{NAME}", COMPANIONS):
+    for place, text in planned(f"/usr/bin/{NAME}"):
         folder = next(folder for folder in SERVICE if place.startswith(folder))
         put(tree / SERVICE[folder] / Path(place).relative_to(folder), text)
     for kind in ("network", "link"):

@@ -8,10 +8,11 @@ import errno
 import io
 import logging
 import os
+import resource
 import signal
 import sys
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -45,9 +46,6 @@ COMMANDS = {
     "completion": "print the completion script of a shell",
 }
 
-_DESCRIPTORS = 64
-"""Open files that any command needs; a gateway needs two more for each ESC."""
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
@@ -55,7 +53,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = next((word for word in words if not word.startswith("-")), None)
     try:
         _prepare_streams()
-        need_descriptors()
         refuse_removed_options(command, words)
         args = make_parser([] if command is None else [command]).parse_args(words)
         with _interruptible():
@@ -69,16 +66,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output ended, as `| head` does
         discard_output()
     except OSError as error:
-        if error.errno in (errno.EMFILE, errno.ENFILE):
-            say(str(_too_few_files()), command)
-        elif error.errno == errno.ENOSPC:
+        if error.errno == errno.ENOSPC:
             discard_output()
             say(f"standard output: cannot be written: {error.strerror}", command)
-        elif (
-            error.errno in (errno.EACCES, errno.ENAMETOOLONG)
-            and error.filename is not None
-            and command != "run"
-        ):
+        elif error.filename is not None and command != "run":
             say(f"{error.filename}: {error.strerror}", command)
         else:
             raise
@@ -116,25 +107,6 @@ def _interruptible() -> Iterator[None]:
     finally:
         if ended_us:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def need_descriptors(more: int = 0) -> None:
-    """Raise the limit of open files as needed, with ``more`` than every command needs. RunError where that is not allowed."""
-    import resource
-
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = _DESCRIPTORS + more
-    if soft == resource.RLIM_INFINITY or soft >= needed:
-        return
-    if hard != resource.RLIM_INFINITY and hard < needed:
-        raise _too_few_files(needed)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
-
-
-def _too_few_files(needed: int = _DESCRIPTORS) -> RunError:
-    return RunError(
-        f"too few files may be open at once: `ulimit -n {needed}` or more, for a service LimitNOFILE={needed}."
-    )
 
 
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
@@ -176,10 +148,13 @@ class _Plain(logging.Formatter):
 
 
 def _prepare_streams() -> None:
-    """Make the three standard streams safe to use.
+    """Make the three standard streams safe to use, and allow as many open files as can be.
 
     A closed one is replaced: if a serial port got its number, messages would be sent to an ESC.
     """
+    with suppress(ValueError, OSError):
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_Plain())
     for number in range(3):

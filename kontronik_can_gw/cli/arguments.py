@@ -1,6 +1,7 @@
 """Options of commands as rows of a table, and what several commands share of them."""
 
 import argparse
+import os
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -113,19 +114,8 @@ def config_file(given: Path | None) -> Path:
 
 
 def default_config() -> Path | None:
-    """The first of CONFIG_PLACES that is there, whether it can be read or not."""
-    return next((place for place in CONFIG_PLACES if _is_there(place)), None)
-
-
-def _is_there(place: Path) -> bool:
-    """False where nothing has that name; a link that leads nowhere, and what a closed folder hides, are something."""
-    try:
-        place.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError:
-        return True
-    return True
+    """The first of CONFIG_PLACES that is there, be it a link that leads nowhere."""
+    return next((place for place in CONFIG_PLACES if os.path.lexists(place)), None)
 
 
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:

@@ -1,7 +1,6 @@
 """Shared by several commands: the log, signals, and warnings of a configuration on standard error."""
 
 import logging
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -19,8 +18,6 @@ from kontronik_can_gw.errors import UserError
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup
     from kontronik_can_gw.runtime.store import ParameterStore
-
-log = logging.getLogger("kontronik_can_gw")
 
 
 def load_all(path: Path, store: "Callable[[Path], ParameterStore] | None" = None) -> Loaded:
@@ -66,43 +63,23 @@ def logging_to_stderr() -> Iterator[None]:
 
 
 @contextmanager
-def stopping_on_signals(stop: Callable[[], None], is_service: bool = False) -> Iterator[None]:
-    """SIGTERM and SIGINT call ``stop``, a second one ends the process at once. SIGHUP ends a service only if its terminal is closed."""
-    # ignored already: started by nohup
-    has_terminal = _has_terminal() and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """SIGTERM, SIGINT and SIGHUP call ``stop``, a second one ends the process at once. Under nohup SIGHUP stays ignored."""
+    numbers = [signal.SIGTERM, signal.SIGINT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
 
     def end(_number: int, _frame: object) -> None:
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in numbers:
             signal.signal(number, signal.SIG_DFL)
         stop()
 
-    def hang_up(_number: int, _frame: object) -> None:
-        if has_terminal and not _has_terminal():
-            log.warning("the terminal was closed: ending (nohup, setsid or a service goes on)")
-            stop()
-        else:
-            log.warning(
-                "SIGHUP is ignored: the configuration is read at the start only. Restart for another one."
-            )
-
-    handlers = {signal.SIGTERM: end, signal.SIGINT: end}
-    if is_service:
-        handlers[signal.SIGHUP] = hang_up
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    before = {number: signal.signal(number, end) for number in numbers}
     try:
         yield
     finally:
         for number, old in before.items():
             signal.signal(number, old)
-
-
-def _has_terminal() -> bool:
-    """True if the process has a controlling terminal that is still open."""
-    try:
-        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC))
-    except OSError:
-        return False
-    return True
 
 
 def canopen_of(loaded: Loaded) -> "CanopenSetup":

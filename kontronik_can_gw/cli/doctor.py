@@ -2,10 +2,9 @@
 
 import argparse
 import platform
-import shutil
 import textwrap
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
@@ -17,15 +16,10 @@ from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor.can import check_can
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings, count
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.ports import check_port
-from kontronik_can_gw.desk.doctor.service import (
-    Unit,
-    check_folder,
-    check_service,
-    unit_of,
-)
+from kontronik_can_gw.desk.doctor.service import Unit, check_folder, check_service, unit_of
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words, make_core
@@ -49,9 +43,9 @@ def main(args: argparse.Namespace) -> int:
             "version": __version__,
             "config": str(config),
             "exit_code": code,
-            "errors": _count(findings, Severity.ERROR),
-            "warnings": _count(findings, Severity.WARNING),
-            "findings": [asdict(finding) for finding in findings],
+            "errors": count(findings, "error"),
+            "warnings": count(findings, "warning"),
+            "findings": [finding._asdict() for finding in findings],
         }
         print(printable_json(document, indent=2))
     else:
@@ -59,13 +53,10 @@ def main(args: argparse.Namespace) -> int:
     return code
 
 
-def _count(findings: Sequence[Finding], severity: Severity) -> int:
-    return sum(finding.severity is severity for finding in findings)
-
-
 def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
     """All findings, and the exit code. Parts that do not depend on a mistake in the configuration are checked nevertheless."""
-    unit = unit_of(machine, str(path.absolute()))
+    full = str(path.absolute())
+    unit = unit_of(machine, full)
     about, rest = Findings("Configuration"), Findings("Machine")
     found, config, code = about.found, None, 0
     try:
@@ -85,7 +76,7 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
             even = protocol_named(esc.protocol).even_parity
             found += check_port(machine, esc.name, esc.port, even)
         found += check_can(machine, config.can)
-    check_service(machine, rest, unit)
+    check_service(machine, rest, unit, full)
     # a Raspberry Pi's own alarm; it affects USB adapters first
     alarms = [f"/sys/class/hwmon/{name}" for name in machine.names("/sys/class/hwmon")]
     if any(machine.text(f"{each}/in0_lcrit_alarm") == "1" for each in alarms):
@@ -93,13 +84,12 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
     versions = {"python": platform.python_version(), "kernel": platform.release()}
     rest.say("machine.versions", "ok", version=__version__, **versions)
     found += rest.found
-    return found, code or int(_count(found, Severity.ERROR) > 0)
+    return found, code or int(count(found, "error") > 0)
 
 
 def _outputs(findings: Findings, loaded: Loaded) -> None:
     """Which core would run, and warnings."""
-    config = loaded.config
-    findings.say("config", "ok", file=config.file)
+    findings.say("config", "ok", file=loaded.config.file)
     core, why = make_core(loaded.escs, loaded.layout, 0, silent=False)
     findings.say("config.core", "python" if why else "ok", core=in_words(core.language, why))
     for warning in (*loaded.layout.warnings, *loaded.warnings):
@@ -109,13 +99,12 @@ def _outputs(findings: Findings, loaded: Loaded) -> None:
 def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | None) -> None:
     """Whether its folders can be filled."""
     store = parameter_folder(config) if config.canopen.enabled else None
-    status = config.statistics_path
-    folders = {
-        "stored parameters": (store, 0),
-        "captures": (record_folder(config), config.record.min_free_mb * 1_000_000),
-        "statistics": (status.parent if status else None, 0),
-    }
-    for what, (folder, reserve) in folders.items():
+    status, least = config.statistics_path, config.record.min_free_mb * 1_000_000
+    for what, folder, reserve in (
+        ("stored parameters", store, 0),
+        ("captures", record_folder(config), least),
+        ("statistics", status.parent if status else None, 0),
+    ):
         if folder is not None:
             path = folder.absolute()
             own = unit is not None and path.is_relative_to(unit.state_folder)
@@ -123,23 +112,21 @@ def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | 
 
 
 def _show(findings: Sequence[Finding]) -> None:
-    """Print the report. Commands are not wrapped, so that they can be copied."""
-    width = max(40, min(100, shutil.get_terminal_size().columns))
-    group = ""
+    """Print the report in 80 columns. Commands are not wrapped, so that they can be copied."""
+    group, gap = "", " " * 11
     for finding in findings:
         if finding.group != group:
-            if group:
-                show()
             group = finding.group
             show(group)
-        first, *lines = textwrap.wrap(finding.text, width - 11, break_on_hyphens=False) or [""]
-        show(f"  {finding.severity:<9}{first}")
-        remedy = textwrap.wrap(finding.remedy, width - 14, break_on_hyphens=False)
-        remedy += [finding.command] if finding.command else []
-        lines += [f"{'   ' if n else '-> '}{line}" for n, line in enumerate(remedy)]
-        for line in lines:
-            show(f"{' ' * 11}{line}")
-    kinds = (Severity.ERROR, Severity.WARNING, Severity.NOTE)
-    numbers = {kind: _count(findings, kind) for kind in kinds}
-    show()
+        for first, text in (
+            (f"  {finding.severity:<9}", finding.text),
+            (f"{gap}-> ", finding.remedy),
+        ):
+            for line in textwrap.wrap(
+                text, 80, initial_indent=first, subsequent_indent=gap, break_on_hyphens=False
+            ):
+                show(line)
+        if finding.command:
+            show(f"{gap}$ {finding.command}")
+    numbers = {kind: count(findings, kind) for kind in ("error", "warning", "note")}
     show(", ".join(f"{n or 'no'} {kind}{'s' * (n != 1)}" for kind, n in numbers.items()))

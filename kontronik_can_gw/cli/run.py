@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli import need_descriptors
 from kontronik_can_gw.cli.arguments import CONFIG, config_file, option
 from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
 from kontronik_can_gw.config.assemble import Loaded
@@ -76,19 +75,17 @@ class _Run:
     """Runs the gateway, from its configuration to its end."""
 
     def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
-        from kontronik_can_gw.runtime.facts import program_facts
-
         self._args, self._notifier = args, notifier
-        self._path = config_file(args.config)
-        self._program = program_facts(self._path)
         self._loop: Loop | None = None
         self._stopping = False
 
     def main(self) -> None:
         """Run until a signal ends it."""
         sys.setswitchinterval(_LOCK_SWITCH_S)
-        with stopping_on_signals(self._stop, is_service=True):
-            loop = self._opened()
+        with stopping_on_signals(self._stop):
+            self._loop = loop = self._opened()
+            if self._stopping:  # a signal came before the loop existed
+                loop.stop()
             settle_memory()
             loop.run()
 
@@ -101,16 +98,18 @@ class _Run:
     def _opened(self) -> "Loop":
         """The loop with everything open."""
         from kontronik_can_gw.native.load import in_words
+        from kontronik_can_gw.runtime.facts import program_facts
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.native_poller import poller_for
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
+        path = config_file(self._args.config)
+        program = program_facts(path)
         # what cantools made of the DBC is not needed any more, and leaves its memory to the core
-        loaded = replace(load_all(self._path, _parameter_store), database=None)
+        loaded = replace(load_all(path, _parameter_store), database=None)
         if loaded.canopen is not None:
             gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config
-        need_descriptors(2 * len(config.esc))
         wait = self._args.wait or config.run.wait_for_devices
         _begin_realtime(config.run.realtime_priority, wait)
         gateway, recorder = self._gateway(loaded)
@@ -129,19 +128,18 @@ class _Run:
             loaded.store,
             notifier=self._notifier,
             statistics=statistics,
-            program=self._program,
+            program=program,
             recorder=recorder,
             poller=poller_for(gateway),
         )
         # first, because a damaged file is moved aside by now and must be reported
-        _say_parameters(loaded)
+        for esc, why in loaded.damaged:
+            name = loaded.escs[esc].name
+            log.error("%s: stored parameters: %s. Running on defaults.", name, why)
         loop.open()
         log.info("%s", in_words(gateway.core.language, gateway.core_note))
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
-        self._loop = loop
-        if self._stopping:  # a signal came before the loop existed
-            loop.stop()
         return loop
 
     def _gateway(self, loaded: Loaded) -> "tuple[Gateway, Recorder | None]":
@@ -191,15 +189,3 @@ def settle_memory() -> None:
     gc.freeze()
     young, middle, _ = gc.get_threshold()
     gc.set_threshold(young, middle, _NEVER)
-
-
-def _say_parameters(loaded: Loaded) -> None:
-    for esc, reason in loaded.damaged:
-        log.error("%s: stored parameters: %s. Running on defaults.", loaded.escs[esc].name, reason)
-    if loaded.canopen is None:
-        return
-    text = "%s: %s is %s, by what a master stored or the EDS's default"
-    for configured, holds in zip(loaded.config.escs, loaded.escs, strict=True):
-        for name in ("pole_pairs", "gear", "cell_count", "timeout_ns"):
-            if getattr(configured, name) != (held := getattr(holds, name)):
-                log.info(text, holds.name, name, held)

@@ -5,6 +5,7 @@ on this machine, as root, and calls systemd's tools; with it only files below th
 """
 
 import argparse
+import itertools
 import os
 import re
 import shutil
@@ -12,32 +13,24 @@ import subprocess
 import sys
 import sysconfig
 import tomllib
-from importlib.util import find_spec
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.init import example
-from kontronik_can_gw.cli.service_files import (
-    COMPANIONS,
-    CONFIGURATIONS,
-    NAME,
-    NETWORK,
-    OBSOLETE,
-    UNITS,
-    planned,
-    put,
-    remove,
-    take_away,
-    unit,
-)
+from kontronik_can_gw.cli.service_files import NAME, UNITS, planned
 from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.runtime.disk import is_locked
 
 _WANTS = f"{UNITS}/multi-user.target.wants"
 _BOOTED = Path("/run/systemd/system")
 """Exists where systemd runs (sd_booted)."""
+_OBSOLETE = (
+    f"{UNITS}/{NAME}*.service.d/prometheus.conf",
+    f"{UNITS}/{NAME}*@.service.d/instance.conf",
+    f"etc/systemd/network/50-{NAME}-*.example",
+)
+"""What earlier versions installed; their set-up of a CAN interface goes on working and stays."""
 
 
 def _name(text: str) -> str:
@@ -56,22 +49,16 @@ def _program(text: str) -> str:
 
 
 # fmt: off
-_INSTANCE = option("--instance NAME", "one of several gateways: NAME.toml, kontronik-can-gw@NAME", type=_name)
 _ROOT = option("--root DIR", "only write below DIR, as for a disk image; call no tools", type=Path)
 OPTIONS = ()
 ACTIONS = {
     "install": ("write units, udev rules, user and an example configuration; enable", (
-        _INSTANCE,
         _ROOT,
+        option("--instance NAME", "one of several gateways: NAME.toml, kontronik-can-gw@NAME", type=_name),
         option("--now", "start it too, or restart it"),
         option("--executable PATH", "the program (default: this one)", type=_program),
-        option("--mqtt", "a second service that publishes to the broker of the table [mqtt]"),
-        option("--metrics", "a service that serves the statistics for Prometheus on 127.0.0.1:9123"),
     )),
-    "uninstall": ("stop, disable, and remove what install wrote", (
-        _INSTANCE,
-        _ROOT,
-    )),
+    "uninstall": ("stop all of them, disable, and remove what install wrote", (_ROOT,)),
 }
 # fmt: on
 EPILOG = (
@@ -92,92 +79,90 @@ def main(args: argparse.Namespace) -> int:
     if root is None and os.geteuid() != 0:
         raise RunError(f"only root may do that: sudo {_own_program()} service {args.action} ...")
     try:
-        return {"install": _install, "uninstall": _uninstall}[args.action](args)
+        if args.action == "install":
+            _install(args, root or Path("/"))
+        else:
+            _uninstall(root or Path("/"), staged=root is not None)
     except OSError as error:
         raise RunError(f"{error.filename}: {error.strerror}") from None
+    return 0
 
 
 # --- install
 
 
-def _install(args: argparse.Namespace) -> int:
-    root = args.root or Path("/")
-    companions = [kind for kind in COMPANIONS if vars(args)[kind]]
-    for kind in companions:
-        if args.executable is None and find_spec(COMPANIONS[kind]) is None:
-            raise RunError(f"--{kind}: pip install 'kontronik-can-gw[{kind}]'")
+def _install(args: argparse.Namespace, root: Path) -> None:
+    """Write the files, and enable the service if its configuration is usable. RunError where --now cannot start it."""
     program = args.executable or _own_program()
     if args.root is None:
         _check_program(program, is_own=args.executable is None)
-    files = dict(planned(program, companions))
-    own = root / CONFIGURATIONS / f"{args.instance or 'gateway'}.toml"
-    if not own.exists():
-        files[str(own.relative_to(root))] = example()
+    files = dict(planned(program))
+    config = f"etc/{NAME}/{args.instance or 'gateway'}.toml"
+    if not (root / config).exists():
+        files[config] = example()
     for place in files:
         # a link to /etc, as in some roots, would lead to this machine
         if not (root / place).parent.resolve().is_relative_to(root.resolve()):
             raise RunError(f"{(root / place).parent}: leads out of {root}")
     for place, text in files.items():
-        put(root / place, text)
-    for path in (path for place in OBSOLETE for path in root.glob(place)):
-        remove(path)
+        _put(root / place, text)
+    for path in (path for place in _OBSOLETE for path in root.glob(place)):
+        path.unlink()
+        say(f"{path}: removed")
+    template = f"{NAME}{'@' if args.instance else ''}.service"
+    unit = template.replace("@", f"@{args.instance}")
+    lines = _not_ready(root / config)
+    is_ready = not lines
+    if is_ready:  # as `systemctl enable` does it
+        link = root / _WANTS / unit
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.unlink(missing_ok=True)
+        link.symlink_to(f"/{UNITS}/{template}")
+        lines = [f"{unit} is enabled. See: systemctl status {unit}"]
+    else:
+        lines += [f"{unit} was not enabled. When it is right: sudo systemctl enable --now {unit}"]
     if args.root is None:
         _reload()
-    _enable(args, root, own, companions)
-    return 0
+    if args.now and not is_ready:
+        raise RunError(*lines)
+    if args.now and args.root is None:
+        _call("systemctl", "restart", unit)
+    for line in lines:
+        say(line)
 
 
-def _reload() -> None:
-    """Let systemd make user and folders, and read units and udev rules."""
-    for words in (
-        ("systemd-sysusers", f"/etc/sysusers.d/{NAME}.conf"),
-        ("systemd-tmpfiles", "--create", f"/etc/tmpfiles.d/{NAME}.conf"),
-        ("systemctl", "daemon-reload"),
-        ("udevadm", "control", "--reload"),
-        ("udevadm", "trigger", "--action=change", "--subsystem-match=tty"),
-    ):
-        if shutil.which(words[0]):
-            _call(*words)
-    _call("id", NAME)
+def _put(path: Path, text: str) -> None:
+    """Write a file that all may read; another one of that name is kept beside it, and named."""
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
+    done = "new"
+    if os.path.lexists(path):
+        if path.is_file() and path.read_text(encoding="utf-8", errors="replace") == text:
+            return
+        kept = _set_aside(path)
+        done = f"replaced, the one before is {kept}"
+        if path.suffix == ".rules":  # 0.5.0's asked for names of ports in it
+            done += f". Your lines are in {kept}: put them into 71-esc.rules"
+    path.write_text(text, encoding="utf-8")
+    path.chmod(0o644)
+    say(f"{path}: {done}")
 
 
-def _enable(args: argparse.Namespace, root: Path, own: Path, companions: list[str]) -> None:
-    """Enable the services, and start them with --now, if their configuration is usable."""
-    if problems := _not_ready(own):
-        then = f"When it is right: sudo systemctl enable --now {unit(args.instance)}"
-        text = [*problems, f"{unit(args.instance)} was not enabled. {then}"]
-        if args.now:
-            raise RunError(*text)
-        for line in text:
-            say(line)
-        return
-    for kind in ("", *companions):
-        name = unit(args.instance, kind)
-        if kind == "mqtt" and load(own).mqtt.broker is None:
-            say(f"{own}: mqtt.broker is not set. {name} was not enabled.")
-            continue
-        if args.root is not None:
-            link = root / _WANTS / name
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.unlink(missing_ok=True)
-            link.symlink_to(f"/{UNITS}/{unit('' if args.instance else None, kind)}")
-        else:
-            _call("systemctl", "enable", name)
-            if args.now:
-                _call("systemctl", "restart", name)
-        say(
-            f"{name} is enabled{' and runs' if args.now and not args.root else ''}. See: systemctl status {name}"
-        )
+def _set_aside(path: Path) -> str:
+    """Rename a file to the first free name of .bak, .bak2 and so on; the name."""
+    names = (f"{path.name}.bak{number if number > 1 else ''}" for number in itertools.count(1))
+    name = next(name for name in names if not os.path.lexists(path.with_name(name)))
+    path.rename(path.with_name(name))
+    return name
 
 
-def _not_ready(own: Path) -> list[str]:
+def _not_ready(config: Path) -> list[str]:
     """Why the service must not send yet: its configuration is faulty, or the unedited example."""
     try:
-        ports = {esc.port for esc in load(own).esc}
+        ports = {esc.port for esc in load(config).esc}
     except UserError as error:
         return list(error.problems)
     if ports & {esc.port for esc in parse(tomllib.loads(example()), "").esc}:
-        return [f"{own}: is the example. Set ports, bit rate and motors first."]
+        return [f"{config}: is the example. Set ports, bit rate and motors first."]
     return []
 
 
@@ -206,71 +191,59 @@ def _check_program(program: str, *, is_own: bool) -> None:
 # --- uninstall
 
 
-def _units(instance: str | None) -> list[str]:
-    """Names of an instance's services, or patterns of all."""
-    kinds = ("", *COMPANIONS)
-    which = [instance] if instance else [None, "*"]
-    return [unit(each, kind) for each in which for kind in kinds]
-
-
-def _there(instance: str | None) -> list[str]:
-    """Services that there are, loaded or only as files."""
-    lines: list[str] = []
-    for verb in ("list-units", "list-unit-files"):
-        done = _run("systemctl", verb, "--all", "--plain", "--no-legend", *_units(instance))
-        lines += done.stdout.splitlines()
-    names = {line.split()[0] for line in lines if line.strip()}
-    return sorted(name for name in names if not name.endswith("@.service"))
-
-
-def _uninstall(args: argparse.Namespace) -> int:
+def _uninstall(root: Path, *, staged: bool) -> None:
     """Stop, disable and remove. Configurations, stored parameters and the user stay."""
-    root = args.root or Path("/")
-    for name in _there(args.instance) if args.root is None else ():
-        _call("systemctl", "disable", "--now", name)
-        _run("systemctl", "reset-failed", name)
-        say(f"{name}: stopped and disabled")
-    links = sorted((root / _WANTS).glob("*"))
-    found = [path for path in links if any(map(path.match, _units(args.instance)))]
-    kept: list[str] = []
-    if not args.instance:
-        owned = {root / place: text for place, text in planned("", COMPANIONS)}
-        found += filter(os.path.lexists, owned)
-        found += (path for place in OBSOLETE for path in root.glob(place))
-        for path, text in owned.items():
-            take_away(path, text)
-        for folder in (root / f"run/{NAME}", *root.glob(f"run/{NAME}-*")):
-            if not any(map(is_locked, folder.glob("lock/*"))):
-                remove(folder)
-        places = (CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*", NETWORK)
-        there = (path for place in places for path in root.glob(place))
-        kept = [str(path) for path in there if path not in found]
+    if not staged:
+        for verb in ("stop", "reset-failed"):
+            _call("systemctl", verb, f"{NAME}*.service")
+    links = [path for path in (root / _WANTS).glob(f"{NAME}*.service") if path.is_symlink()]
+    found = [*links, *(path for place in _OBSOLETE for path in root.glob(place))]
+    for place, text in planned(""):
+        path = root / place
+        there = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
+        if re.sub(r"(?m)^ExecStart=\S*", "ExecStart=", there) != text:
+            say(f"{path}: was changed, kept as {_set_aside(path)}")
+        elif os.path.lexists(path):
+            found.append(path)
     for path in found:
-        remove(path)
-    if args.root is None and not args.instance:
+        path.unlink()
+        say(f"{path}: removed")
+    if not staged:
         _call("systemctl", "daemon-reload")
-    say("done" if found else "nothing is installed")
-    if kept:
-        say(f"kept: {', '.join(kept)}, and the user {NAME} (sudo rm -r, sudo userdel)")
-    return 0
+    if found:
+        say(
+            f"kept: /etc/{NAME}, /var/lib/{NAME}* (sudo rm -r), the user {NAME} (sudo userdel) and /etc/systemd/network"
+        )
+    else:
+        say("nothing is installed")
 
 
 # --- tools
 
 
-def _run(*words: str) -> "subprocess.CompletedProcess[str]":
-    environment = os.environ | {"LC_ALL": "C.UTF-8", "SYSTEMD_PAGER": "", "SYSTEMD_COLORS": "0"}
-    try:
-        return subprocess.run(
-            words, capture_output=True, text=True, errors="replace", timeout=120, stdin=subprocess.DEVNULL, env=environment
-        )  # fmt: skip
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise RunError(f"`{' '.join(words)}` did not end: {error}") from None
+def _reload() -> None:
+    """Let systemd make user and folders, and read units and udev rules."""
+    for words in (
+        ("systemd-sysusers", f"/etc/sysusers.d/{NAME}.conf"),
+        ("systemd-tmpfiles", "--create", f"/etc/tmpfiles.d/{NAME}.conf"),
+        ("systemctl", "daemon-reload"),
+        ("udevadm", "control", "--reload"),
+        ("udevadm", "trigger", "--action=change", "--subsystem-match=tty"),
+        ("id", NAME),
+    ):
+        if shutil.which(words[0]):
+            _call(*words)
 
 
 def _call(*words: str) -> None:
     """Call a tool. RunError with its output where it fails."""
-    done = _run(*words)
+    environment = os.environ | {"LC_ALL": "C.UTF-8"}
+    try:
+        done = subprocess.run(
+            words, capture_output=True, text=True, errors="replace", timeout=120, stdin=subprocess.DEVNULL, env=environment
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise RunError(f"`{' '.join(words)}` did not end: {error}") from None
     if done.returncode:
         raise RunError(
             f"`{' '.join(words)}` failed: {' '.join((done.stderr or done.stdout).split())}"

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
     from kontronik_can_gw.canopen.nodes import CanopenSetup
+    from kontronik_can_gw.canopen.storage import Stored
     from kontronik_can_gw.runtime.store import ParameterStore
+
 
 _NODES = "the CANopen nodes"
 
@@ -150,8 +152,11 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     problems: list[str] = []
     with collecting(problems):
         check_devices(config)
-    escs, plain, kept = config.escs, None, None
+    escs, plain, canopen = config.escs, None, None
+    stored: list[Stored] = []
+    damaged: list[tuple[int, str]] = []
     ignored: list[str] = []
+    warnings: list[str] = []
     taken: dict[int, str] = {}
     bits: dict[str, float] = {}
     if config.canopen.enabled:  # what only nodes need is not loaded without them
@@ -162,8 +167,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             of_nodes = plain.esc_settings(config.escs)
             taken, bits[_NODES] = nodes.needs(plain, of_nodes)
         if plain is not None and not problems:
-            kept = nodes.read_stored(config, store)
-            escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
+            stored, damaged, warnings = nodes.read_stored(config, store)
+            escs = replace(plain, stored=tuple(stored)).esc_settings(config.escs)
     outputs = _outputs(config, problems, taken, bits)
     database, layout, dbc, file = None, Layout("", "", ()), b"", str(config.dbc_path)
     if config.dbc.enabled:
@@ -173,21 +178,20 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             layout = prepare(database, file, escs, config.dbc_settings, config.can.fd, taken)
     if problems:
         raise UserError(*problems)
-    bitrate, data_bitrate = config.can.bitrate, config.can.data_bitrate
-    warnings = [check_load(layout, bitrate, data_bitrate, bits)]
-    canopen = None
-    if plain is not None and kept is not None:
+    bitrate = config.can.bitrate
+    rates = bitrate, config.can.data_bitrate
+    load = check_load(layout, *rates, bits)
+    if plain is not None:
         foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
-        canopen, given_way = nodes.with_stored(plain, kept.stored, config, escs, foreign)
-        if canopen is not plain:
+        canopen, given_way = nodes.with_stored(plain, stored, config, escs, foreign)
+        warnings = [*given_way, *warnings]
+        if canopen.stored != plain.stored:
             _, bits[_NODES] = nodes.needs(canopen, escs)
-        warnings += [
-            *given_way,
-            *kept.warnings,
-            *nodes.load_of_stored(warnings[0], layout, bitrate, data_bitrate, sum(bits.values())),
-        ]
+            with collecting(warnings):  # more than the bus has is no reason not to start
+                load = check_load(layout, *rates, bits)
     warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(bitrate)]
-    damaged = () if kept is None else tuple(kept.damaged)
     mute = [*unreported(layout, config.dbc.on_loss == "silent"), *unsupplied(layout, escs)]
-    said = tuple(warning for warning in (*config.warnings, *ignored, *mute, *warnings) if warning)
-    return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc, outputs)
+    said = (*config.warnings, *mute, *filter(None, [load]), *warnings)
+    return Loaded(
+        *(config, escs, database, layout, canopen, tuple(damaged), store, said, dbc, outputs)
+    )

@@ -39,7 +39,7 @@ from kontronik_can_gw.node_state import UNCONFIGURED
 REQUIRED = MISSING
 """Default of a key that has to be given."""
 REMOVED_KEYS: dict[str, str] = {
-    "statistics.prometheus": "`kontronik-can-gw metrics` serves /metrics, as a service too: `service install --metrics`.",
+    "statistics.prometheus": "`kontronik-can-gw metrics` serves /metrics; `sudo systemctl enable --now kontronik-can-gw-metrics`.",
     "record.can_log": "`kontronik-can-gw convert CAPTURE flight.log` makes the log from a capture.",
 }
 """Table and key of earlier versions, as "record.can_log", and what to do instead, as a sentence.

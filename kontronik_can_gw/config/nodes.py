@@ -5,7 +5,7 @@ another node or a DBC message, they are ignored with a warning.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
@@ -18,22 +18,12 @@ from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.canopen.uses import Use, uses
 from kontronik_can_gw.config.keys import Config, shipped
-from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
 from kontronik_can_gw.runtime.store import ParameterStore, parameter_file
-from kontronik_can_gw.signals.plan import Layout, classic_bits
-
-
-@dataclass
-class Kept:
-    """Stored parameters of each ESC; ``damaged``: (ESC, why they could not be read)."""
-
-    stored: list[Stored] = field(default_factory=list)
-    damaged: list[tuple[int, str]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+from kontronik_can_gw.signals.plan import classic_bits
 
 
 def load_eds(config: Config) -> Eds:
@@ -73,22 +63,16 @@ def plain_setup(config: Config) -> CanopenSetup:
         serial = serial_number(number + 1, esc.name, identity)
         if canopen.serial is not None:
             serial = canopen.serial + number & 0xFFFFFFFF
-        settings.append(
-            NodeSettings(
-                node_id,
-                serial,
-                canopen.vendor_id,
-                canopen.self_start,
-                canopen.read_only,
-                config.can.bitrate,
-                segment_ns=segment_ns,
-                version=__version__,
-                device=esc.device_number,
-            )
+        own = NodeSettings(
+            *(node_id, serial, canopen.vendor_id, canopen.self_start, canopen.read_only),
+            bitrate=config.can.bitrate,
+            segment_ns=segment_ns,
+            version=__version__,
+            device=esc.device_number,
         )
-    return CanopenSetup(
-        load_eds(config), tuple(settings), (Stored(),) * len(settings), tuple(config.escs)
-    )
+        settings.append(own)
+    nothing = (Stored(),) * len(settings)
+    return CanopenSetup(load_eds(config), tuple(settings), nothing, tuple(config.escs))
 
 
 def needs(setup: CanopenSetup, escs: Sequence[EscSettings]) -> tuple[dict[int, str], float]:
@@ -98,27 +82,32 @@ def needs(setup: CanopenSetup, escs: Sequence[EscSettings]) -> tuple[dict[int, s
     return ids, made.traffic()[1]
 
 
+Kept = tuple[list[Stored], list[tuple[int, str]], list[str]]
+"""What is stored for each ESC's node; ESCs whose parameters cannot be read, and why; warnings."""
+
+
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
     """Parameters that masters stored. Without a store its files are only read."""
-    kept = Kept()
+    stored: list[Stored] = []
+    damaged: list[tuple[int, str]] = []
+    warnings: list[str] = []
     if config.canopen.serial is None and not machine_identity():
-        kept.warnings.append(
+        warnings.append(
             "this machine has no id, so serial numbers (1018h:4) are 0 and LSS cannot distinguish the nodes: set canopen.serial"
         )
     for number, esc in enumerate(config.esc):
         if store is None:
             found, reason = _read_stored_file(parameter_file(parameter_folder(config), esc.name))
             if reason is not None:
-                kept.warnings.append(f"{esc.name}: stored parameters: {reason}")
+                warnings.append(f"{esc.name}: stored parameters: {reason}")
         else:
-            trouble = store.lock(esc.name)
-            if trouble is not None:
-                kept.warnings.append(f"{esc.name}: parameters could not be stored: {trouble}")
+            if trouble := store.lock(esc.name):
+                warnings.append(f"{esc.name}: parameters could not be stored: {trouble}")
             found, reason = store.load(esc.name)
-        kept.stored.append(found)
+        stored.append(found)
         if reason is not None:
-            kept.damaged.append((number, reason))
-    return kept
+            damaged.append((number, reason))
+    return stored, damaged, warnings
 
 
 def _read_stored_file(path: Path) -> tuple[Stored, str | None]:
@@ -175,18 +164,6 @@ def _clashing(
     }
     pairs = enumerate(zip(setup.settings, setup.stored, strict=True))
     return found | {n for n, (own, s) in pairs if own.read_only and s.node_id == UNCONFIGURED}
-
-
-def load_of_stored(
-    before: str | None, layout: Layout, bitrate: int, data_bitrate: int, bits: float
-) -> list[str]:
-    """A warning where only the stored parameters make the bus load too high; the gateway starts nevertheless."""
-    load = layout.bus_load(bitrate, data_bitrate) + bits / bitrate
-    if before is not None or load <= WARN_LOAD:
-        return []
-    return [
-        f"with what masters stored, {load:.0%} of {bitrate // 1000} kbit/s are needed; other nodes get little"
-    ]
 
 
 def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:

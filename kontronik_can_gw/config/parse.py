@@ -7,13 +7,7 @@ from pathlib import Path
 from posixpath import normpath
 from typing import Any, cast
 
-from kontronik_can_gw.config.keys import (
-    REMOVED_KEYS,
-    TABLES,
-    Config,
-    EscConfig,
-    required,
-)
+from kontronik_can_gw.config.keys import REMOVED_KEYS, TABLES, Config, EscConfig, required
 from kontronik_can_gw.dbc.binding import VALUES_BY_KEY
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError, did_you_mean
@@ -28,7 +22,7 @@ def load(path: Path) -> Config:
 
 def parse(tables: Mapping[str, Any], file: str) -> Config:
     """A configuration from TOML tables. UserError with every mistake."""
-    return _valid(*_Parser(file).config(tables))
+    return _valid(*_config(tables, file))
 
 
 def _valid(config: Config | None, problems: list[str]) -> Config:
@@ -52,83 +46,68 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
     except (ValueError, RecursionError) as error:
         # besides TOMLDecodeError: numbers of 5000 digits, 1000 nested brackets
         raise UserError(f"{path}: is not valid TOML: {error}") from None
-    return _Parser(str(path)).config(tables)
+    return _config(tables, str(path))
 
 
-class _Parser:
-    """Tables of a file; ``problems`` and ``warnings`` collect what is to be said about them."""
-
-    def __init__(self, file: str) -> None:
-        self.file = file
-        self.problems: list[str] = []
-        self.warnings: list[str] = []
-
-    def config(self, tables: Mapping[str, Any]) -> tuple[Config | None, list[str]]:
-        """The configuration, None where a table is invalid, and all mistakes."""
-        for name in tables:
-            if name not in TABLES:
-                near = did_you_mean(name, TABLES, 0.5, or_known=True)
-                self._problem(f"{name}: unknown table.{near}")
-        made = {
-            name: self._table(tables.get(name, {}), name, name) for name in TABLES if name != "esc"
-        }
-        escs = self._escs(tables.get("esc", []))
-        is_valid = not self.problems
-        self._problem(*_esc_problems(escs))
-        if not is_valid:
-            return None, self.problems
-        config = Config(
-            **cast(Any, made),
-            esc=tuple(escs.values()),
-            file=self.file,
-            warnings=tuple(self.warnings),
+def _config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[str]]:
+    """The configuration, None where a table is invalid, and all mistakes."""
+    problems: list[str] = []
+    removed: list[str] = []
+    for name in tables:
+        if name not in TABLES:
+            near = did_you_mean(name, TABLES, 0.5, or_known=True)
+            problems.append(f"{name}: unknown table.{near}")
+    made = {
+        name: _table(tables.get(name, {}), name, name, problems, removed)
+        for name in TABLES
+        if name != "esc"
+    }
+    listed = tables.get("esc", [])
+    if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
+        problems.append("esc: is written [[esc]], once for each ESC")
+        listed = []
+    elif not listed:
+        problems.append(
+            "esc: at least one [[esc]] with its port is needed. `kontronik-can-gw init` shows one."
         )
-        self._problem(*_output_problems(config))
-        return config, self.problems
+    escs: dict[int, EscConfig] = {}
+    for number, entry in enumerate(listed, 1):
+        named = {"name": f"esc{number}"} | entry
+        if esc := _table(named, "esc", f"esc[{number}]", problems, removed):
+            escs[number] = esc
+    config = None
+    if not problems:
+        warnings = tuple(f"{file}: {text}" for text in removed)
+        config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file, warnings=warnings)
+    problems += _esc_problems(escs)
+    if config is not None:
+        problems += _output_problems(config)
+    return config, [f"{file}: {text}" for text in problems]
 
-    def _problem(self, *texts: str) -> None:
-        self.problems += [f"{self.file}: {text}" for text in texts]
 
-    def _escs(self, listed: Any) -> dict[int, EscConfig]:
-        """The valid ESCs by their number in the file."""
-        if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
-            self._problem("esc: is written [[esc]], once for each ESC")
-            return {}
-        if not listed:
-            self._problem(
-                "esc: at least one [[esc]] with its port is needed. `kontronik-can-gw init` shows one."
-            )
-        escs = {
-            number: self._table({"name": f"esc{number}"} | entry, "esc", f"esc[{number}]")
-            for number, entry in enumerate(listed, 1)
-        }
-        return {number: esc for number, esc in escs.items() if esc is not None}
-
-    def _table(self, given: Any, name: str, place: str) -> Any:
-        """The object of a table; None where it is invalid."""
-        if not isinstance(given, dict):
-            return self._problem(f"{place}: is a table, written [{place}]")
-        before = len(self.problems)
-        table = TABLES[name]
-        kinds = {f.name: f.metadata["kind"] for f in fields(table)}
-        values: dict[str, Any] = {}
-        for key, value in given.items():
-            if advice := REMOVED_KEYS.get(f"{name}.{key}"):
-                self.warnings.append(
-                    f"{self.file}: {place}.{key}: was removed and is ignored. {advice}"
-                )
-            elif key not in kinds:
-                near = did_you_mean(key, kinds, 0.5, or_known=True)
-                self._problem(f"{place}.{key}: unknown key.{near}")
-            else:
-                try:
-                    values[key] = kinds[key].check(value)
-                except ValueError as error:
-                    self._problem(f"{place}.{key}: {error}")
-        for f in required(table):
-            if f.name not in given:
-                self._problem(f"{place}.{f.name}: is required: {f.metadata['doc']}")
-        return table(**values) if len(self.problems) == before else None
+def _table(given: Any, name: str, place: str, problems: list[str], removed: list[str]) -> Any:
+    """The object of a table; None where it is invalid. Adds what is wrong, and a line for each key that was removed."""
+    if not isinstance(given, dict):
+        problems.append(f"{place}: is a table, written [{place}]")
+        return None
+    before = len(problems)
+    kinds = {f.name: f.metadata["kind"] for f in fields(TABLES[name])}
+    values: dict[str, Any] = {}
+    for key, value in given.items():
+        if advice := REMOVED_KEYS.get(f"{name}.{key}"):
+            removed.append(f"{place}.{key}: was removed and is ignored. {advice}")
+        elif key not in kinds:
+            near = did_you_mean(key, kinds, 0.5, or_known=True)
+            problems.append(f"{place}.{key}: unknown key.{near}")
+        else:
+            try:
+                values[key] = kinds[key].check(value)
+            except ValueError as error:
+                problems.append(f"{place}.{key}: {error}")
+    for f in required(TABLES[name]):
+        if f.name not in given:
+            problems.append(f"{place}.{f.name}: is required: {f.metadata['doc']}")
+    return TABLES[name](**values) if len(problems) == before else None
 
 
 # --- rules about several keys

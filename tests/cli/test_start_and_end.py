@@ -69,24 +69,8 @@ def test_who_has_ctrl_c_ignored_is_not_ended_by_it(folder: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["run --wait -c gateway.toml", "check -c gateway.toml", "status"],
-)
-@pytest.mark.parametrize("limit", [5, 63])
-def test_too_few_open_files_are_one_line(limit: int, words: str, folder: Path) -> None:
-    command = [sys.executable, "-m", "kontronik_can_gw", *words.split()]
-    done = run("sh", "-c", LIMITED, str(limit), *command, folder=folder)
-    assert done.stderr.count("\n") == 1, done.stderr
-    assert "`ulimit -n 64` or more" in done.stderr
-    assert (done.returncode, done.stdout) == (1, "")
-
-
-def test_each_esc_needs_files_too_and_a_soft_limit_is_raised(folder: Path) -> None:
-    command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", "gateway.toml"]
-    assert (
-        "`ulimit -n 66` or more" in run("sh", "-c", LIMITED, "65", *command, folder=folder).stderr
-    )
-    for limit in ("66", "-S 20"):
-        done = run("sh", "-c", LIMITED.replace('"$0"', "$0"), limit, *command, folder=folder)
-        assert "nowhere: no such serial port" in done.stderr
+def test_too_few_open_files_are_one_line(folder: Path) -> None:
+    command = [sys.executable, "-m", "kontronik_can_gw", "simulate", "--esc", "40"]
+    done = run("sh", "-c", LIMITED, "40", *command, folder=folder)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+    assert "Too many open files" in done.stderr

@@ -106,16 +106,14 @@ TAKEN: dict[tuple[str, str], list[object]] = {
 
 
 @pytest.mark.parametrize(("table", "key"), list(TAKEN))
-def test_a_value_of_a_key_is_taken_as_it_is(table: str, key: str) -> None:
+def test_a_value_of_a_key_is_taken_as_it_is_and_one_beyond_its_range_is_refused(
+    table: str, key: str
+) -> None:
     for value in TAKEN[table, key]:
         found = taken(table, key, value)
-        assert found == value and type(found) in (type(value), float)
-
-
-@pytest.mark.parametrize(("table", "key"), list(RANGES))
-def test_a_whole_number_beyond_its_range_is_refused(table: str, key: str) -> None:
-    low, high = RANGES[table, key]
-    for value in (low - 1, high + 1):
+        assert found == value and type(found) is type(value)
+    low, high = RANGES.get((table, key), (0, 0))
+    for value in (low - 1, high + 1) if high else ():
         (line,) = problems(tables(table, key, value))
         assert line.startswith("a.toml: ") and f"{value} is outside {low}..{high}" in line
 
@@ -164,8 +162,6 @@ def test_node_ids_count_on_from_the_base_unless_an_esc_has_its_own() -> None:
     [
         '[dbc.bind]\n"EscPower.BattVolt" = "battery_voltage"\nSpare = 0\nHalf = 0.5',
         '[dbc.bind]\nEscPower.BattVolt = "battery_voltage"\nSpare = 0\nHalf = 0.5',
-        '[dbc.bind.EscPower]\nBattVolt = "battery_voltage"\n[dbc.bind]\nSpare = 0\nHalf = 0.5',
-        'dbc.bind.EscPower.BattVolt = "battery_voltage"\ndbc.bind.Spare = 0\ndbc.bind.Half = 0.5',
         '[dbc]\nbind = { EscPower = { BattVolt = "battery_voltage" }, Spare = 0, Half = 0.5 }',
     ],
 )
@@ -334,19 +330,14 @@ def test_the_schema_takes_and_refuses_what_the_parser_takes_and_refuses() -> Non
 
 
 def test_what_only_the_parser_can_refuse_is_known() -> None:
-    only_parser: list[dict[str, Any]] = [
-        tables("esc", "gear", "5000"),
+    only_parser = [
         tables("esc", "gear", "1/0"),
         tables("esc", "pole_pairs", 7.0),  # to JSON 7.0 is a whole number, to TOML it is a float
-        tables("esc", "name", "max"),
         tables("esc", "name", "a\n"),  # "$" of Python's expressions, which an editor's do not share
         tables("dbc", "bind", {"a": math.inf}),  # JSON has no infinity
-        {"esc": [{"port": "a"}, {"port": "a"}]},
-        {"esc": [{"port": "a", "name": "x"}, {"port": "b", "name": "X"}]},
     ]
-    for made in only_parser:
-        assert VALIDATOR.is_valid(made)
-        assert not accepted(made)
+    assert [VALIDATOR.is_valid(made) for made in only_parser] == [True] * 4
+    assert [accepted(made) for made in only_parser] == [False] * 4
 
 
 def equal(config: Config) -> None:

@@ -22,7 +22,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from kontronik_can_gw.cli.service_files import COMPANIONS, planned
+from kontronik_can_gw.cli.service_files import planned
 
 PROJECT = make_deb.PROJECT
 LEFT_OUT = {"wrapt", "markdown-it-py", "pygments", "argparse-addons", "crccheck"}
@@ -172,7 +172,7 @@ def script(board: Path, name: str, *words: str) -> str:
 
 def installed(board: Path) -> list[Path]:
     """What `service install` of a program in /opt writes."""
-    files = planned("/opt/x/bin/kontronik-can-gw", COMPANIONS)
+    files = planned("/opt/x/bin/kontronik-can-gw")
     for place, content in files:
         make_deb.put(board / place, content)
     return sorted(path for path in (board / "etc").rglob("*") if path.is_file())

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from doctor_trees import Tree, grave, only
 
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.service import check_folder, check_service, unit_of
 
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 STORE = "/var/lib/kontronik-can-gw"
-OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
+OK, NOTE, WARNING, ERROR = "ok", "note", "warning", "error"
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def tree(tmp_path: Path) -> Tree:
 
 def service(tree: Tree) -> list[Finding]:
     findings = Findings("Machine")
-    check_service(tree, findings, unit_of(tree, CONFIG))
+    check_service(tree, findings, unit_of(tree, CONFIG), CONFIG)
     return findings.found
 
 
@@ -49,13 +49,12 @@ def folder(tree: Tree, own: bool = False) -> Finding:
     ],
 )
 def test_how_the_service_fares_is_reported(
-    tree: Tree, shown: dict[str, str], check: str, severity: Severity, word: str
+    tree: Tree, shown: dict[str, str], check: str, severity: str, word: str
 ) -> None:
-    assert "systemd does not run" in only(service(tree), "machine.service").text
     tree.systemd(**shown)
     findings = service(tree)
     found = only(findings, f"machine.{check}")
-    assert found.severity is severity
+    assert found.severity == severity
     assert word in found.command
     assert set(grave(findings)) <= {found.check}
 
@@ -72,28 +71,28 @@ def test_how_the_service_fares_is_reported(
     ],
 )
 def test_a_full_or_read_only_file_system_is_reported(
-    tree: Tree, left: tuple[bool, int], severity: Severity, word: str
+    tree: Tree, left: tuple[bool, int], severity: str, word: str
 ) -> None:
     tree.folder(STORE)
     tree.full[STORE] = left
     found = folder(tree)
-    assert found.severity is severity
+    assert found.severity == severity
     assert word in found.text
 
 
 # --- the real thing
 
 
-def test_who_has_a_terminal_open_or_locked_is_seen() -> None:
+def test_who_has_a_terminal_open_is_seen() -> None:
     master, slave = os.openpty()
     status = Machine().status(os.ttyname(slave))
     assert status is not None
     with subprocess.Popen(["sleep", "600"], stdin=slave) as child:
         try:
-            assert child.pid in [process.pid for process in Machine().openers(status)[0]]
+            assert child.pid in [process.pid for process in Machine().openers(status)]
         finally:
             child.kill()
-    assert child.pid not in [process.pid for process in Machine().openers(status)[0]]
+    assert child.pid not in [process.pid for process in Machine().openers(status)]
     os.close(master)
     os.close(slave)
 
@@ -114,4 +113,4 @@ def test_a_folder_must_be_one_that_this_user_or_systemd_can_fill(tree: Tree) -> 
     assert f"chown anna {STORE}" in folder(tree).command
     assert "made by systemd" in folder(tree, own=True).text
     tree.process(78, "python3", "-m", "kontronik_can_gw", "run")  # of another user
-    assert folder(Tree(tree.root)).severity is OK
+    assert folder(Tree(tree.root)).severity == OK

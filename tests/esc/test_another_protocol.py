@@ -191,7 +191,7 @@ def test_its_line_is_set_without_parity() -> None:
     ("wrong", "said"),
     [
         ({"protocol": "kiss", "device": "KOSMIK"}, "'KOSMIK' is no device of the protocol kiss"),
-        ({"protocol": "kis"}, "'kis' is none of kontronik, kiss. Did you mean kiss?"),
+        ({"protocol": "kis"}, "'kis' is not known here. Did you mean kiss?"),
     ],
 )
 def test_what_its_configuration_cannot_have_is_refused(wrong: dict[str, str], said: str) -> None:

@@ -53,7 +53,7 @@ esc = [{{port = "{ports[0]}"}}, {{port = "{ports[1]}"}}]
 """
 
 
-def test_it_is_ready_and_alive_outlives_a_hang_up_records_all_and_says_that_it_ends(
+def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
     tmp_path: Path,
 ) -> None:
     """By a configuration of 0.5.0, which asks for a CAN log beside the capture: that is not written any more."""
@@ -86,13 +86,12 @@ def test_it_is_ready_and_alive_outlives_a_hang_up_records_all_and_says_that_it_e
             heard(lambda: "STATUS=" in said)
             policy = os.sched_getscheduler(process.pid)
             priority = os.sched_getparam(process.pid).sched_priority
-            process.send_signal(signal.SIGHUP)
             before = said.count("WATCHDOG=1")
             heard(lambda: said.count("WATCHDOG=1") >= before + 4 and file.exists())
             heard(lambda: "esc2: telemetry ok" in errors.read_text())
             heard(lambda: sum(part.stat().st_size for part in captures.iterdir()) > ENOUGH)
             assert json.loads(file.read_text())["escs"][0]["name"] == "esc1"
-            process.terminate()
+            process.send_signal(signal.SIGHUP)  # as where a terminal is closed
             heard(lambda: "STOPPING=1" in said)
             assert process.wait(LIMIT_S) == 0
         finally:
@@ -100,7 +99,6 @@ def test_it_is_ready_and_alive_outlives_a_hang_up_records_all_and_says_that_it_e
             process.wait()
     assert not file.exists()
     logged = errors.read_text()
-    assert "SIGHUP is ignored: the configuration is read at the start only." in logged
     assert "record.can_log: was removed and is ignored. `kontronik-can-gw convert" in logged
     if "not permitted" in logged:
         assert "Running without." in logged and policy == os.SCHED_OTHER

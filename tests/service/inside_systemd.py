@@ -145,13 +145,14 @@ def trial(facts: Facts) -> None:
     facts["install left"] = service("install", "--instance", "left", "--now")
     facts["both"] = [shown(), shown("kontronik-can-gw@left.service")]
     simulator.terminate()
-    facts["uninstall left"] = service("uninstall", "--instance", "left")
+    facts["end of left"] = run("systemctl", "disable", "--now", "kontronik-can-gw@left.service")
     facts["left"] = shown("kontronik-can-gw@left.service")
 
     os.mknod(FORBIDDEN, 0o666 | stat.S_IFCHR, os.makedev(1, 11))  # all may open it, but the service
     os.chmod(FORBIDDEN, 0o666)
     facts["probe"] = probed()
-    facts["metrics"] = service("install", "--metrics", "--now"), fetched(), probed()
+    metrics = run("systemctl", "enable", "--now", "kontronik-can-gw-metrics.service")
+    facts["metrics"] = metrics, fetched(), probed()
     facts["log"] = [[entry.get("PRIORITY"), entry.get("MESSAGE")] for entry in entries()]
 
     facts["uninstall"] = service("uninstall")
@@ -165,11 +166,7 @@ def trial(facts: Facts) -> None:
 
 
 def left_over() -> list[str]:
-    found = [
-        *Path("/etc").rglob("*kontronik*"),
-        *Path("/var/lib").glob("kontronik*"),
-        *Path("/run").glob("kontronik*"),
-    ]
+    found = [*Path("/etc").rglob("*kontronik*"), *Path("/var/lib").glob("kontronik*")]
     return sorted(str(path) for path in found)
 
 

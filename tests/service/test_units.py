@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.cli.service_files import COMPANIONS, planned
+from kontronik_can_gw.cli.service_files import planned
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 BESIDE = tuple(
@@ -21,7 +21,7 @@ MAX_EXPOSED = 2.0
 
 def files() -> dict[str, str]:
     """Texts of all files by their names, *.conf by its folder's."""
-    made = {Path(place): text for place, text in planned("/bin/true", COMPANIONS)}
+    made = {Path(place): text for place, text in planned("/bin/true")}
     return {(p.parent if p.suffix == ".conf" else p).name: text for p, text in made.items()}
 
 

@@ -62,9 +62,9 @@ def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_n
             found, code = doctor(file)
         assert watch.recorded == []
         assert code == 0
-        assert found["can.kernel"]["severity"] == found["can.up"]["severity"] == "ok"
+        assert found["can.up"]["severity"] == "ok"
         assert "virtual interface" in found["can.exists"]["text"]
-        assert not {"can.bitrate", "can.restart", "can.state", "can.queue"} & set(found)
+        assert not {"can.bitrate", "can.restart", "can.state"} & set(found)
 
 
 def test_bit_rate_and_state_of_a_real_driver_are_seen(
@@ -90,7 +90,6 @@ def test_bit_rate_and_state_of_a_real_driver_are_seen(
         found, _ = doctor(file)
         assert found["can.state"]["severity"] == severity
         assert state in found["can.state"]["text"]
-    assert found["can.bus_off"]["severity"] == "warning"
     subprocess.run(found["can.state"]["command"].replace("sudo ", ""), shell=True, check=True)
     assert doctor(file)[0]["can.state"]["severity"] == "ok"
 

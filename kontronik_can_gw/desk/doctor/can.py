@@ -1,7 +1,6 @@
 """Checks the CAN interface: existence, state, bit rate, recovery from bus-off, and health of the bus."""
 
 import json
-import platform
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,8 +8,6 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
 
-MIN_QUEUE = 8
-"""Frames: more than the few that the gateway keeps in the queue itself."""
 _CAN_TYPE = "280"
 """ARPHRD_CAN"""
 _FD_MTU = 72
@@ -19,48 +16,24 @@ _MODES = {"LISTEN-ONLY": "listen_only", "LOOPBACK": "loopback"}
 
 
 def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
-    """All findings about the CAN interface."""
+    """All findings about the CAN interface: the kernel's own facts, and where `ip` is there those of the controller."""
     fd = f" dbitrate {can.data_bitrate} fd on" if can.fd else ""
     findings = Findings(
         f"CAN {can.channel}",
         channel=can.channel,
-        bitrate=can.bitrate,
-        data_bitrate=can.data_bitrate,
         again=f"sudo ip link set {can.channel} down; sudo ip link set {can.channel} up",
         set=f"type can bitrate {can.bitrate}{fd}",
     )
+    net = "/sys/class/net"
+    folder = f"{net}/{can.channel}"
     if can.interface != "socketcan":
         findings.say("can.driver", "unseen", interface=can.interface)
-    elif _kernel(machine, findings) and _exists(machine, findings, can.channel):
-        _interface(machine, findings, can)
-    return findings.found
-
-
-def _kernel(machine: Machine, findings: Findings) -> bool:
-    release = platform.release()
-    loaded = machine.exists("/sys/module/can_raw") or "\nCAN_RAW " in machine.text(
-        "/proc/net/protocols"
-    )
-    lists = [f"/lib/modules/{release}/{name}" for name in ("modules.dep", "modules.builtin")]
-    found = loaded or any("/can-raw.ko" in machine.text(name) for name in lists)
-    findings.say("can.kernel", "ok" if found else "none", release=release)
-    return found
-
-
-def _exists(machine: Machine, findings: Findings, channel: str) -> bool:
-    net = "/sys/class/net"
-    kinds = {name: machine.text(f"{net}/{name}/type") for name in machine.names(net)}
-    there = [name for name, kind in kinds.items() if kind == _CAN_TYPE]
-    if channel in there:
-        return True
-    case = "no_can" if channel in kinds else "others" if there else "none"
-    findings.say("can.exists", case, there=", ".join(there) or "none")
-    return False
-
-
-def _interface(machine: Machine, findings: Findings, can: CanConfig) -> None:
-    """The kernel's own facts, and where `ip` is there those of the controller."""
-    folder = f"/sys/class/net/{can.channel}"
+        return findings.found
+    if machine.text(f"{folder}/type") != _CAN_TYPE:
+        there = [n for n in machine.names(net) if machine.text(f"{net}/{n}/type") == _CAN_TYPE]
+        case = "no_can" if machine.exists(folder) else "others" if there else "none"
+        findings.say("can.exists", case, there=", ".join(there) or "none")
+        return findings.found
     link = _link(machine, can.channel)
     kind = link.get("info_kind")
     virtual = kind in ("vcan", "vxcan")
@@ -75,16 +48,12 @@ def _interface(machine: Machine, findings: Findings, can: CanConfig) -> None:
         # slcan, which cannot leave bus-off by itself, has no device
         has_restart = kind != "can" or machine.exists(f"{folder}/device")
         _controller(findings, can, link.get("info_data", {}), is_up, has_restart)
-    length = machine.text(f"{folder}/tx_queue_len")
-    if length.isdigit() and not virtual and int(length) < MIN_QUEUE:  # other programs share it
-        findings.say("can.queue", "short", length=length)
-    if times := link.get("info_xstats", {}).get("bus_off"):
-        findings.say("can.bus_off", "some", times=times)
+    return findings.found
 
 
 def _link(machine: Machine, name: str) -> Mapping[str, Any]:
     """Kind, bit timing and state of an interface; empty without an `ip` that shows them."""
-    shown = machine.run("ip", "-json", "-details", "-statistics", "link", "show", "dev", name)
+    shown = machine.run("ip", "-json", "-details", "link", "show", "dev", name)
     try:
         found: Mapping[str, Any] = json.loads(shown)[0].get("linkinfo", {})
     except (ValueError, LookupError):
@@ -98,12 +67,13 @@ def _controller(
     """What the driver says."""
     # a driver with fixed rates only, as slcan, has no further timing
     bitrate = data.get("bittiming", {}).get("bitrate", data.get("bittiming_bitrate", 0))
-    fast = data.get("data_bittiming", {}).get("bitrate", can.data_bitrate)
+    rates = {"bitrate": (can.bitrate, bitrate)}
+    if can.fd and (fast := data.get("data_bittiming", {}).get("bitrate")):
+        rates["data_bitrate"] = can.data_bitrate, fast
     if is_up or bitrate:  # otherwise the command that starts it sets all of it
-        case = "ok" if bitrate == can.bitrate else "other" if bitrate else "none"
-        findings.say("can.bitrate", case, real=bitrate)
-        if can.fd and fast != can.data_bitrate:
-            findings.say("can.data_bitrate", "other", real=fast)
+        for key, (wanted, real) in rates.items():
+            case = "ok" if real == wanted else "other" if real else "none"
+            findings.say("can.bitrate", case, key=key, wanted=wanted, real=real)
         ms = data.get("restart_ms", 0)
         findings.say("can.restart", ("ok" if ms else "never") if has_restart else "slcan", ms=ms)
     state, counters = data.get("state", "STOPPED"), data.get("berr_counter", {})

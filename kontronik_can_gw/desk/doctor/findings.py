@@ -1,38 +1,31 @@
 """Findings of checks with severity and remedy, worded in checks.toml."""
 
 import tomllib
-from dataclasses import dataclass
-from enum import StrEnum
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
+
+_WORDINGS: dict[str, dict[str, list[str]]] = tomllib.loads(
+    Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
+)
+"""By check and case: severity, text, remedy, command; the last two may be missing."""
 
 
-class Severity(StrEnum):
-    """``ok``: as it should be. ``note``: good to know. ``warning``: works, but not well. ``error``: does not work."""
-
-    OK = "ok"
-    NOTE = "note"
-    WARNING = "warning"
-    ERROR = "error"
-
-
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """One line of the report. ``remedy`` says in words what to do, ``command`` is a line to type; either may be empty."""
 
     group: str
     check: str
     """Stable name for programs, as ``port.parity``."""
-    severity: Severity
+    severity: str
     text: str
     remedy: str = ""
     command: str = ""
 
 
-@cache
-def wordings() -> dict[str, dict[str, list[str]]]:
-    """By check and case: severity, text, remedy, command; the last two may be missing."""
-    return tomllib.loads(Path(__file__).with_name("checks.toml").read_text(encoding="utf-8"))
+def count(findings: Sequence[Finding], severity: str) -> int:
+    """How many have a severity."""
+    return sum(finding.severity == severity for finding in findings)
 
 
 class Findings:
@@ -45,6 +38,6 @@ class Findings:
 
     def say(self, check: str, case: str, **values: object) -> None:
         """Add a case of a check."""
-        severity, *texts = wordings()[check][case]
+        severity, *texts = _WORDINGS[check][case]
         filled = [text.format(**{**self.values, **values}) for text in texts]
-        self.found.append(Finding(self.group, check, Severity(severity), *filled))
+        self.found.append(Finding(self.group, check, severity, *filled))

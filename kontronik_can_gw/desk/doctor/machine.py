@@ -7,15 +7,13 @@ import contextlib
 import grp
 import os
 import pwd
-import shutil
 import stat
 import subprocess
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
-_PROGRAM_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
-"""`ip` is not on every user's path."""
 _PATIENCE_S = 5.0
 
 
@@ -24,7 +22,7 @@ class Process(NamedTuple):
 
     pid: int
     name: str
-    words: tuple[str, ...] = ()
+    words: tuple[str, ...]
 
     @property
     def is_gateway(self) -> bool:
@@ -47,26 +45,24 @@ class Machine:
 
     def text(self, name: str) -> str:
         """A small file's text; empty where it cannot be read."""
-        try:
+        with contextlib.suppress(OSError):
             return self.path(name).read_bytes().decode("utf-8", "replace").strip("\0\n ")
-        except OSError:
-            return ""
+        return ""
 
     def names(self, folder: str) -> list[str]:
         """Names in a folder; empty where it cannot be read."""
-        try:
+        with contextlib.suppress(OSError):
             return sorted(each.name for each in self.path(folder).iterdir())
-        except OSError:
-            return []
+        return []
+
+    def status(self, name: str) -> os.stat_result | None:
+        """None where there is nothing of that name that we may see."""
+        with contextlib.suppress(OSError):
+            return self.path(name).stat()
+        return None
 
     def exists(self, name: str) -> bool:
         return self.status(name) is not None
-
-    def status(self, name: str) -> os.stat_result | None:
-        try:
-            return self.path(name).stat()
-        except OSError:
-            return None
 
     def real(self, name: str) -> str:
         """The path without symbolic links."""
@@ -86,21 +82,18 @@ class Machine:
 
     def run(self, *command: str) -> str:
         """Output of a program, whatever its exit code; empty where it is missing or takes too long."""
-        program = shutil.which(command[0], path=_PROGRAM_PATH)
+        path = (
+            f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/sbin"  # `ip` is not on every user's
+        )
+        env = os.environ | {"LC_ALL": "C", "PATH": path}
         with contextlib.suppress(OSError, subprocess.SubprocessError):
-            if program is not None:
-                words, env = [program, *command[1:]], {**os.environ, "LC_ALL": "C"}
-                done = subprocess.run(
-                    words, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PATIENCE_S, env=env
-                )  # fmt: skip
-                return done.stdout.decode("utf-8", "replace")
+            done = subprocess.run(
+                command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PATIENCE_S, env=env
+            )  # fmt: skip
+            return done.stdout.decode("utf-8", "replace")
         return ""
 
-    @property
-    def has_systemd(self) -> bool:
-        return self.exists("/run/systemd/system")
-
-    @property
+    @cached_property
     def user(self) -> str:
         """The name of this process's user."""
         try:
@@ -115,36 +108,23 @@ class Machine:
             return str(gid)
 
     @cached_property
-    def processes(self) -> dict[int, Process]:
+    def processes(self) -> list[Process]:
         """All visible processes except this one."""
-        found = {}
+        found = []
         for pid in (int(name) for name in self.names("/proc") if name.isdigit()):
             if pid != os.getpid() and (name := self.text(f"/proc/{pid}/comm")):
                 words = self.text(f"/proc/{pid}/cmdline").split("\0")
-                found[pid] = Process(pid, name, tuple(words))
+                found.append(Process(pid, name, tuple(words)))
         return found
 
-    def openers(self, device: os.stat_result) -> tuple[list[Process], bool]:
-        """Processes that have a character device open or locked; False if there may be others that this user cannot see."""
-        found: dict[int, Process] = {}
-        complete = bool(self.processes) and self.exists("/proc/1/comm")
-        for pid, process in self.processes.items():
-            try:
-                numbers = list(self.path(f"/proc/{pid}/fd").iterdir())
-            except PermissionError:
-                complete = False
-                continue
-            except OSError:  # it ended meanwhile
-                continue
-            for number in numbers:
-                status = self.status(f"/proc/{pid}/fd/{number.name}")
-                if status and stat.S_ISCHR(status.st_mode) and status.st_rdev == device.st_rdev:
-                    found[pid] = process
-        # locks, which every user can see
-        place = f"{os.major(device.st_dev):02x}:{os.minor(device.st_dev):02x}:{device.st_ino}"
-        for words in map(str.split, self.text("/proc/locks").splitlines()):
-            if len(words) > 5 and words[5] == place and words[4] not in ("-1", str(os.getpid())):
-                pid = int(words[4])
-                unseen = Process(pid, "a program that we may not see")
-                found[pid] = self.processes.get(pid, unseen)
-        return [found[pid] for pid in sorted(found)], complete
+    @property
+    def runs_gateway(self) -> bool:
+        return any(process.is_gateway for process in self.processes)
+
+    def openers(self, device: os.stat_result) -> Iterator[Process]:
+        """Processes that have a character device open, as far as this user may see."""
+        for process in self.processes:
+            folder = f"/proc/{process.pid}/fd"
+            held = (self.status(f"{folder}/{number}") for number in self.names(folder))
+            if any(s and stat.S_ISCHR(s.st_mode) and s.st_rdev == device.st_rdev for s in held):
+                yield process

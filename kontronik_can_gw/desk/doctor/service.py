@@ -14,10 +14,9 @@ _MIN_BYTES = 1_000_000
 
 
 class Unit(NamedTuple):
-    """A systemd unit, the configuration that it runs, and its properties as `systemctl show` has them."""
+    """A systemd unit, and its properties as `systemctl show` has them."""
 
     name: str
-    config: str
     shown: dict[str, str]
 
     @property
@@ -31,34 +30,28 @@ def unit_of(machine: Machine, config: str) -> Unit | None:
     path = PurePath(config)
     is_instance = str(path.parent) == f"/etc/{NAME}" and path.stem != "gateway"
     name = f"{NAME}@{path.stem}.service" if is_instance else f"{NAME}.service"
-    if not machine.has_systemd:
-        return None
     lines = machine.run("systemctl", "show", name, f"--property={_SHOWN}").splitlines()
     shown = dict(line.partition("=")[::2] for line in lines)
-    if shown.get("LoadState") != "loaded":
-        return None
-    return Unit(name, config, shown)
+    return Unit(name, shown) if shown.get("LoadState") == "loaded" else None
 
 
-def check_service(machine: Machine, findings: Findings, unit: Unit | None) -> None:
+def check_service(machine: Machine, findings: Findings, unit: Unit | None, config: str) -> None:
     """Check whether it is installed, enabled and running, and how often it was restarted."""
     if unit is None:
-        findings.say("machine.service", "none" if machine.has_systemd else "no_systemd")
+        findings.say("machine.service", "none")
         return
-    state, restarts = unit.shown.get("ActiveState", ""), unit.shown.get("NRestarts", "0")
+    state = unit.shown.get("ActiveState", "")
+    restarts, result = unit.shown.get("NRestarts", "0"), unit.shown.get("Result", "")
     case = "ok" if restarts == "0" else "restarted"
     if state not in ("active", "reloading"):
         case = "failed" if state == "failed" else "stopped"
-    detail = f"{unit.shown.get('SubState', '')}, result {unit.shown.get('Result', '')}"
-    findings.say(
-        "machine.service", case, unit=unit.name, detail=detail, state=state, restarts=restarts
-    )
+    findings.values["unit"] = unit.name
+    findings.say("machine.service", case, result=result, state=state, restarts=restarts)
     if not unit.shown.get("UnitFileState", "").startswith("enabled"):
-        findings.say("machine.service_enabled", "no", unit=unit.name)
+        findings.say("machine.service_enabled", "no")
     user = unit.shown.get("User") or "root"
     if user != machine.user:
-        names = {"unit": unit.name, "user": user, "me": machine.user, "file": unit.config}
-        findings.say("machine.user", "other", **names)
+        findings.say("machine.user", "other", user=user, me=machine.user, file=config)
 
 
 def check_folder(
@@ -70,30 +63,22 @@ def check_folder(
     written there.
     """
     there = PurePath(folder)
-    while not machine.exists(str(there)):
+    while (status := machine.status(str(there))) is None:
         there = there.parent
-    status, (read_only, free) = machine.status(str(there)), machine.space(str(there))
-    assert status is not None
+    read_only, free = machine.space(str(there))
+    needed = max(_MIN_BYTES, reserve)
     case = "ok"
     if not S_ISDIR(status.st_mode):
         case = "file"
     elif read_only:
         case = "read_only"
-    elif free < max(_MIN_BYTES, reserve):
+    elif free < needed:
         case = "full"
     elif own:
         case = "by_systemd"
     elif not machine.may(str(there), os.W_OK | os.X_OK):
-        running = any(each.is_gateway for each in machine.processes.values())
-        case = "gateway" if running else "closed"
-    findings.say(
-        "config.folder",
-        case,
-        what=what,
-        folder=folder,
-        there=there,
-        made="" if str(there) == folder else ", will be made",
-        user=machine.user,
-        free=free // 1_000_000,
-        needed=max(1, reserve // 1_000_000),
-    )
+        case = "gateway" if machine.runs_gateway else "closed"
+    made = "" if str(there) == folder else ", will be made"
+    space = {"free": free // 1_000_000, "needed": needed // 1_000_000}
+    names = {"what": what, "folder": folder, "there": there, "user": machine.user}
+    findings.say("config.folder", case, made=made, **names, **space)
