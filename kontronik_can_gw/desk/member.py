@@ -51,8 +51,6 @@ class Member:
     def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
         self.view, self.index = view, index
         self.name = "" if settings is None else settings.name
-        self.cells = None if settings is None else settings.cell_count
-        """As configured; None where not."""
         self.protocol = protocol_named(None if settings is None else settings.protocol)
         self.columns: dict[str, int] = {}
         for at, column in enumerate(view.reader.columns):

@@ -82,7 +82,7 @@ def test_the_newest_metrics_are_fetched_as_prometheus_does(
     assert ask(port)[0] == 503
     file.write_text(json.dumps(document | {"version": "9.9.9"}))
     assert 'kontronik_build_info{version="9.9.9"} 1.0' in ask(port)[2]
-    for age_ns, said in ((STALE_NS + 9 * SECOND, "since 12.0 s"), (-STALE_NS - 1, "not running")):
+    for age_ns, said in ((STALE_NS + 9 * SECOND, "for 12.0 s"), (-STALE_NS - 1, "not running")):
         clock.now = document["monotonic_ns"] + age_ns
         status, _, text = ask(port)
         assert (status, said in text) == (503, True)

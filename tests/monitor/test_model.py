@@ -188,7 +188,6 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(tmp_path: Path) -
     monitor.take(CanFrame(257, bytes((26, 6, 0, 0, 0, 0, 0, 0))), 2 * STEP_NS)
     assert monitor.is_complete
     assert esc.number("battery_voltage") == 22.2
-    assert esc.number("mean_cell_voltage") == pytest.approx(3.7)
     assert esc.number("power_stage_temperature") == pytest.approx(60.05)
     assert esc.tracks["battery_voltage"].low == 22.2
     assert esc.state == "RPMControl"

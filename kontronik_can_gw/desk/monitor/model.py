@@ -85,15 +85,6 @@ class Esc(Member):
 
     tracks: dict[str, Track]
 
-    def number(self, source: str) -> float | None:
-        """The value of a numeric source. The cell voltage is computed if the DBC has none and the number of cells is known."""
-        value = super().number(source)
-        if value is None and source == "mean_cell_voltage":
-            cells = self.cells or self.number("cell_count")
-            voltage = self.number("battery_voltage")
-            return voltage / cells if cells and voltage is not None else None
-        return value
-
     @property
     def device_text(self) -> str:
         """Device, variant and firmware; empty where not available."""

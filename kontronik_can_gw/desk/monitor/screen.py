@@ -54,8 +54,6 @@ def screen(
     lines = [_title(monitor, source)]
     for text, style in notices(monitor, source):
         lines += wrapped(text, style, width)
-    if source.note:
-        lines.append(line((source.note, "cyan")))
     room = height - len(lines) - 1
     escs = monitor.escs if page == 0 else monitor.escs[page - 1 : page]
     if len(escs) == 1:
@@ -198,7 +196,7 @@ def _page(esc: Esc, width: int) -> list[Text]:
     heads = ("", "", "now", "min", "max", f"last {seconds} s")
     rows: list[list[Part]] = [[(text, "dim") for text in heads]]
     for quantity in QUANTITIES:
-        if esc.has(quantity.source) or esc.number(quantity.source) is not None:
+        if esc.has(quantity.source):
             track = esc.tracks[quantity.source]
             extremes = (number(each, quantity.digits) for each in (track.low, track.high))
             names = (quantity.label, "dim"), (quantity.unit, "dim")

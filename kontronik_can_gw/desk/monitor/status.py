@@ -1,7 +1,6 @@
 """The state of a running gateway from its statistics file: an exit code, faults in words, lines of at most 80 columns."""
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,6 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.native.load import in_words
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.fault_log import duration
-from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
@@ -100,10 +98,10 @@ def judge(file: Path, document: Any, now: int) -> Seen:
 def _judge(file: Path, document: Document, now: int) -> Seen:
     age = now - document["monotonic_ns"]
     age_s = age / SECOND
-    if age < -STALE_NS or not _is_alive(document["process"]):  # or the machine restarted since
-        return Seen(file, NOT_RUNNING, "not running", (), age_s, document)
-    if age > STALE_NS:
-        text = f"does not answer since {duration(age)} (stopped, or the disk of its file is full)"
+    if abs(age) > STALE_NS:
+        text = "not running"  # the machine has restarted since
+        if age > 0:
+            text = f"has written nothing for {duration(age)} (ended, held up, or the disk is full)"
         return Seen(file, NOT_RUNNING, text, (), age_s, document)
     troubles = tuple(map(printable, _troubles(document)))
     sentence = printable(document["gateway"]["state"])
@@ -134,21 +132,6 @@ def _troubles(document: Document) -> Iterator[str]:
         yield f"parameters cannot be stored: {store['last_error']}"
     if (recording := document["recording"]) and recording["problem"]:
         yield f"captures: {recording['problem']}"
-
-
-def _is_alive(process: Document) -> bool:
-    """True if the writing process still runs, or if that cannot be found out."""
-    pid, ticks = process["pid"], process["start_ticks"]
-    if pid <= 0 or process["pid_namespace"] != pid_namespace():
-        return True
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # another user's
-        pass
-    now = start_ticks(pid)
-    return now >= 0 and (now == 0 or ticks == 0 or now == ticks)
 
 
 # --- lines
