@@ -87,6 +87,7 @@ def written(
 def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "run"
     monkeypatch.setattr(status, "RUN_FOLDER", folder)
+    monkeypatch.setattr("kontronik_can_gw.desk.monitor.status.RUN_FOLDER", folder)
     return folder
 
 
@@ -165,26 +166,21 @@ def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path) -> None:
         assert said in refused(NOT_RUNNING, "status", "--file", tmp_path / name)
 
 
-def test_a_configuration_is_looked_for_among_the_services(tmp_path: Path, run_folder: Path) -> None:
-    configuration = tmp_path / "front.toml"
-    configuration.write_text('[[esc]]\nport = "x"\n', encoding="utf-8")
+def test_a_configuration_names_its_file_or_the_service_of_its_name(
+    tmp_path: Path, run_folder: Path
+) -> None:
+    esc = '[[esc]]\nport = "x"\n'
+    for name, folder in (("gateway", ""), ("left", "-left")):
+        toml = tmp_path / f"{name}.toml"
+        toml.write_text(esc, encoding="utf-8")
+        assert shell("-c", toml)[0] == NOT_RUNNING
+        written(run_folder / f"kontronik-can-gw{folder}" / "status.json", heard())
+        code, out, _ = shell("-c", toml)
+        assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
     elsewhere = tmp_path / "elsewhere.toml"
-    elsewhere.write_text('[statistics]\nfile = "s/status.json"\n[[esc]]\nport = "x"\n')
+    elsewhere.write_text(f'[statistics]\nfile = "s/status.json"\n{esc}')
     written(tmp_path / "s" / "status.json", heard())
-    assert shell("-c", elsewhere)[0] == HEALTHY, "one that says where it is"
-    code, _, talk = shell("-c", configuration)
-    assert code == NOT_RUNNING and "no gateway with this configuration runs as a service" in talk
-    written(
-        run_folder / "kontronik-can-gw-rear" / "status.json",
-        heard(),
-        program_facts(tmp_path / "rear.toml"),
-    )
-    written(
-        run_folder / "kontronik-can-gw-front" / "status.json", heard(), program_facts(configuration)
-    )
-    code, out, _ = shell("-c", configuration)
-    assert code == HEALTHY
-    assert str(configuration) in out and "rear.toml" not in out
+    assert shell("-c", elsewhere)[0] == HEALTHY
 
 
 def test_all_services_are_shown_and_the_worst_is_the_exit_code(

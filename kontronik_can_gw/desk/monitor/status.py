@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.text import Text
 
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.member import Flag, alarms_of, flag_of
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
@@ -28,6 +29,7 @@ from kontronik_can_gw.runtime.fault_log import duration
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
+RUN_FOLDER = Path("/run")
 _LARGEST_FILE = 1 << 22
 FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
@@ -59,6 +61,13 @@ class Seen:
             "age_s": None if self.age_s is None else round(self.age_s, 3),
             "document": self.document,
         }
+
+
+def status_file(config: Path | None) -> Path:
+    """The file of a configuration's gateway: its own, or the service's of the same name."""
+    own = None if config is None else load(config).statistics_path
+    folder = PROGRAM if config is None or config.stem == "gateway" else f"{PROGRAM}-{config.stem}"
+    return own or RUN_FOLDER / folder / "status.json"
 
 
 def look_at(file: Path, now: int) -> Seen:
