@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.member import Flag, Member
+from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -95,7 +95,7 @@ class Esc(Member):
         return f"{text}, firmware {self.firmware}" if text and self.firmware else text
 
     @property
-    def active(self) -> list[Flag]:
+    def active(self) -> list[Alarm]:
         """The bits that are set."""
         return [flag for word in self.protocol.errors for flag in self.flags(word) or ()]
 
@@ -109,7 +109,7 @@ class Esc(Member):
         """Everything as JSON; None for what is not available."""
         names: dict[Severity, list[str]] = {severity: [] for severity in Severity}
         for flag in self.active:
-            names[flag.severity].append(flag.name)
+            names[flag.severity].append(flag.text)
         return {
             "name": self.name,
             "link": self.link,

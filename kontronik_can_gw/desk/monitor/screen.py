@@ -6,7 +6,7 @@ from math import inf
 from rich.text import Text
 
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.desk.member import Flag, alarms_of
+from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
     Part,
@@ -171,7 +171,7 @@ def _trouble(esc: Esc) -> Flag | None:
 
 def alarms(escs: Sequence[Esc], width: int, room: int = 999) -> list[Text]:
     """Errors and warnings of the ESCs."""
-    found: list[tuple[str, Flag]] = []
+    found: list[tuple[str, Alarm]] = []
     for esc in escs:
         trouble = _trouble(esc)
         flags = alarms_of([*([trouble] if trouble else []), *esc.active])

@@ -9,7 +9,7 @@ from typing import Any
 from rich.text import Text
 
 from kontronik_can_gw.config.parse import load
-from kontronik_can_gw.desk.member import Flag, alarms_of, flag_of
+from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
     Part,
@@ -219,7 +219,7 @@ def _esc_rows(document: Document) -> Iterator[list[Part]]:
         ]
 
 
-def alarms(document: Document) -> list[tuple[str, Flag]]:
+def alarms(document: Document) -> list[tuple[str, Alarm]]:
     """Errors and warnings that the ESCs report, each after the ESC's name."""
     found = []
     for esc in document["escs"]:
@@ -227,7 +227,7 @@ def alarms(document: Document) -> list[tuple[str, Flag]]:
         for key in ("errors", "selftest_errors", "warnings"):
             severity = Severity.WARNING if key == "warnings" else Severity.ERROR
             for name in esc[key] or ():
-                flags.append(flag_of(bits[name]) if name in bits else Flag(name, severity, name))
+                flags.append(bits[name] if name in bits else Flag(name, severity, name))
         found += [(f"{esc['name']} ", flag) for flag in alarms_of(flags)]
     return found
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.member import Flag, Member
+from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.mqtt.discovery import device
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
@@ -136,10 +136,10 @@ class Published(Member):
         return self._kinds.get(normalize(self.state or ""))
 
 
-def _in_words(flags: Sequence[Flag] | None) -> list[dict[str, str]] | None:
+def _in_words(flags: Sequence[Alarm] | None) -> list[dict[str, str]] | None:
     if flags is None:
         return None
-    return [{"name": f.name, "severity": f.severity.value, "meaning": f.meaning} for f in flags]
+    return [{"name": f.text, "severity": f.severity.value, "meaning": f.meaning} for f in flags]
 
 
 class Publisher:
