@@ -69,7 +69,6 @@ ONLY_IN = {
     "asammdf": ("desk",),
     "paho": ("desk",),
     "shtab": ("cli",),
-    "canopen": ("desk/monitor/demo.py",),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

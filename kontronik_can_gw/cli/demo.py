@@ -18,7 +18,7 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "A simulated ESC, the gateway, the canopen package as master of its node, and the monitor, which knows the DBC. "
+    "A simulated ESC, the gateway, and the monitor, which knows the DBC. "
     "Exit code: 0 at its end, 2 wrong usage. The same with ports and a bus: simulate, run, monitor."
 )
 

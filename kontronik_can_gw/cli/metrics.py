@@ -7,11 +7,8 @@ from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import CONFIG, option
 from kontronik_can_gw.cli.common import announced_config, say, stopping_on_signals
-from kontronik_can_gw.config.parse import load
+from kontronik_can_gw.desk.monitor.status import status_file
 from kontronik_can_gw.errors import RunError
-
-_RUN_FOLDER = Path("/run")
-_NAME = "kontronik-can-gw"
 
 
 def _loopback(text: str) -> tuple[str, int]:
@@ -32,7 +29,7 @@ def _loopback(text: str) -> tuple[str, int]:
 OPTIONS = (
     (
         *CONFIG,
-        option("--file FILE", f"its statistics file (default: the configuration's, or {_RUN_FOLDER}/{_NAME}/status.json)", type=Path),
+        option("--file FILE", "its statistics file (default: the configuration's, or /run/kontronik-can-gw/status.json)", type=Path),
     ),
     option("--listen HOST:PORT", "where Prometheus may fetch /metrics, on this machine (default 127.0.0.1:9123)",
            type=_loopback, default=("127.0.0.1", 9123)),
@@ -46,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
         from kontronik_can_gw.desk.metrics import server_of
     except ImportError:
         raise RunError("needs prometheus-client: pip install 'kontronik-can-gw[metrics]'") from None
-    file = args.file or _status_file(args.config or announced_config())
+    file = args.file or status_file(args.config or announced_config())
     host, port = args.listen
     stopped, server = threading.Event(), server_of(file, host, port)
     with server, stopping_on_signals(stopped.set):
@@ -55,10 +52,3 @@ def main(args: argparse.Namespace) -> int:
         say(f"http://{shown}:{server.server_port}/metrics serves {file}")
         stopped.wait()
     return 0
-
-
-def _status_file(config: Path | None) -> Path:
-    """The file of a configuration's gateway: its own, or the service's of the same name."""
-    own = None if config is None else load(config).statistics_path
-    folder = _NAME if config is None or config.stem == "gateway" else f"{_NAME}-{config.stem}"
-    return own or _RUN_FOLDER / folder / "status.json"

@@ -5,7 +5,6 @@ import logging
 import re
 import socket
 import time
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -23,7 +22,6 @@ from kontronik_can_gw.desk.mqtt.messages import Publisher, Topics
 from kontronik_can_gw.desk.sources import Bus, can_config
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.systemd import Notifier
 
 if TYPE_CHECKING:  # it needs paho-mqtt
@@ -68,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
             f"{args.file}: recordings are not published any more. Type kontronik-can-gw replay {args.file} --on can --channel vcan0 "
             f"(a CAN log: canplayer -I {args.file} vcan0=can0), and beside it kontronik-can-gw mqtt --channel vcan0 --broker HOST."
         )
-    with logging_to_stderr(), closing(Locks()) as locks:
+    with logging_to_stderr():
         bus = bus_layout(args)
         settings = _settings(args.broker, bus.config)
         topics = Topics(settings.topic, settings.gateway or host_name())
@@ -76,10 +74,6 @@ def main(args: argparse.Namespace) -> int:
             client = MqttClient(settings, f"kontronik-can-gw-{topics.gateway}", topics.of("online"))
         except OSError as error:
             raise RunError(str(error)) from None
-        if locks.hold([f"{settings.address}/mqtt/{topics.gateway}"]):
-            raise RunError(
-                f"another process on this machine publishes as {topics.gateway} to {client}. End it, or give another mqtt.gateway."
-            )
         can = can_config(bus, args.interface, args.channel)
         with Bus(bus, can, patient=Notifier().present) as source:
             publisher = Publisher(bus, topics, settings)

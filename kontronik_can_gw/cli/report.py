@@ -9,8 +9,7 @@ from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.cli.progress import watched
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
-from kontronik_can_gw.desk.report.analysis import Analysis, needed_columns
-from kontronik_can_gw.desk.report.flight import Flight
+from kontronik_can_gw.desk.report.flight import Flight, needed_columns
 from kontronik_can_gw.desk.report.page import render
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -94,16 +93,16 @@ def _analysed(recording: Input, args: argparse.Namespace) -> Flight | None:
     """The flight of all rows; None if the user stopped it. UserError where nothing could be shown."""
     chosen = needed_columns(recording.fields)
     fields = [recording.fields[index] for index in chosen]
-    analysis = Analysis(recording.bus.escs, fields, window=(args.start, args.end))
-    if not analysis.has_anything:
+    flight = Flight(recording.bus.escs, fields, window=(args.start, args.end))
+    if not flight.has_anything:
         raise UserError(
             f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
         )
     try:
         blocks = filter(len, recording.blocks(chosen))
         for block in watched(blocks, f"{recording.name}: rows", args.output == "-"):
-            if not analysis.take(block):
+            if not flight.take(block):
                 break
     except KeyboardInterrupt:
         return None
-    return analysis.finish()
+    return flight.finish()

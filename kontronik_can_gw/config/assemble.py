@@ -191,7 +191,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
                 load = check_load(layout, *rates, bits)
     warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(bitrate)]
     mute = [*unreported(layout, config.dbc.on_loss == "silent"), *unsupplied(layout, escs)]
-    said = (*config.warnings, *mute, *filter(None, [load]), *warnings)
+    said = (*config.warnings, *ignored, *mute, *filter(None, [load]), *warnings)
     return Loaded(
         *(config, escs, database, layout, canopen, tuple(damaged), store, said, dbc, outputs)
     )

@@ -21,9 +21,9 @@ _SEVERITIES = list(Severity)
 
 
 class Flag(NamedTuple):
-    """A bit that an ESC has set."""
+    """An alarm that is no bit with a name, shown as one."""
 
-    name: str
+    text: str
     severity: Severity
     meaning: str
     remedy: str = ""
@@ -31,13 +31,10 @@ class Flag(NamedTuple):
     is_normal: bool = False
 
 
-def flag_of(bit: ErrorBit) -> Flag:
-    """The flag of a bit that has a name."""
-    summary, normal = bit.is_summary, bit.is_normal
-    return Flag(bit.text, bit.severity, bit.meaning, bit.remedy, summary, normal)
+Alarm = ErrorBit | Flag
 
 
-def alarms_of(flags: Iterable[Flag]) -> list[Flag]:
+def alarms_of(flags: Iterable[Alarm]) -> list[Alarm]:
     """What to show, errors first: no normal bits, and no summary of bits that are shown anyway."""
     found = [flag for flag in flags if not flag.is_normal]
     shown = {flag.severity for flag in found if not flag.is_summary}
@@ -51,8 +48,6 @@ class Member:
     def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
         self.view, self.index = view, index
         self.name = "" if settings is None else settings.name
-        self.cells = None if settings is None else settings.cell_count
-        """As configured; None where not."""
         self.protocol = protocol_named(None if settings is None else settings.protocol)
         self.columns: dict[str, int] = {}
         for at, column in enumerate(view.reader.columns):
@@ -152,7 +147,7 @@ class Member:
         main, sub = self.number("firmware_main"), self.number("firmware_sub")
         return None if main is None or sub is None else f"{main:.0f}.{sub:.0f}"
 
-    def flags(self, word: str) -> list[Flag] | None:
+    def flags(self, word: str) -> list[Alarm] | None:
         """The set bits of an error word; None while it is not available.
 
         Flags have no code for "not available": they count while another value of their group is known.
@@ -163,7 +158,7 @@ class Member:
         if (has_others and not self.is_known(group)) or {whole, *is_set.values()} == {None}:
             return None
         number = int(whole or 0)
-        found = [flag_of(bit) for bit in bits if number >> bit & 1 or is_set.get(bit) == 1]
+        found: list[Alarm] = [bit for bit in bits if number >> bit & 1 or is_set.get(bit) == 1]
         for bit in range(32) if number else ():
             if number >> bit & 1 and bit not in bits:
                 meaning = f"bit {bit} of {word}, which has no name"

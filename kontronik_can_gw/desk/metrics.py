@@ -71,6 +71,7 @@ _ESC = {
     "esc_port_reopened_total": "port.reopened",
     "esc_frame_rate_hertz": "frame_rate_hz",
     "esc_losses_total": "losses",
+    "esc_data_age_seconds": "data_age_ms",
 }
 """Metrics that are a value of the document as it stands, and its place."""
 _WORDS = {
@@ -120,10 +121,10 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
 
 def _esc(esc: Document, units: Mapping[str, str]) -> Iterator[Sample]:
     """What is known of an ESC's line, what it measures in base units, and its error bits."""
-    of, age_ms = {"esc": esc["name"]}, esc["data_age_ms"]
+    of = {"esc": esc["name"]}
     for name, place in _ESC.items():
-        yield name, _at(esc, place), of
-    yield "esc_data_age_seconds", None if age_ms is None else age_ms / 1000, of
+        value = _at(esc, place)
+        yield name, value / 1000 if value is not None and place.endswith("_ms") else value, of
     yield from _states("esc_link_state", LinkState, esc["link"], of)
     about = {key: esc[key] or "" for key in ("layout", "device", "variant", "firmware")}
     yield "esc_info", None if esc["device"] is None else 1, of | about
@@ -187,8 +188,9 @@ def server_of(
             reason = "only for this machine: the Host header must name localhost"
         elif seen.document is not None and seen.code != NOT_RUNNING:
             try:
+                found = families(seen.document, max(0, seen.age_s or 0))
                 registry = CollectorRegistry(auto_describe=False)
-                registry.register(_Collected(families(seen.document, max(0, seen.age_s or 0))))
+                registry.register(_Collected(found))
                 made: Iterable[bytes] = make_wsgi_app(registry)(environ, start)
                 return made
             except MALFORMED:

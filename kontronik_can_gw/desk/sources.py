@@ -30,8 +30,6 @@ class Source:
     paused = False
     problem = ""
     """One line while no frames can come."""
-    note = ""
-    """One line to show with the values."""
     hints: tuple[str, ...] = ()
     """Possible causes where no frame comes."""
     progress = ""

@@ -16,7 +16,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench
 from vcan_tools import GatewayProcess
 
-from kontronik_can_gw.cli.metrics import _status_file
 from kontronik_can_gw.desk import metrics
 from kontronik_can_gw.desk.metrics import server_of
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -82,7 +81,7 @@ def test_the_newest_metrics_are_fetched_as_prometheus_does(
     assert ask(port)[0] == 503
     file.write_text(json.dumps(document | {"version": "9.9.9"}))
     assert 'kontronik_build_info{version="9.9.9"} 1.0' in ask(port)[2]
-    for age_ns, said in ((STALE_NS + 9 * SECOND, "since 12.0 s"), (-STALE_NS - 1, "not running")):
+    for age_ns, said in ((STALE_NS + 9 * SECOND, "for 12.0 s"), (-STALE_NS - 1, "not running")):
         clock.now = document["monotonic_ns"] + age_ns
         status, _, text = ask(port)
         assert (status, said in text) == (503, True)
@@ -162,10 +161,3 @@ def test_it_serves_the_file_of_a_configuration_on_this_machine_until_sigterm(
         assert program.end() == 0
     finally:
         program.kill()
-
-
-@pytest.mark.parametrize("name", ["gateway", "left"])
-def test_a_service_of_the_configurations_name_has_its_own_file(tmp_path: Path, name: str) -> None:
-    toml = written(tmp_path / f"{name}.toml", '[[esc]]\nport = "/dev/ttyS0"\n')
-    end = "" if name == "gateway" else f"-{name}"
-    assert str(_status_file(toml)) == f"/run/kontronik-can-gw{end}/status.json"

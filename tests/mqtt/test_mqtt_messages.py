@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -16,13 +16,7 @@ from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_error
 
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.dbc.writer import dbc_text
-from kontronik_can_gw.desk.mqtt.messages import (
-    IDENTITY_NS,
-    MIN_PAUSE_NS,
-    Message,
-    Publisher,
-    Topics,
-)
+from kontronik_can_gw.desk.mqtt.messages import MIN_PAUSE_NS, Message, Publisher, Topics
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
     ErrorWindow,
@@ -288,19 +282,14 @@ def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_
             assert "options" not in component
 
 
-def discoveries(published: Iterable[tuple[int, Message]]) -> list[tuple[int, dict[str, Any]]]:
-    topic = TOPICS.discovery("ha", "esc1")
-    return [(now, json.loads(m.payload)) for now, m in published if m.topic == topic]
-
-
-def test_an_esc_that_does_not_identify_itself_is_announced_nevertheless() -> None:
-    """Info frames are missing; what was published before a restart is not overwritten too soon."""
+def test_an_esc_is_announced_when_it_is_heard_and_again_when_it_is_known() -> None:
     bus = layout_of(["esc1"])
     columns = SignalReader(bus.layout).columns
     info = {c.key for c in columns if c.source in ("device", "firmware_main")}
-    frames = [entry for entry in flight(bus, 10) if entry[1].key not in info]
-    ((now, found),) = discoveries(run(publisher("esc1", discovery="ha"), frames, 10))
-    assert found["device"]["model"] == "ESC"
-    assert "sw_version" not in found["device"]
-    assert IDENTITY_NS <= now <= IDENTITY_NS + 1.6 * SECOND_NS
-    assert discoveries(run(publisher("esc1", discovery="ha"), [], 10)) == []
+    frames = [(t, f) for t, f in flight(bus, 10) if t > 4 * SECOND_NS or f.key not in info]
+    topic = TOPICS.discovery("ha", "esc1")
+    for heard, models in ((frames, ["ESC", "KOSMIK"]), ([], [])):
+        published = run(publisher("esc1", discovery="ha"), heard, 10)
+        found = [json.loads(m.payload)["device"] for _, m in published if m.topic == topic]
+        assert [about["model"] for about in found] == models
+        assert ["sw_version" in about for about in found] == [False, True][: len(models)]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from command_line import refused, written
+from command_line import written
 from mqtt_bench import PATIENCE, Mosquitto, Subscriber, free_port, kept
 from vcan_tools import GatewayProcess, wait_for
 
@@ -105,19 +105,6 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
             assert text not in program.log + shown
     finally:
         made.stop()
-
-
-def test_the_same_gateway_twice_on_a_machine_is_refused(
-    live: Live, broker: Mosquitto, tmp_path: Path
-) -> None:
-    program = live("twice")
-    program.wait_for_line("connected as")
-    said = refused(1, "mqtt", "-c", tmp_path / "gateway.toml")
-    assert (
-        f"another process on this machine publishes as twice to MQTT broker {broker.address}"
-        in said
-    )
-    assert program.process.poll() is None
 
 
 def test_the_service_manager_is_reported_and_the_watchdog_fed(

@@ -13,7 +13,6 @@ from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
-from kontronik_can_gw.desk.report.analysis import Analysis
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -36,22 +35,14 @@ def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()
         yield sample.time_ns, list(sample.values)
 
 
-def analysis_of(
-    bus: BusLayout, points: int = 2000, window: tuple[float | None, float | None] = (None, None)
-) -> Analysis:
-    """An analysis of the rows of a bus."""
-    fields = fields_of_log(SignalReader(bus.layout), bus.escs)
-    return Analysis(bus.escs, fields, points, window)
-
-
-def analysed(analysis: Analysis, rows: Iterable[Row]) -> Flight:
-    """The flight of these rows."""
+def flight_of(bus: BusLayout, rows: Iterable[Row], points: int = 2000) -> Flight:
+    """The flight of the rows of a bus."""
+    made = Flight(bus.escs, fields_of_log(SignalReader(bus.layout), bus.escs), points)
     every = iter(rows)
     while some := list(islice(every, 100)):
         times, values = zip(*some, strict=True)
-        if not analysis.take(Block(times, [*zip(*values, strict=True)], None)):
-            break
-    return analysis.finish()
+        made.take(Block(times, [*zip(*values, strict=True)], None))
+    return made.finish()
 
 
 def rows_of(bus: BusLayout, times: Sequence[int], **columns: Sequence[Value]) -> Iterator[Row]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from report_browser import MISSING, PROGRAM, Browser
-from report_flights import analysed, analysis_of, shipped_bus, simulated
+from report_flights import flight_of, shipped_bus, simulated
 
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
@@ -40,7 +40,7 @@ COUNT = """((key, name) => {
 def flown(names: list[str]) -> Flight:
     bus = shipped_bus(*names)
     options = [EscOptions(faults=FAULTS), EscOptions()]
-    return analysed(analysis_of(bus), simulated(bus, 60, options))
+    return flight_of(bus, simulated(bus, 60, options))
 
 
 @pytest.fixture(scope="module")

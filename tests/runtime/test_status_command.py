@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from kontronik_can_gw.desk.monitor.status import (
     Seen,
     judge,
     lines_of,
-    look_at,
 )
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway_status import CanState
@@ -89,6 +87,7 @@ def written(
 def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "run"
     monkeypatch.setattr(status, "RUN_FOLDER", folder)
+    monkeypatch.setattr("kontronik_can_gw.desk.monitor.status.RUN_FOLDER", folder)
     return folder
 
 
@@ -143,38 +142,15 @@ def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> Non
     seen = judged(document, 12 * SECOND)
     assert (seen.code, seen.sentence) == (
         NOT_RUNNING,
-        "does not answer since 12.0 s (stopped, or the disk of its file is full)",
+        "has written nothing for 12.0 s (ended, held up, or the disk is full)",
     )
     shown = words(seen)
-    assert "does not answer since 12.0 s" in shown and "journalctl" in shown
+    assert "has written nothing for 12.0 s" in shown and "journalctl" in shown
     assert "25." not in shown and "esc1" not in shown
     assert judged(document, -STALE_NS - 1).sentence == "not running", "the machine was restarted"
 
 
 # --- files
-
-
-def test_a_living_writer_is_told_from_a_dead_one_and_its_pids_next(
-    tmp_path: Path,
-) -> None:
-    file, bench, own = tmp_path / "status.json", heard(), program_facts("x")
-    written(file, bench)
-    assert look_at(file, NOW).code == HEALTHY
-    other = ProgramFacts("x", pid=own.pid, ticks=own.ticks + 1, pid_namespace=own.pid_namespace)
-    written(file, bench, other)
-    assert look_at(file, NOW).sentence == "not running"
-    child = subprocess.Popen(["sleep", "100"])
-    dead = ProgramFacts("x", pid=child.pid, ticks=0, pid_namespace=own.pid_namespace)
-    written(file, bench, dead)
-    assert look_at(file, NOW).code == HEALTHY
-    child.kill()
-    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and is not reaped
-    assert look_at(file, NOW).sentence == "not running"
-    child.wait()
-    assert look_at(file, NOW).sentence == "not running"
-    elsewhere = ProgramFacts("x", pid=child.pid, ticks=5, pid_namespace="pid:[7]")  # in a container
-    written(file, bench, elsewhere)
-    assert look_at(file, NOW).code == HEALTHY
 
 
 CONTENTS = (b"", b"{", b"7", b"{}", b"\xff\xfe", b'{"format": 2}', b"[" * 100_000, b"1" * 5000)
@@ -190,26 +166,21 @@ def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path) -> None:
         assert said in refused(NOT_RUNNING, "status", "--file", tmp_path / name)
 
 
-def test_a_configuration_is_looked_for_among_the_services(tmp_path: Path, run_folder: Path) -> None:
-    configuration = tmp_path / "front.toml"
-    configuration.write_text('[[esc]]\nport = "x"\n', encoding="utf-8")
+def test_a_configuration_names_its_file_or_the_service_of_its_name(
+    tmp_path: Path, run_folder: Path
+) -> None:
+    esc = '[[esc]]\nport = "x"\n'
+    for name, folder in (("gateway", ""), ("left", "-left")):
+        toml = tmp_path / f"{name}.toml"
+        toml.write_text(esc, encoding="utf-8")
+        assert shell("-c", toml)[0] == NOT_RUNNING
+        written(run_folder / f"kontronik-can-gw{folder}" / "status.json", heard())
+        code, out, _ = shell("-c", toml)
+        assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
     elsewhere = tmp_path / "elsewhere.toml"
-    elsewhere.write_text('[statistics]\nfile = "s/status.json"\n[[esc]]\nport = "x"\n')
+    elsewhere.write_text(f'[statistics]\nfile = "s/status.json"\n{esc}')
     written(tmp_path / "s" / "status.json", heard())
-    assert shell("-c", elsewhere)[0] == HEALTHY, "one that says where it is"
-    code, _, talk = shell("-c", configuration)
-    assert code == NOT_RUNNING and "no gateway with this configuration runs as a service" in talk
-    written(
-        run_folder / "kontronik-can-gw-rear" / "status.json",
-        heard(),
-        program_facts(tmp_path / "rear.toml"),
-    )
-    written(
-        run_folder / "kontronik-can-gw-front" / "status.json", heard(), program_facts(configuration)
-    )
-    code, out, _ = shell("-c", configuration)
-    assert code == HEALTHY
-    assert str(configuration) in out and "rear.toml" not in out
+    assert shell("-c", elsewhere)[0] == HEALTHY
 
 
 def test_all_services_are_shown_and_the_worst_is_the_exit_code(

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from rich.text import Text
 
-from kontronik_can_gw.desk.member import Flag
+from kontronik_can_gw.desk.member import Alarm
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.printable import printable
 
@@ -61,7 +61,7 @@ def table(
     return [line(Text(" ").join(row[: len(widths)])) for row in cells]
 
 
-def alarm_lines(alarms: Iterable[tuple[str, Flag]], width: int, room: int = 999) -> list[Text]:
+def alarm_lines(alarms: Iterable[tuple[str, Alarm]], width: int, room: int = 999) -> list[Text]:
     """Errors and warnings, each after a name, with remedies where there is room."""
     lines: list[Text] = []
     for with_remedy in (True, False):

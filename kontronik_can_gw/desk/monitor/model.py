@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.member import Flag, Member
+from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -85,15 +85,6 @@ class Esc(Member):
 
     tracks: dict[str, Track]
 
-    def number(self, source: str) -> float | None:
-        """The value of a numeric source. The cell voltage is computed if the DBC has none and the number of cells is known."""
-        value = super().number(source)
-        if value is None and source == "mean_cell_voltage":
-            cells = self.cells or self.number("cell_count")
-            voltage = self.number("battery_voltage")
-            return voltage / cells if cells and voltage is not None else None
-        return value
-
     @property
     def device_text(self) -> str:
         """Device, variant and firmware; empty where not available."""
@@ -104,7 +95,7 @@ class Esc(Member):
         return f"{text}, firmware {self.firmware}" if text and self.firmware else text
 
     @property
-    def active(self) -> list[Flag]:
+    def active(self) -> list[Alarm]:
         """The bits that are set."""
         return [flag for word in self.protocol.errors for flag in self.flags(word) or ()]
 
@@ -118,7 +109,7 @@ class Esc(Member):
         """Everything as JSON; None for what is not available."""
         names: dict[Severity, list[str]] = {severity: [] for severity in Severity}
         for flag in self.active:
-            names[flag.severity].append(flag.name)
+            names[flag.severity].append(flag.text)
         return {
             "name": self.name,
             "link": self.link,

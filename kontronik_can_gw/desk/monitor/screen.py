@@ -6,7 +6,7 @@ from math import inf
 from rich.text import Text
 
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.desk.member import Flag, alarms_of
+from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
     Part,
@@ -54,8 +54,6 @@ def screen(
     lines = [_title(monitor, source)]
     for text, style in notices(monitor, source):
         lines += wrapped(text, style, width)
-    if source.note:
-        lines.append(line((source.note, "cyan")))
     room = height - len(lines) - 1
     escs = monitor.escs if page == 0 else monitor.escs[page - 1 : page]
     if len(escs) == 1:
@@ -173,7 +171,7 @@ def _trouble(esc: Esc) -> Flag | None:
 
 def alarms(escs: Sequence[Esc], width: int, room: int = 999) -> list[Text]:
     """Errors and warnings of the ESCs."""
-    found: list[tuple[str, Flag]] = []
+    found: list[tuple[str, Alarm]] = []
     for esc in escs:
         trouble = _trouble(esc)
         flags = alarms_of([*([trouble] if trouble else []), *esc.active])
@@ -198,7 +196,7 @@ def _page(esc: Esc, width: int) -> list[Text]:
     heads = ("", "", "now", "min", "max", f"last {seconds} s")
     rows: list[list[Part]] = [[(text, "dim") for text in heads]]
     for quantity in QUANTITIES:
-        if esc.has(quantity.source) or esc.number(quantity.source) is not None:
+        if esc.has(quantity.source):
             track = esc.tracks[quantity.source]
             extremes = (number(each, quantity.digits) for each in (track.low, track.high))
             names = (quantity.label, "dim"), (quantity.unit, "dim")

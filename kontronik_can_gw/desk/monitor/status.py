@@ -1,7 +1,6 @@
 """The state of a running gateway from its statistics file: an exit code, faults in words, lines of at most 80 columns."""
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,8 @@ from typing import Any
 
 from rich.text import Text
 
-from kontronik_can_gw.desk.member import Flag, alarms_of, flag_of
+from kontronik_can_gw.config.parse import load
+from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
     Part,
@@ -26,10 +26,10 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.native.load import in_words
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.fault_log import duration
-from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
+RUN_FOLDER = Path("/run")
 _LARGEST_FILE = 1 << 22
 FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
@@ -61,6 +61,13 @@ class Seen:
             "age_s": None if self.age_s is None else round(self.age_s, 3),
             "document": self.document,
         }
+
+
+def status_file(config: Path | None) -> Path:
+    """The file of a configuration's gateway: its own, or the service's of the same name."""
+    own = None if config is None else load(config).statistics_path
+    folder = PROGRAM if config is None or config.stem == "gateway" else f"{PROGRAM}-{config.stem}"
+    return own or RUN_FOLDER / folder / "status.json"
 
 
 def look_at(file: Path, now: int) -> Seen:
@@ -100,10 +107,10 @@ def judge(file: Path, document: Any, now: int) -> Seen:
 def _judge(file: Path, document: Document, now: int) -> Seen:
     age = now - document["monotonic_ns"]
     age_s = age / SECOND
-    if age < -STALE_NS or not _is_alive(document["process"]):  # or the machine restarted since
-        return Seen(file, NOT_RUNNING, "not running", (), age_s, document)
-    if age > STALE_NS:
-        text = f"does not answer since {duration(age)} (stopped, or the disk of its file is full)"
+    if abs(age) > STALE_NS:
+        text = "not running"  # the machine has restarted since
+        if age > 0:
+            text = f"has written nothing for {duration(age)} (ended, held up, or the disk is full)"
         return Seen(file, NOT_RUNNING, text, (), age_s, document)
     troubles = tuple(map(printable, _troubles(document)))
     sentence = printable(document["gateway"]["state"])
@@ -134,21 +141,6 @@ def _troubles(document: Document) -> Iterator[str]:
         yield f"parameters cannot be stored: {store['last_error']}"
     if (recording := document["recording"]) and recording["problem"]:
         yield f"captures: {recording['problem']}"
-
-
-def _is_alive(process: Document) -> bool:
-    """True if the writing process still runs, or if that cannot be found out."""
-    pid, ticks = process["pid"], process["start_ticks"]
-    if pid <= 0 or process["pid_namespace"] != pid_namespace():
-        return True
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # another user's
-        pass
-    now = start_ticks(pid)
-    return now >= 0 and (now == 0 or ticks == 0 or now == ticks)
 
 
 # --- lines
@@ -227,7 +219,7 @@ def _esc_rows(document: Document) -> Iterator[list[Part]]:
         ]
 
 
-def alarms(document: Document) -> list[tuple[str, Flag]]:
+def alarms(document: Document) -> list[tuple[str, Alarm]]:
     """Errors and warnings that the ESCs report, each after the ESC's name."""
     found = []
     for esc in document["escs"]:
@@ -235,7 +227,7 @@ def alarms(document: Document) -> list[tuple[str, Flag]]:
         for key in ("errors", "selftest_errors", "warnings"):
             severity = Severity.WARNING if key == "warnings" else Severity.ERROR
             for name in esc[key] or ():
-                flags.append(flag_of(bits[name]) if name in bits else Flag(name, severity, name))
+                flags.append(bits[name] if name in bits else Flag(name, severity, name))
         found += [(f"{esc['name']} ", flag) for flag in alarms_of(flags)]
     return found
 

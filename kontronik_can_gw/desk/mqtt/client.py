@@ -5,7 +5,6 @@ nobody. Lasting messages are published again after each reconnection. MQTT 3.1.1
 """
 
 import contextlib
-import errno
 import logging
 import random
 import socket
@@ -113,8 +112,6 @@ class MqttClient:
         try:
             self._client.loop_start()
         except OSError as error:
-            if error.errno in (errno.EMFILE, errno.ENFILE):
-                raise
             raise RunError(
                 f"127.0.0.1: {error.strerror or error}. MQTT needs this machine's own network: sudo ip link set lo up"
             ) from None

@@ -93,8 +93,9 @@ def device(topics: "Topics", member: "Published") -> dict[str, Any]:
 def _about(topics: "Topics", member: "Published") -> dict[str, Any]:
     if member.index is None:
         return {"name": f"KONTRONIK gateway {topics.gateway}", "model": PROGRAM}
-    name, (model, firmware) = f"{topics.gateway} {member.name}", member.identity
-    about = {"name": name, "manufacturer": member.protocol.maker, "model": model or "ESC"}
+    model, firmware = member.identity or (None, None)
+    about = {"name": f"{topics.gateway} {member.name}", "manufacturer": member.protocol.maker}
+    about["model"] = model or "ESC"
     about["via_device"] = topics.identifier()
     return about if firmware is None else about | {"sw_version": firmware}
 
@@ -116,13 +117,9 @@ def entity(source: str, member: "Published") -> dict[str, Any]:
         return made
     counts = "total_increasing" if about.rolls else "measurement"
     unit, kind, made["state_class"] = _UNITS.get(about.unit, (about.unit or None, None, counts))
-    digits = None if source in member.factors else column.digits
-    known = {
-        "unit_of_measurement": unit,
-        "device_class": kind,
-        "suggested_display_precision": digits,
-    }
-    return made | {key: value for key, value in known.items() if value is not None}
+    made |= {"unit_of_measurement": unit, "device_class": kind}
+    made["suggested_display_precision"] = None if source in member.factors else column.digits
+    return {key: value for key, value in made.items() if value is not None}
 
 
 def _in_words(source: str) -> str:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.member import Flag, Member
+from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.mqtt.discovery import device
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
@@ -34,8 +34,6 @@ ONLINE, OFFLINE = b"online", b"offline"
 MIN_PAUSE_NS = 200 * MS
 SILENCE_NS = 3 * SECOND
 """After this time without a frame the gateway is not available."""
-IDENTITY_NS = 6 * SECOND
-"""Time to wait for device and firmware: an ESC sends them about every second, some every five."""
 _FIRST_NS = SECOND // 2
 """Delay of the first state, so that the first frames of all messages can arrive."""
 
@@ -75,11 +73,8 @@ class Published(Member):
         super().__init__(view, settings, index)
         self.heard_ns: int | None = None
         """Time of the newest live value."""
-        self.first_heard_ns: int | None = None
-        self.identity: tuple[str | None, str | None] = (None, None)
-        """Device and firmware last known."""
-        self.announced: tuple[str | None, str | None] | None = None
-        """Those of the published discovery."""
+        self.identity: tuple[str | None, str | None] | None = None
+        """Device and firmware of the published discovery."""
         self._kinds = {normalize(each.text): each.kind for each in self.protocol.states.values()}
         self._due: int | None = None
         self._shown: tuple[object, ...] | None = None
@@ -90,8 +85,7 @@ class Published(Member):
         if self.index is None:
             last = self.view.last_ns
             return last is not None and now - last <= SILENCE_NS
-        columns = self.of_group[Group.LIVE] or self.no_flags.values()
-        return any(self.view.values[at] is not None for at in columns)
+        return self.is_known(Group.LIVE)
 
     def is_due(self, now: int, period: int) -> bool:
         """True if the state is to be published now: it is time, or something notable has changed."""
@@ -129,26 +123,23 @@ class Published(Member):
         made |= {"selftest": _in_words(self.flags("selftest_errors")), "link_state": None}
         return made | values | {"firmware": self.firmware}
 
-    def is_news(self, now: int) -> bool:
-        """True where device and firmware are others than announced: once they are known, or stay unknown for long.
-
-        Not before, since the retained discovery of an earlier run may be more complete. What was known stays.
-        """
-        device, firmware = self.identity
+    def is_news(self) -> bool:
+        """True where device and firmware are others than announced, of an ESC once it was heard. What was known stays."""
+        if self.index is not None and self.heard_ns is None:
+            return False
+        before = self.identity
+        device, firmware = before or (None, None)
         self.identity = self.device or device, self.firmware or firmware
-        first = self.first_heard_ns
-        waited = first is not None and now - first >= IDENTITY_NS
-        is_settled = self.index is None or None not in self.identity or waited
-        return is_settled and self.identity != self.announced
+        return self.identity != before
 
     def _kind(self) -> str | None:
         return self._kinds.get(normalize(self.state or ""))
 
 
-def _in_words(flags: Sequence[Flag] | None) -> list[dict[str, str]] | None:
+def _in_words(flags: Sequence[Alarm] | None) -> list[dict[str, str]] | None:
     if flags is None:
         return None
-    return [{"name": f.name, "severity": f.severity.value, "meaning": f.meaning} for f in flags]
+    return [{"name": f.text, "severity": f.severity.value, "meaning": f.meaning} for f in flags]
 
 
 class Publisher:
@@ -175,9 +166,7 @@ class Publisher:
         for first, values in self._view.take(frame.key, frame.data, now) or ():
             for at, value in enumerate(values, first):
                 if value is not None and at in self._live:
-                    member = self._live[at]
-                    member.heard_ns = now
-                    member.first_heard_ns = member.first_heard_ns or now
+                    self._live[at].heard_ns = now
 
     def messages(self, now: int, wall_ns: int) -> list[Message]:
         """The messages to publish now."""
@@ -198,8 +187,7 @@ class Publisher:
         """Availability and, where it is new, discovery."""
         available = ONLINE if member.is_available(now) else OFFLINE
         found = {self._topics.of(member.name, "available"): available}
-        if (prefix := self._config.discovery) is not None and member.is_news(now):
-            member.announced = member.identity
+        if (prefix := self._config.discovery) is not None and member.is_news():
             found[self._topics.discovery(prefix, member.name)] = _json(device(self._topics, member))
         return found
 

@@ -1,98 +1,139 @@
-"""The data of a recorded flight, from which the page is made. Times are ns of the recording's clock."""
+"""A recorded flight: rows of values in; numbers, events and points to draw out. Pure, one pass, bounded memory.
 
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+Every value is found by its name, so any recording and any DBC will do; what they do not have is left out. Two rows further apart than the
+time-out have a gap between them. Times are ns of the recording's clock.
+"""
 
-from kontronik_can_gw.esc.decoder import EscProtocol
+from collections.abc import Sequence
+from itertools import pairwise
 
-Number = int | float | None
-Kind = Literal["error", "state", "link", "device"]
+from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.desk.recordings.fields import Field, column_of
+from kontronik_can_gw.desk.recordings.recording import Block
+from kontronik_can_gw.desk.recordings.tables.rows import LATEST_NS
+from kontronik_can_gw.desk.report.decimate import Decimator
+from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight
+from kontronik_can_gw.desk.report.events import Event, Events, Number
+from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
+from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.gateway_status import GatewayState
 
-
-class Extreme(NamedTuple):
-    """A value and the time of its first occurrence."""
-
-    value: float
-    time_ns: int
-
-
-class Segment(NamedTuple):
-    """A period in one operating state; ``state`` is its number."""
-
-    begin_ns: int
-    end_ns: int
-    state: int
-
-
-@dataclass(slots=True)
-class Event:
-    """An event of an ESC. ``end_ns`` None: it lasts until the end; equal to ``begin_ns``: it has no length."""
-
-    kind: Kind
-    esc: int
-    begin_ns: int
-    text: str
-    severity: str = "status"
-    remedy: str = ""
-    end_ns: int | None = None
-    note: str = ""
-    """How it ended, where that is not obvious."""
+SAME_SPEED = 0.005
+"""Share that the maxima of equal speeds may differ by: in a CAN log they come in different messages."""
+_ERRORS = {name for each in PROTOCOLS for name in (*each.errors, *each.bits)}
+_SOURCES = {*DRAWN, *COUNTERS, *LIVE, *MAXIMA, *MINIMA, *DEVICE, *_ERRORS}
+_SOURCES |= {"cell_count", "gateway_state"}
 
 
-@dataclass
-class EscFlight:
-    """What is known of one ESC. None: not in the recording."""
-
-    name: str
-    protocol: EscProtocol
-    telemetry_ns: int = 0
-    """Time with telemetry."""
-    turning_ns: int | None = None
-    """Time with the motor turning."""
-    energy_drawn: float | None = None
-    """Wh, the integral of positive power."""
-    energy_returned: float | None = None
-    """Wh, returned to the battery."""
-    power_turning: float | None = None
-    """W, mean while the motor turns."""
-    counted: dict[str, float] = field(default_factory=dict)
-    """By source: what a counter went up by."""
-    charge_resets: int = 0
-    maxima: dict[str, Extreme] = field(default_factory=dict)
-    """By source."""
-    minima: dict[str, Extreme] = field(default_factory=dict)
-    cells: int | None = None
-    rest_voltage: float | None = None
-    """V of the battery before the first load."""
-    load_voltage: Extreme | None = None
-    """V of the battery, minimum under load."""
-    gaps: int = 0
-    longest_gap_ns: int = 0
-    devices: list[str] = field(default_factory=list)
-    """Every device seen, in words; usually one."""
-    layout: str = ""
-    """Of its frames."""
-    segments: list[Segment] = field(default_factory=list)
+def needed_columns(fields: Sequence[Field]) -> list[int]:
+    """The fields of a recording that a flight needs: of error words and their flags the words."""
+    words = {field.source for field in fields} & {word for p in PROTOCOLS for word in p.errors}
+    flags = {bit.text for p in PROTOCOLS for word in words for bit in p.errors.get(word, ())}
+    return [i for i, field in enumerate(fields) if field.source in _SOURCES - flags]
 
 
-@dataclass
 class Flight:
-    """Everything that a report shows. Times are on the clock of ``start_ns``."""
+    """Takes the rows of a recording in blocks. ``window``: seconds after the first row, (from, to); None: no limit."""
 
-    origin_ns: int
-    """The recording's first row: time 0."""
-    start_ns: int
-    end_ns: int
-    rows: int
-    escs: list[EscFlight]
-    times: list[int]
-    """Of the points of all lines."""
-    lines: dict[tuple[int, str], list[Number]]
-    """The points to draw, by ESC and source."""
-    events: list[Event]
-    left_out: int
-    """Number of events that were only counted."""
-    missing: list[str]
-    """What the fields do not have, in words."""
-    rows_in_bucket: int
-    replayed: bool
+    def __init__(
+        self,
+        escs: Sequence[EscSettings],
+        fields: Sequence[Field],
+        points: int = 20_000,
+        window: tuple[float | None, float | None] = (None, None),
+    ) -> None:
+        low, high = window
+        self._from_ns = 0 if low is None else round(low * SECOND)
+        self._to_ns = None if high is None else round(high * SECOND)
+        self._gap_ns = max(500 * MS, *(settings.timeout_ns + 250 * MS for settings in escs))
+        self._blank = ((None,),) * len(fields)
+        self._gateway_state = column_of(fields, "gateway_state", None)
+        self._events = Events()
+        self._origin_ns: int | None = None
+        self._start_ns: int | None = None
+        self.end_ns = 0
+        self.rows = 0
+        self.replayed = False
+        self.escs = [EscFlight(i, each, fields, self._events) for i, each in enumerate(escs)]
+        self._drawn = [(i, source) for i, esc in enumerate(self.escs) for source in esc.drawn]
+        self._decimator = Decimator(len(self._drawn), points)
+        self.lines: dict[tuple[int, str], list[Number]] = {}
+        """The points to draw, by ESC and source; and all events by their begin, after ``finish``."""
+        self.events: list[Event] = []
+
+    @property
+    def has_anything(self) -> bool:
+        """True if the fields have a value that can be drawn."""
+        return bool(self._drawn)
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first row of the window."""
+        return self._start_ns or 0
+
+    @property
+    def origin_ns(self) -> int:
+        """Time of the recording's first row: time 0 of the page."""
+        return self.start_ns if self._origin_ns is None else self._origin_ns
+
+    @property
+    def times(self) -> list[int]:
+        """Of the points of all lines."""
+        return self._decimator.times
+
+    @property
+    def rows_in_bucket(self) -> int:
+        """Rows that two points stand for; 1: every row is drawn."""
+        return self._decimator.rows_in_bucket
+
+    @property
+    def left_out(self) -> int:
+        """Number of events that were only counted."""
+        return self._events.left_out
+
+    def take(self, block: Block) -> bool:
+        """Take rows; False where all that follow are after the window."""
+        if self._origin_ns is None:
+            self._origin_ns = block.times[0]
+        high = LATEST_NS if self._to_ns is None else self._origin_ns + self._to_ns
+        rows = block.between(self._origin_ns + self._from_ns, high)
+        begin = 0
+        for row, time_ns in enumerate(rows.times):
+            if self._start_ns is None:
+                self._start_ns = self.end_ns = time_ns
+            elif time_ns - self.end_ns > self._gap_ns:
+                self._analyse(rows.part(begin, row))
+                self._analyse(Block([self.end_ns], self._blank, None))
+                begin = row
+            self.end_ns = time_ns
+        self.rows += len(rows)
+        self._analyse(rows.part(begin, len(rows)))
+        return block.times[-1] <= high
+
+    def finish(self) -> "Flight":
+        """Have ``lines`` and ``events`` made after the last row."""
+        lines = zip(self._drawn, self._decimator.columns, strict=True)
+        self.lines = {key: line for key, line in lines if line.count(None) < len(line)}
+        for slow, fast in pairwise(("output_speed", "motor_speed", "electrical_speed")):
+            found = [esc.extremes for esc in self.escs]
+            tops = [(e[slow].value, e[fast].value) for e in found if slow in e and fast in e]
+            if tops and all(
+                abs(a - b) <= SAME_SPEED * b for a, b in tops
+            ):  # no gear, one pole pair
+                for index, extremes in enumerate(found):
+                    self.lines.pop((index, slow), None)
+                    extremes.pop(slow, None)
+        self.events = self._events.in_order()
+        return self
+
+    def _analyse(self, rows: Block) -> None:
+        if not len(rows):
+            return
+        times, columns = rows.times, rows.columns
+        if self._gateway_state is not None:
+            replay = GatewayState.REPLAY
+            for value in set(columns[self._gateway_state]):
+                self.replayed |= value == replay or normalize(str(value)) == normalize(replay.name)
+        drawn = [column for esc in self.escs for column in esc.take(times, columns)]
+        self._decimator.feed(times, drawn)

@@ -17,6 +17,7 @@
   const FONT = "11px system-ui, sans-serif";
   const WIDTHS = [2, 1.2, 0.8]; // of a plot's lines, where colours and dashes tell ESCs apart
   const errors = data.events.filter((event) => event.kind === "error");
+  const states = data.escs.map((name, esc) => data.events.filter((event) => event.kind === "state" && event.esc === esc));
   const plots = [];
   const visible = data.escs.map(() => true);
   let range = [...whole];
@@ -81,7 +82,7 @@
     setCursor(from);
   }
 
-  const stateAt = (esc, t) => data.segments[esc].findLast(([from, to]) => from <= t && t <= to);
+  const stateAt = (esc, t) => states[esc].findLast((state) => state.from <= t && t <= end(state));
 
   // What is at the cursor, in the bar.
   function showNow() {
@@ -91,7 +92,7 @@
     if (data.wall !== null) parts.push(new Date(data.wall + t * 1000).toISOString().slice(11, 21) + " UTC");
     data.escs.forEach((name, esc) => {
       const state = visible[esc] && stateAt(esc, t);
-      if (state) parts.push((several ? name + ": " : "") + data.states[state[2]][0]);
+      if (state) parts.push((several ? name + ": " : "") + state.text);
     });
     const reach = (range[1] - range[0]) / 400;
     for (const event of errors.filter((e) => visible[e.esc] && e.from - reach <= t && t <= end(e) + reach).slice(0, 5)) {
@@ -245,24 +246,23 @@
     }).length;
   }
 
-  function drawSegments(u, ratio, esc, top, height) {
+  function drawStates(u, ratio, esc, top, height) {
     const { ctx, bbox } = u;
     ctx.globalAlpha = visible[esc] ? 1 : 0.2;
-    for (const [from, to, state] of data.segments[esc]) {
-      if (to < range[0] || from > range[1]) continue;
-      const [name, group] = data.states[state];
-      const left = Math.max(u.valToPos(from, "x", true), bbox.left);
-      const width = Math.min(u.valToPos(to, "x", true), bbox.left + bbox.width) - left;
-      ctx.fillStyle = ink(`--s${group}`);
+    for (const state of states[esc]) {
+      if (end(state) < range[0] || state.from > range[1]) continue;
+      const left = Math.max(u.valToPos(state.from, "x", true), bbox.left);
+      const width = Math.min(u.valToPos(end(state), "x", true), bbox.left + bbox.width) - left;
+      ctx.fillStyle = ink(`--s${state.phase}`);
       ctx.fillRect(left, top, Math.max(width - ratio, ratio), height);
-      if (ctx.measureText(name).width > width - 8 * ratio) continue;
+      if (ctx.measureText(state.text).width > width - 8 * ratio) continue;
       ctx.fillStyle = ink("--ink");
-      ctx.fillText(name, left + 4 * ratio, top + height / 2);
+      ctx.fillText(state.text, left + 4 * ratio, top + height / 2);
     }
   }
 
   function addBand() {
-    const escs = [...data.escs.keys()].filter((esc) => data.segments[esc].length);
+    const escs = [...data.escs.keys()].filter((esc) => states[esc].length);
     const textRows = Math.min(3, errors.length);
     if (!escs.length && !textRows) return;
     const note = make("small");
@@ -285,7 +285,7 @@
         ctx.textAlign = "right";
         ctx.fillText(name, bbox.left - 6 * ratio, top + (row + 0.5) * height);
         ctx.textAlign = "left";
-        drawSegments(u, ratio, esc, top + row * height + ratio, height - 2 * ratio);
+        drawStates(u, ratio, esc, top + row * height + ratio, height - 2 * ratio);
         ctx.globalAlpha = 1;
       });
       ctx.restore();
@@ -297,9 +297,9 @@
       draw,
     };
     addPlot(figure, "states", "Operating state", 38 + textRows * ROW + 26 * escs.length, options, [data.times.map(() => null)]);
-    const met = [...new Set(Object.values(data.states).map(([, group]) => group))].sort((a, b) => a - b);
-    figure.append(make("ul", { class: "states" }, ...met.map((group) =>
-      make("li", {}, make("i", { class: `s${group}` }), data.classes[group]))));
+    const met = [...new Set(states.flat().map((state) => state.phase))].sort((a, b) => a - b);
+    figure.append(make("ul", { class: "states" }, ...met.map((phase) =>
+      make("li", {}, make("i", { class: `s${phase}` }), data.phases[phase]))));
   }
 
   // --- pointer, fingers, keys
@@ -364,7 +364,8 @@
   function listEvents() {
     const needle = byId("search").value.trim().toLowerCase();
     const kind = byId("kind").value;
-    const text = (e) => `${e.text} ${kindOf(e)} ${data.escs[e.esc]} ${e.remedy} ${e.note}`.toLowerCase();
+    const what = (e) => (e.kind === "state" ? data.phases[e.phase] + ": " : "") + e.text;
+    const text = (e) => `${what(e)} ${kindOf(e)} ${data.escs[e.esc]} ${e.remedy} ${e.note}`.toLowerCase();
     const found = data.events.filter((e) => (!kind || e.kind === kind) && visible[e.esc] && text(e).includes(needle));
     const first = found.length > MAX_EVENTS ? `the first ${MAX_EVENTS} of ` : "";
     byId("count").textContent = `${first}${found.length} of ${data.events.length}`;
@@ -373,7 +374,7 @@
       const row = make("tr", { class: event.severity },
         make("td", {}, make("button", { type: "button", class: "at" }, clock(event.from, 2))),
         ...[length, data.escs[event.esc], kindOf(event)].map((word) => make("td", {}, word)),
-        make("td", { class: "what" }, event.text + (event.note ? ` (${event.note})` : "")),
+        make("td", { class: "what" }, what(event) + (event.note ? ` (${event.note})` : "")),
         make("td", { class: "do" }, event.remedy));
       row.addEventListener("click", () => goTo(event.from, end(event)));
       return row;

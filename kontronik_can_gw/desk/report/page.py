@@ -5,16 +5,17 @@ import gzip
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.desk.report.flight import EscFlight, Flight, Number
-from kontronik_can_gw.desk.report.quantities import PLOTS, STATE_CLASSES, class_of
+from kontronik_can_gw.desk.report.events import Number
+from kontronik_can_gw.desk.report.flight import Flight
+from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS
 from kontronik_can_gw.desk.report.summary import tables, tiles
 from kontronik_can_gw.desk.report.text import clock, duration, number, wall_clock
-from kontronik_can_gw.desk.report.trackers import state_name
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
 
@@ -67,85 +68,54 @@ def _hash(text: str) -> str:
 def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
     """All that page.js draws; times in seconds of the recording."""
 
-    def seconds(time_ns: int) -> float:
-        return round((time_ns - flight.origin_ns) / SECOND, 6)
+    def seconds(time_ns: int | None) -> float | None:
+        return None if time_ns is None else round((time_ns - flight.origin_ns) / SECOND, 6)
 
-    states = {
-        (esc.protocol.name, segment.state): esc.protocol.states
-        for esc in flight.escs
-        for segment in esc.segments
-    }
-    keys = {known: number for number, known in enumerate(sorted(states))}
     return {
         "escs": [esc.name for esc in flight.escs],
         "from": seconds(flight.start_ns),
         "to": seconds(flight.end_ns),
         "wall": None if wall_ns is None else wall_ns // 1_000_000,
         "times": [seconds(time_ns) for time_ns in flight.times],
-        "classes": list(STATE_CLASSES),
-        "states": [
-            [state_name(number, states[of, number]), class_of(number, states[of, number])]
-            for of, number in keys
-        ],
-        "segments": [
-            [
-                [seconds(s.begin_ns), seconds(s.end_ns), keys[esc.protocol.name, s.state]]
-                for s in esc.segments
-            ]
-            for esc in flight.escs
-        ],
-        "plots": _plots(flight),
+        "phases": PHASES,
+        "plots": list(_plots(flight)),
         "events": [
-            {
-                "kind": event.kind,
-                "esc": event.esc,
-                "from": seconds(event.begin_ns),
-                "to": None if event.end_ns is None else seconds(event.end_ns),
-                "text": event.text,
-                "severity": event.severity,
-                "remedy": event.remedy,
-                "note": event.note,
-            }
+            {**asdict(event), "from": seconds(event.begin_ns), "to": seconds(event.end_ns)}
             for event in flight.events
         ],
     }
 
 
-def _plots(flight: Flight) -> list[dict[str, Any]]:
+def _plots(flight: Flight) -> Iterator[dict[str, Any]]:
     """The plots that have data. Lines of one plot whose sizes differ come in plots of their own, each with its axis."""
-    found = []
     for plot in PLOTS:
+        lines: dict[str, dict[int, list[Number]]] = {}
+        for (esc, source), values in flight.lines.items():
+            if source in plot.lines:
+                lines.setdefault(source, {})[esc] = values
         tops = {
             source: max(
-                abs(value) for line in lines.values() for value in line if value is not None
+                abs(v) for values in lines[source].values() for v in values if v is not None
             )
             for source in plot.lines
-            if (lines := _lines_of(flight, source))
+            if source in lines
         }
         groups = of_like_size(tops)
         for index, sources in enumerate(groups):
             labels = [plot.lines[source] for source in sources]
             named = f"{', '.join(labels)} {plot.title[0].lower()}{plot.title[1:]}"
-            found.append(
-                {
-                    "key": f"{plot.key}-{index}" if index else plot.key,
-                    "title": named if len(groups) > 1 else plot.title,
-                    "unit": VALUES[sources[0]].unit,
-                    "digits": plot.digits,
-                    "lines": labels,
-                    "series": [
-                        {"esc": esc, "line": index, "values": values}
-                        for index, source in enumerate(sources)
-                        for esc, values in _lines_of(flight, source).items()
-                    ],
-                }
-            )
-    return found
-
-
-def _lines_of(flight: Flight, source: str) -> dict[int, list[Number]]:
-    """The values of a source by ESC."""
-    return {esc: values for (esc, name), values in flight.lines.items() if name == source}
+            yield {
+                "key": f"{plot.key}-{index}" if index else plot.key,
+                "title": named if len(groups) > 1 else plot.title,
+                "unit": VALUES[sources[0]].unit,
+                "digits": plot.digits,
+                "lines": labels,
+                "series": [
+                    {"esc": esc, "line": line, "values": values}
+                    for line, source in enumerate(sources)
+                    for esc, values in lines[source].items()
+                ],
+            }
 
 
 def of_like_size(tops: Mapping[str, float]) -> list[list[str]]:
@@ -174,9 +144,9 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
     if wall_ns is not None:
         facts["Begin"] = wall_clock(wall_ns + flight.start_ns - flight.origin_ns)
     for esc in flight.escs:
-        words, noted = _device(esc), provenance.get(esc.name, "")
+        devices, noted = ", then ".join(esc.devices[:8]), provenance.get(esc.name, "")
         port = noted.rpartition(", at ")[2]
-        facts[esc.name] = ", at ".join(filter(None, (words, port))) if words else noted
+        facts[esc.name] = ", at ".join(filter(None, (devices, port))) if devices else noted
     if flight.replayed:
         facts["Replay"] = "These frames were replayed from a recording."
     known = {label.lower() for label in facts}
@@ -189,14 +159,6 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
     return f"<dl>{''.join(items)}</dl>"
 
 
-def _device(esc: EscFlight) -> str:
-    """The device in a few words; if it was replaced, the first devices; empty where nothing is known."""
-    words = esc.devices[:8]
-    if len(words) == 1 and esc.layout:
-        words = [f"{words[0]}, layout {esc.layout}"]
-    return ", then ".join(words)
-
-
 def _damage(damage: Sequence[str]) -> str:
     if not damage:
         return ""
@@ -207,8 +169,6 @@ def _damage(damage: Sequence[str]) -> str:
 
 def _notes(flight: Flight) -> str:
     lines = []
-    if flight.missing:
-        lines.append(f"Not in the DBC, so not here: {', '.join(flight.missing)}.")
     if flight.rows_in_bucket > 1:
         lines.append(
             f"Lines are drawn from the minimum and the maximum of each {flight.rows_in_bucket} rows: no peak is lost, its time is "
@@ -216,4 +176,4 @@ def _notes(flight: Flight) -> str:
         )
     if flight.left_out:
         lines.append(f"{flight.left_out} more events are not listed.")
-    return "".join(f'<p class="note">{escape(line)}</p>' for line in lines)
+    return "".join(f'<p class="note">{line}</p>' for line in lines)

@@ -1,9 +1,6 @@
-"""Plots, extremes and classes of operating states of the report: titles, order and decimals. Colours are in page.css."""
+"""Plots, extremes and phases of operating states of the report: titles, order and decimals. Colours are in page.css."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
-
-from kontronik_can_gw.esc.decoder import State
 
 
 class Plot(NamedTuple):
@@ -29,6 +26,7 @@ PLOTS = (
     Plot("bec_current", "BEC current", 3, {"bec_current": "BEC current"}),
 )
 # fmt: on
+DRAWN = tuple(source for plot in PLOTS for source in plot.lines)
 
 MAXIMA = {
     "battery_power": ("Battery power", 0),
@@ -49,8 +47,15 @@ MINIMA = {
     "mean_cell_voltage": ("Lowest mean cell voltage", 3),
     "bec_voltage": ("Lowest BEC voltage", 3),
 }
+COUNTERS = {
+    "consumed_charge": "Charge used",
+    "losses": "Losses of the link",
+    "crc_errors": "CRC errors",
+    "dropped_bytes": "Bytes dropped",
+}
+SPEEDS = ("electrical_speed", "motor_speed", "output_speed")
 
-STATE_CLASSES = (
+PHASES = (
     "Motor off, standby",
     "Waiting",
     "Self-test, signal",
@@ -62,10 +67,3 @@ STATE_CLASSES = (
     "Unknown to this program",
 )
 """Phases of operating states, which are shown alike; page.css has a colour for each, in this order."""
-UNKNOWN_CLASS = len(STATE_CLASSES) - 1
-
-
-def class_of(state: int, states: Mapping[int, State]) -> int:
-    """Index in STATE_CLASSES of an operating state's number; ``states``: those of the ESC's protocol."""
-    phase = states[state].phase if state in states else ""
-    return STATE_CLASSES.index(phase) if phase in STATE_CLASSES else UNKNOWN_CLASS

@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 from html import escape
 
-from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Flight
-from kontronik_can_gw.desk.report.quantities import MAXIMA, MINIMA
+from kontronik_can_gw.desk.report.esc import EscFlight
+from kontronik_can_gw.desk.report.events import Extreme
+from kontronik_can_gw.desk.report.flight import Flight
+from kontronik_can_gw.desk.report.quantities import COUNTERS, MAXIMA, MINIMA
 from kontronik_can_gw.desk.report.text import clock, duration, number
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
@@ -19,33 +21,39 @@ _EXTREMES = (
 
 def tiles(flight: Flight) -> str:
     """The most important numbers; with several ESCs the extreme and the name of its ESC."""
-    escs = flight.escs
-    found = [_tile("Duration", duration(flight.end_ns - flight.start_ns))]
-    turning = [esc.turning_ns for esc in escs if esc.turning_ns is not None]
-    if turning:
-        aside = "the longest of all" if len(escs) > 1 else ""
-        found.append(_tile("Motor turning", duration(max(turning)), aside))
-    energies = [energy for esc in escs if (energy := _energy_wh(esc)) is not None]
+    escs, several = flight.escs, len(flight.escs) > 1
+    found = [("Duration", duration(flight.end_ns - flight.start_ns), "")]
+    if any(esc.has_speed for esc in escs):
+        longest = duration(max(esc.turning_ns for esc in escs))
+        found.append(("Motor turning", longest, "the longest of all" if several else ""))
+    energies = [esc.energy_wh for esc in escs if esc.energy_wh is not None]
     if energies:
-        charges = [c for esc in escs if (c := esc.counted.get("consumed_charge")) is not None]
-        aside = f"{number(sum(charges), 0)} mAh" if charges else ""
-        label = "Energy, all ESCs" if len(escs) > 1 else "Energy"
-        found.append(_tile(label, f"{number(sum(energies), 1)} Wh", aside))
+        charges = [esc.counted.get("consumed_charge") for esc in escs]
+        charge = _plain(sum(c or 0 for c in charges), 0, "mAh") if any(charges) else ""
+        label = "Energy, all ESCs" if several else "Energy"
+        found.append((label, _plain(sum(energies), 1, "Wh"), charge))
     for label, source, digits in _EXTREMES:
         of_escs = [
-            (extreme, escape(esc.name) if len(escs) > 1 else "")
+            (esc.extremes[source], escape(esc.name) if several else "")
             for esc in escs
-            if (extreme := (esc.maxima | esc.minima).get(source)) is not None
+            if source in esc.extremes
         ]
         if of_escs:
             extreme, name = (min if source in MINIMA else max)(of_escs)
-            value = f"{number(extreme.value, digits)} {VALUES[source].unit}"
-            found.append(_tile(label, value, f"{_at(extreme, flight)} {name}"))
-    severities = [event.severity for event in flight.events if event.kind == "error"]
-    errors, warnings = severities.count("error"), severities.count("warning")
-    aside = f"{warnings} warning{'' if warnings == 1 else 's'}"
-    found.append(_tile("Errors", str(errors), aside, "bad" if errors else "good"))
-    return "".join(found)
+            value = _plain(extreme.value, digits, VALUES[source].unit)
+            found.append((label, value, f"{_at(extreme, flight)} {name}"))
+    html = "".join(_tile(*each) for each in found)
+    if any(esc.has_errors for esc in escs):
+        severities = [event.severity for event in flight.events if event.kind == "error"]
+        errors, warnings = severities.count("error"), severities.count("warning")
+        aside = f"{warnings} warning{'' if warnings == 1 else 's'}"
+        html += _tile("Errors", str(errors), aside, "bad" if errors else "good")
+    return html
+
+
+def _tile(label: str, value: str, aside: str, kind: str = "") -> str:
+    text = f"<span>{label}</span><b>{value}</b><small>{aside or '&nbsp;'}</small>"
+    return f'<div class="{kind}">{text}</div>'
 
 
 def tables(flight: Flight) -> str:
@@ -66,56 +74,46 @@ def tables(flight: Flight) -> str:
     return html
 
 
-def _numbers(esc: EscFlight, flight: Flight) -> dict[str, dict[str, str | None]]:
-    """HTML of the numbers of an ESC by group and label; None where it is not known."""
-    rest, load, counted = esc.rest_voltage, esc.load_voltage, esc.counted
-    charge = _value(counted.get("consumed_charge"), 0, "mAh")
-    if charge and esc.charge_resets:
-        charge += f" (the counter began again: {esc.charge_resets})"
-    energy = _value(_energy_wh(esc), 1, "Wh")
-    if energy and esc.energy_drawn is not None:
-        energy += f" (power integrated: {number(esc.energy_drawn, 2)} Wh)"
+def _numbers(esc: EscFlight, flight: Flight) -> dict[str, dict[str, str]]:
+    """HTML of the numbers of an ESC by group and label; empty where it is not known."""
+    rest, load = esc.rest_voltage, esc.load_voltage
     share = 100 * esc.telemetry_ns / max(1, flight.end_ns - flight.start_ns)
+    counts = {
+        label: _value(esc.counted.get(source), 0, VALUES[source].unit)
+        for source, label in COUNTERS.items()
+    }
     return {
         "Use": {
-            "Motor turning": None if esc.turning_ns is None else _bold(duration(esc.turning_ns)),
-            "Energy used": energy,
-            "Energy returned by braking": _value(esc.energy_returned, 2, "Wh"),
-            "Charge used": charge,
-            "Mean power while turning": _value(esc.power_turning, 0, "W"),
+            "Motor turning": _bold(duration(esc.turning_ns)) if esc.has_speed else "",
+            "Energy used": _value(esc.energy_wh, 1, "Wh"),
+            "Charge used": counts.pop("Charge used"),
         },
-        "Maxima": _extremes(MAXIMA, esc.maxima, flight),
+        "Maxima": _extremes(MAXIMA, esc, flight),
         "Voltages": {
-            **_extremes(MINIMA, esc.minima, flight),
+            **_extremes(MINIMA, esc, flight),
             "At rest before the first load": _per_cell(rest, esc),
-            "Lowest under load": load and f"{_per_cell(load.value, esc)} {_at(load, flight)}",
-            "Sag": None if rest is None or load is None else _per_cell(rest - load.value, esc),
+            "Lowest under load": f"{_per_cell(load.value, esc)} {_at(load, flight)}"
+            if load
+            else "",
+            "Sag": _per_cell(None if rest is None or load is None else rest - load.value, esc),
         },
         "Quality of the data": {
             "With telemetry": f"{_value(share, 2, '%')} ({duration(esc.telemetry_ns)})",
             "Gaps": _bold(str(esc.gaps)),
-            "Longest gap": duration(esc.longest_gap_ns) if esc.gaps else None,
-            "Losses of the link": _value(counted.get("losses"), 0),
-            "CRC errors": _value(counted.get("crc_errors"), 0),
-            "Bytes dropped": _value(counted.get("dropped_bytes"), 0),
+            **counts,
         },
     }
 
 
 def _extremes(
-    quantities: Mapping[str, tuple[str, int]], found: Mapping[str, Extreme], flight: Flight
-) -> dict[str, str | None]:
-    def shown(source: str, digits: int) -> str | None:
-        extreme = found.get(source)
-        unit = VALUES[source].unit
-        return extreme and f"{_value(extreme.value, digits, unit)} {_at(extreme, flight)}"
-
-    return {label: shown(source, digits) for source, (label, digits) in quantities.items()}
-
-
-def _tile(label: str, value: str, aside: str = "", kind: str = "") -> str:
-    text = f"<span>{label}</span><b>{value}</b><small>{aside or '&nbsp;'}</small>"
-    return f'<div class="{kind}">{text}</div>'
+    quantities: Mapping[str, tuple[str, int]], esc: EscFlight, flight: Flight
+) -> dict[str, str]:
+    found = {}
+    for source, (label, digits) in quantities.items():
+        extreme = esc.extremes.get(source)
+        value = "" if extreme is None else _value(extreme.value, digits, VALUES[source].unit)
+        found[label] = "" if extreme is None else f"{value} {_at(extreme, flight)}"
+    return found
 
 
 def _at(extreme: Extreme, flight: Flight) -> str:
@@ -129,16 +127,15 @@ def _bold(text: str) -> str:
     return f"<b>{text}</b>"
 
 
-def _value(value: float | None, digits: int, unit: str = "") -> str | None:
-    return None if value is None else f"{_bold(number(value, digits))} {unit}".rstrip()
+def _plain(value: float, digits: int, unit: str) -> str:
+    return f"{number(value, digits)} {unit}".rstrip()
 
 
-def _energy_wh(esc: EscFlight) -> float | None:
-    """By the gateway's counter; integrated where there is none."""
-    return esc.counted.get("energy_used", esc.energy_drawn)
+def _value(value: float | None, digits: int, unit: str) -> str:
+    return "" if value is None else f"{_bold(number(value, digits))} {unit}".rstrip()
 
 
-def _per_cell(voltage: float | None, esc: EscFlight) -> str | None:
+def _per_cell(voltage: float | None, esc: EscFlight) -> str:
     if voltage is None or not esc.cells:
         return _value(voltage, 2, "V")
-    return f"{_value(voltage / esc.cells, 3, 'V a cell')} ({number(voltage, 2)} V)"
+    return f"{_value(voltage / esc.cells, 3, 'V a cell')} ({_plain(voltage, 2, 'V')})"

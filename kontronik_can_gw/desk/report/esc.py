@@ -1,0 +1,248 @@
+"""One ESC of a flight, found in columns of values chunk by chunk: sums, extremes and events.
+
+A value holds until the next row; while telemetry is lost nothing is counted.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+from math import inf, isfinite
+from typing import Any
+
+from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.report.events import Event, Events, Extreme, Number
+from kontronik_can_gw.desk.report.quantities import (
+    COUNTERS,
+    DRAWN,
+    MAXIMA,
+    MINIMA,
+    PHASES,
+    SPEEDS,
+)
+from kontronik_can_gw.esc.protocols import protocol_named
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
+
+HOUR_NS = 3600 * SECOND
+REST_CURRENT = 1.0
+"""A: up to this magnitude the battery is at rest."""
+LOAD_CURRENT = 5.0
+"""A: at or above it the battery is under load."""
+LIVE = ("battery_voltage", *SPEEDS, "battery_current", "operating_state_raw", "operating_state")
+"""The first of these that there is says whether there is telemetry."""
+DEVICE = ("device", "device_raw", "variant", "firmware_main", "firmware_sub")
+_WORD_BITS = 32
+
+Columns = dict[str, Sequence[Any]]
+"""Values of the rows of a chunk by source; None where not available."""
+
+
+class EscFlight:
+    """What is known of one ESC. None: not in the recording."""
+
+    def __init__(
+        self, index: int, settings: EscSettings, fields: Sequence[Field], events: Events
+    ) -> None:
+        self.name = settings.name
+        self.telemetry_ns = self.turning_ns = 0
+        """Time with telemetry, and with the motor turning."""
+        self.counted: dict[str, float] = {}
+        """By source: what a counter went up by."""
+        self.extremes: dict[str, Extreme] = {}
+        """By source."""
+        self.cells = settings.cell_count or None
+        self.rest_voltage: float | None = None
+        """V of the battery before the first load."""
+        self.load_voltage: Extreme | None = None
+        """V of the battery, minimum under load."""
+        self.gaps = 0
+        self.devices: list[str] = []
+        """Every device seen, in words; usually one."""
+        self._index, self._events, self._protocol = index, events, protocol_named(settings.protocol)
+        self._at = at = {f.source: i for i, f in reversed([*enumerate(fields)]) if f.esc == index}
+        self._live = next((source for source in LIVE if source in at), None)
+        self._words: list[tuple[str, str, Iterable[int], int]] = []
+        """Error words and flags: source, word, bits in it, and by how much its value is shifted."""
+        for word, bits in self._protocol.errors.items():
+            flags = [(bit.text, word, (int(bit),), int(bit)) for bit in bits if bit.text in at]
+            self._words += [(word, word, range(_WORD_BITS), 0)] if word in at else flags
+        known = set(at)
+        if "battery_voltage" in at:
+            known.add("mean_cell_voltage")
+            if "battery_current" in at:
+                known.add("battery_power")
+        self.drawn = [source for source in DRAWN if source in known]
+        self.has_errors, self.has_power = bool(self._words), "battery_power" in known
+        self.has_speed = not known.isdisjoint(SPEEDS)
+        self._names = {normalize(state.text): state for state in self._protocol.states.values()}
+        self._last: dict[str, Any] = {"gap": True}
+        self._counts: dict[str, float] = {}
+        self._set: set[tuple[int, str, int]] = set()
+        self._held: tuple[int, bool, float, Number] = (0, False, 0, 0)
+        """Time, presence of telemetry, power and speed of the last row."""
+        self._energy = 0.0  # W ns
+
+    @property
+    def energy_wh(self) -> float | None:
+        """Wh, the integral of the positive power."""
+        return self._energy / HOUR_NS if self.has_power else None
+
+    def take(
+        self, times: Sequence[int], chunk: Sequence[Sequence[Any]]
+    ) -> list[Sequence[int | float | None]]:
+        """Take rows as columns; return those to draw."""
+        columns = {source: _finite(chunk[at]) for source, at in self._at.items()}
+        self._derive(columns)
+        nothing = (None,) * len(times)
+        present = nothing if self._live is None else columns[self._live]
+        for row, is_lost in self._changes("gap", [value is None for value in present]):
+            self._events.end((self._index, "gap"), times[row])
+            if is_lost:
+                self.gaps += 1
+                event = Event("link", self._index, times[row], "No telemetry", "warning")
+                self._events.begin((self._index, "gap"), event)
+        parts = [columns.get(source, nothing) for source in DEVICE]
+        for row, about in self._changes("device", [*zip(*parts, strict=True)]):
+            self._name_device(times[row], *about)
+        for row, state in self._changes("state", columns.get(_state_of(columns), ())):
+            self._change_state(times[row], state)
+        for source, word, bits, shift in self._words:
+            for row, value in self._changes(source, columns[source]):
+                is_lost = value is None or present[row] is None
+                for bit in bits:
+                    is_set = (int(value or 0) << shift) >> bit & 1
+                    self._change_bit(times[row], word, bit, is_set, is_lost)
+        self._count(columns)
+        self._find_extremes(times, columns)
+        self._add_up(times, present, columns)
+        return [columns[source] for source in self.drawn]
+
+    def _changes(self, key: str, values: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        """Row and new value of each change of a column, over all chunks."""
+        last = self._last.get(key)
+        for row, value in enumerate(values if values.count(last) != len(values) else ()):
+            if value != last:
+                last = self._last[key] = value
+                yield row, value
+
+    def _derive(self, columns: Columns) -> None:
+        """Add what follows from other values, where the recording does not have it."""
+        counts = [count for count in columns.get("cell_count", ()) if count]
+        cells = self.cells = round(counts[-1]) if counts else self.cells
+        voltage, current = columns.get("battery_voltage"), columns.get("battery_current")
+        if voltage is not None and "mean_cell_voltage" not in columns:
+            columns["mean_cell_voltage"] = [
+                None if v is None or not cells else round(v / cells, 3) for v in voltage
+            ]
+        if voltage is not None and current is not None and "battery_power" not in columns:
+            columns["battery_power"] = [
+                None if v is None or i is None else round(v * i, 3)
+                for v, i in zip(voltage, current, strict=True)
+            ]
+
+    # --- events
+
+    def _name_device(self, now: int, device: Any, raw: Any, variant: Any, *version: Any) -> None:
+        if device is None and raw is not None:
+            device = self._protocol.devices.get(int(raw), f"device {raw}")
+        if device is None:
+            return
+        text = str(device) if variant is None else f"{device} {variant}"
+        if None not in version:
+            text += ", firmware {}.{}".format(*version)
+        if text not in self.devices[-1:]:
+            if self.devices:
+                change = f"Device changed from {self.devices[-1]} to {text}"
+                event = Event("device", self._index, now, change)
+                self._events.begin((self._index, "device"), event)
+                self._events.end((self._index, "device"), now)
+            self.devices.append(text)
+
+    def _change_state(self, now: int, value: Any) -> None:
+        key = (self._index, "state")
+        self._events.end(key, now)
+        if value is None:
+            return
+        if isinstance(value, str):
+            state = self._names.get(normalize(value))
+        else:
+            state = self._protocol.states.get(value)
+        phase = PHASES[-1] if state is None or state.phase not in PHASES else state.phase
+        text = f"state {value}" if state is None else state.text
+        severity = "error" if phase == "Fault" else "status"
+        event = Event("state", self._index, now, text, severity, phase=PHASES.index(phase))
+        self._events.begin(key, event)
+
+    def _change_bit(self, now: int, word: str, bit: int, is_set: int, is_lost: bool) -> None:
+        key = (self._index, word, bit)
+        if not is_set and key in self._set:
+            self._set.remove(key)
+            self._events.end(key, now, lost=is_lost)
+        elif is_set and key not in self._set:
+            event = Event("error", self._index, now, f"bit {bit}, unknown to this program", "error")
+            known = next((one for one in self._protocol.errors[word] if one == bit), None)
+            if known is not None:
+                if known.is_normal:
+                    return
+                place = "self-test: " if word == "selftest_errors" else ""
+                event.text, event.severity = place + known.meaning, known.severity.value
+                event.remedy = known.remedy
+            self._set.add(key)
+            self._events.begin(key, event)
+
+    # --- numbers
+
+    def _count(self, columns: Columns) -> None:
+        """Add what counters went up by. One that begins again, or overflows, adds its new value."""
+        for source in COUNTERS:
+            known = [value for value in columns.get(source, ()) if value is not None]
+            if known:
+                steps = pairwise((self._counts.get(source, known[0]), *known))
+                more = sum(b - a if b >= a else b for a, b in steps)
+                self.counted[source] = self.counted.get(source, 0) + more
+                self._counts[source] = known[-1]
+
+    def _find_extremes(self, times: Sequence[int], columns: Columns) -> None:
+        for quantities, best in ((MAXIMA, max), (MINIMA, min)):
+            for source in quantities.keys() & columns.keys():
+                values = columns[source]
+                value = best((v for v in values if v is not None), default=None)
+                before = self.extremes.get(source)
+                if value is not None and (
+                    before is None or best(value, before.value) != before.value
+                ):
+                    self.extremes[source] = Extreme(value, times[values.index(value)])
+
+    def _add_up(self, times: Sequence[int], present: Sequence[Any], columns: Columns) -> None:
+        """Add times and energy; weigh the battery."""
+        nothing = (None,) * len(times)
+        load = [columns.get(f"battery_{name}", nothing) for name in ("power", "voltage", "current")]
+        speeds = next((columns[source] for source in SPEEDS if source in columns), nothing)
+        since, was_there, held_power, turned = self._held
+        for now, live, power, voltage, current, speed in zip(
+            times, present, *load, speeds, strict=True
+        ):
+            if was_there:
+                length = now - since
+                self.telemetry_ns += length
+                self.turning_ns += length if turned else 0
+                self._energy += held_power * length
+            since, was_there, held_power, turned = now, live is not None, max(power or 0, 0), speed
+            if voltage is None or current is None:
+                continue
+            if current >= LOAD_CURRENT:
+                if self.load_voltage is None or voltage < self.load_voltage.value:
+                    self.load_voltage = Extreme(voltage, now)
+            elif self.load_voltage is None and abs(current) <= REST_CURRENT and voltage > 0:
+                self.rest_voltage = voltage
+        self._held = since, was_there, held_power, turned
+
+
+def _finite(values: Sequence[Any]) -> Sequence[Any]:
+    """A float signal may be infinite; that is no value."""
+    if inf not in values and -inf not in values:
+        return values
+    return [value if value is None or isfinite(value) else None for value in values]
+
+
+def _state_of(columns: Columns) -> str:
+    return "operating_state_raw" if "operating_state_raw" in columns else "operating_state"
