@@ -8,7 +8,7 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, number_from, option
+from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.progress import watched
@@ -25,8 +25,7 @@ from kontronik_can_gw.desk.recordings.convert import (
     to_log,
     to_table,
 )
-from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, Input, open_input
-from kontronik_can_gw.desk.recordings.log_input import CanLogInput
+from kontronik_can_gw.desk.recordings.inputs import CanLogInput, Input, open_input
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -50,7 +49,6 @@ def _names(text: str) -> list[str]:
     return found
 
 
-_RATE = number_from(0.001, 1e6, problem="is no rate between 0.001 and 1000000")
 # fmt: off
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes; - for standard input", dest="input"),
@@ -59,14 +57,13 @@ OPTIONS = (
     option("--force", "write over OUT if it is there"),
     option("-q --quiet", "no summary"),
     LAYOUT,
-    option("--live-rate HZ", "live frames a second of plain UART bytes, which have no time (default 100)", type=_RATE),
     "a part of it",
     option("--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"),
     option("--until S", "up to this time after the start, in seconds", type=_seconds_ns, dest="end"),
-    option("--esc NAME", "only the signals (or bytes) of this ESC"),
     "tables",
     option("--signals A,B*", "only these signals, in this order; * and ? stand for others", type=_names, default=[]),
-    option("--rate HZ", "rows a second at most, the newest of each period", type=_RATE),
+    "bin",
+    option("--esc NAME", "the ESC whose bytes are wanted, of several"),
 )
 # fmt: on
 EPILOG = """\
@@ -116,12 +113,7 @@ def _interrupt() -> None:
 def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input]) -> None:
     target = None if args.output == "-" else Path(args.output)
     begun = time.monotonic()
-    rate = args.live_rate or LIVE_RATE
-    with opened_by(Path(args.input), given_layout(args), rate) as recording:
-        if args.live_rate is not None and not recording.times_assumed:
-            raise UserError(
-                f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
-            )
+    with opened_by(Path(args.input), given_layout(args)) as recording:
         conversion = _conversion(args, form, recording)
         try:
             with Output(target) as out:
@@ -149,9 +141,7 @@ def _report(
         where = "standard output" if args.output == "-" else args.output
         say(f"{where}: {summary}, in {seconds:.1f} s", args.command)
         if recording.times_assumed and form != BYTES:
-            live_rate = args.live_rate or LIVE_RATE
-            assumed = f"times are assumed: {live_rate:g} live frames a second"
-            say(f"{assumed} (convert --live-rate)", args.command)
+            say(f"times are {recording.provenance['times']}", args.command)
     for line in damage:
         say(line, args.command)
 
@@ -171,11 +161,11 @@ def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
     """What is to be done with recording and output. UserError for what the recording has not."""
     if form == BYTES:
-        return partial(to_bytes, esc=_esc(args, recording, needed=True) or 0)
+        return partial(to_bytes, esc=_esc(args, recording))
+    times = {"start_ns": args.start, "end_ns": args.end}
     if form in LOGS:
-        return partial(to_log, form=LOGS[form], start_ns=args.start, end_ns=args.end)
-    times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
-    choice = Choice.of(recording.fields, args.signals, _esc(args, recording), **times)
+        return partial(to_log, form=LOGS[form], **times)
+    choice = Choice.of(recording.fields, args.signals, **times)
     return partial(to_table, form=form, choice=choice)
 
 
@@ -199,18 +189,15 @@ def _format(args: argparse.Namespace) -> str:
 def _check(args: argparse.Namespace, form: str) -> None:
     """Wrong usage that is known before anything is opened. UserError."""
     to_screen, start, end = args.output == "-", args.start, args.end
-    has_rows, is_bytes = form in TABLES, form == BYTES
-    only_rows = f"is for tables ({', '.join(TABLES)}), not for {form}"
+    is_bytes = form == BYTES
     # fmt: off
     rules = (
         (to_screen and form not in STREAMS,
          f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}"),
         (to_screen and is_bytes and sys.stdout.isatty(), "bin cannot go to a terminal. Give a file, or a pipe behind it."),
-        (args.signals and not has_rows, f"--signals {only_rows}"),
-        (args.rate and not has_rows, f"--rate {only_rows}"),
-        (args.esc is not None and form in LOGS, f"--esc is for tables and bin: {form} holds the frames as they are"),
+        (args.signals and form not in TABLES, f"--signals is for tables ({', '.join(TABLES)}), not for {form}"),
+        (args.esc is not None and not is_bytes, f"--esc is for bin, not for {form}; the columns of an ESC: --signals 'NAME.*'"),
         (is_bytes and not (start is None and end is None), "--from and --until are not for bin, which has no times"),
-        (is_bytes and args.live_rate is not None, "--live-rate is not for bin, which has no times"),
         (start is not None and end is not None and end < start, "--until is before --from"),
     )
     # fmt: on
@@ -228,13 +215,11 @@ def _check(args: argparse.Namespace, form: str) -> None:
         raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
 
 
-def _esc(args: argparse.Namespace, recording: Input, needed: bool = False) -> int | None:
-    """Index of the ESC that --esc names; None where none is named and none is needed. UserError."""
+def _esc(args: argparse.Namespace, recording: Input) -> int:
+    """Index of the ESC that --esc names, or of the only one. UserError."""
     names = [esc.name for esc in recording.bus.escs]
-    if args.esc is None:
-        if needed and len(names) > 1:
-            raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")
-        return None
-    if args.esc not in names:
+    if args.esc is None and len(names) > 1:
+        raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")
+    if args.esc not in (None, *names):
         raise UserError(f"--esc {args.esc}: there is no such ESC. There are: {', '.join(names)}")
-    return names.index(args.esc)
+    return names.index(args.esc) if args.esc else 0

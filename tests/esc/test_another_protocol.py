@@ -17,7 +17,7 @@ from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.desk.recordings.columns import fields_of_values, reader_of, values_of_fields
+from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
@@ -172,9 +172,9 @@ def test_a_table_has_its_values_by_name() -> None:
     flight.send(OLD, FRAME)
     escs, esc = [esc.settings for esc in flight.gateway.escs], flight.gateway.escs[1]
     live = {}
-    for field, value in values_of_fields(fields_of_values(escs), escs):
+    for field in fields_of_values(escs):
         if field.esc == 1 and VALUES[field.source].group is Group.LIVE:
-            live[field.source] = reader_of(value)(esc, flight.gateway.status, flight.now)
+            live[field.source] = field.reader(esc, flight.gateway.status, flight.now)
     assert {name: value for name, value in live.items() if value is not None} == {
         "electrical_speed": 21_000,
         "battery_voltage": 24.0,

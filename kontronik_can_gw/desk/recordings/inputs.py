@@ -4,25 +4,29 @@ A capture (.kcap) goes through the gateway's core with the recorded clock. Plain
 come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what a file is by its content.
 """
 
-from pathlib import Path
+import os
+import shutil
+import stat
+import tempfile
+from pathlib import Path, PosixPath
+from typing import IO
 
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.bytes_input import LIVE_RATE, UART_MAGIC, BytesInput
+from kontronik_can_gw.desk.recordings.bytes_input import UART_MAGIC, BytesInput
 from kontronik_can_gw.desk.recordings.can_logs.log import NAMES, SUFFIXES, log_format
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.log_input import CanLogInput
 from kontronik_can_gw.desk.recordings.recording import Input
-from kontronik_can_gw.desk.recordings.spool import spooled
 from kontronik_can_gw.errors import RunError, UserError
 
-__all__ = ["LIVE_RATE", "BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
+__all__ = ["BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
 
 _HEAD = 1 << 16
 
 
-def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE) -> Input:
+def open_input(path: Path, layout: BusLayout | None = None) -> Input:
     """Open a recording. UserError for other files, RunError for what cannot be read.
 
     ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run; a pipe, or ``-`` for
@@ -46,7 +50,7 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         return CanLogInput(path, layout, found)
     if UART_MAGIC in head:
-        return BytesInput(path, layout, live_rate)
+        return BytesInput(path, layout)
     if (called := SUFFIXES.get(path.suffix.lower())) is not None:
         raise UserError(
             f"{path}: is no {NAMES[called]}, whatever its name says, and no other recording"
@@ -56,9 +60,9 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
     )
 
 
-def open_bytes(path: Path, layout: BusLayout | None, live_rate: float) -> Input:
+def open_bytes(path: Path, layout: BusLayout | None) -> Input:
     """Open the bytes of one ESC, whatever is in them."""
-    return BytesInput(spooled(path), layout, live_rate)
+    return BytesInput(spooled(path), layout)
 
 
 def _parts(path: Path) -> list[Path] | None:
@@ -80,3 +84,57 @@ def _parts(path: Path) -> list[Path] | None:
             f"{path}: has captures of {len(runs)} runs; give the beginning of the names of one: {', '.join(runs[-8:])}"
         )
     return found
+
+
+# --- what can be read only once
+
+
+class SpooledPath(PosixPath):
+    """A path that is shown under another name. It keeps its file open: that exists no longer than this."""
+
+    shown = ""
+    kept: IO[bytes] | None = None
+
+    def __str__(self) -> str:
+        return self.shown or super().__str__()
+
+    def __fspath__(self) -> str:
+        return super().__str__()
+
+    @property
+    def name(self) -> str:
+        return self.shown.rpartition("/")[2] or super().name
+
+
+def spooled(path: Path) -> Path:
+    """All that comes of ``-`` or of a pipe, in a temporary file without a name; any other path as it is.
+
+    UserError for a device, RunError where there is no room.
+    """
+    is_input = str(path) == "-"
+    shown = "standard input" if is_input else str(path)
+    try:
+        about = os.fstat(0) if is_input else path.stat()
+    except (OSError, ValueError):
+        return path
+    kind = stat.S_IFMT(about.st_mode)
+    if not is_input and kind in (stat.S_IFREG, stat.S_IFDIR):
+        return path
+    is_pipe = kind in (stat.S_IFIFO, stat.S_IFREG, stat.S_IFSOCK)
+    if not is_pipe and about.st_rdev != Path(os.devnull).stat().st_rdev:
+        # it is not opened: it might be the port of an ESC
+        raise UserError(
+            f"{shown}: is a terminal or another device. Give a file, or a pipe that brings a recording."
+        )
+    file = tempfile.TemporaryFile()  # noqa: SIM115  as long as its path
+    try:
+        with open(0 if is_input else path, "rb", closefd=not is_input) as stream:
+            shutil.copyfileobj(stream, file)
+        file.flush()
+    except OSError as error:
+        raise RunError(
+            f"{shown}: cannot be read into {tempfile.gettempdir()} (TMPDIR): {error.strerror}."
+        ) from None
+    made = SpooledPath(f"/proc/self/fd/{file.fileno()}")
+    made.shown, made.kept = shown, file
+    return made
