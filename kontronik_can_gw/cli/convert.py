@@ -73,16 +73,10 @@ IN may be a pipe, or - for standard input: it is first read to its end, into a t
 
 OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
 bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .log .candump .asc .blf .trc .bin; --to where it
-does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, mf4-log needs asammdf; they are named
-where they are missing.
+does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, mf4-log needs asammdf.
 
-Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
-Columns are values by name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]): of captures and bytes all of them in full
-resolution, of CAN logs those that the DBC has.
-Time [s] counts from the recording's first row; Utc is there where the recording knows the time of day. What is not
-available is empty in CSV, null in JSON lines and Parquet.
-Flags are 0 and 1.
-
+A table has a row at each telemetry frame, or at each group of CAN frames that belong together, and a column for each value by its
+name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]). What is not available is empty in CSV, null elsewhere.
 Of a damaged recording everything that is intact is converted, and a summary says what is not.
 OUT takes its name only when it is whole; until then it is called OUT.part.
 

@@ -48,9 +48,8 @@ def write_log(
     path: Path, format_: str, items: list[Item], wall_start_ns: int | None = WALL_NS
 ) -> None:
     """By our writer."""
-    first = items[0][0] if items else 0
     with path.open("wb") as file:
-        writer = CanLogWriter(file, format_, wall_start_ns, 0, first, name=path.name)
+        writer = CanLogWriter(file, format_, wall_start_ns)
         writer.write([TimedFrame(*item) for item in items])
         writer.close()
 

@@ -52,7 +52,6 @@ class Output:
         self.is_whole = False
         self.watch: Callable[[Iterable[Any]], Iterable[Any]] = iter
         """What is converted passes through this, block by block."""
-        self.name = "" if target is None else target.name
         self._target, self._what = target, what
         self._file: IO[bytes] | None = None
         self._part: Path | None = None
@@ -141,8 +140,8 @@ def to_log(
     first, batches = first_of(cut(batches, start_ns, end_ns, origin_ns))
     if first is None:
         return None
-    known = wall_ns, origin_ns, time_at(first, 0), recording.channel
-    writer = CanLogWriter(out.open(), form, *known, out.name, recording.provenance)
+    known = wall_ns, origin_ns, recording.channel, recording.provenance
+    writer = CanLogWriter(out.open(), form, *known)
     count, last_ns = _write_all(writer, batches, out)
     lasted = last_ns - origin_ns
     frames_written = _many(count - sum(writer.left_out.values()), "CAN frame")

@@ -28,8 +28,7 @@ class CanLogWriter:
     """Writes one log.
 
     ``file``: open for bytes, stays open. ``wall_ns``: Unix time at ``origin_ns``, the log's time 0; None where unknown.
-    ``first_ns``: time of the first frame, where an ASC, BLF, TRC or MF4 file with the Unix time begins.
-    ``name``: what the file will be called (TRC says it). ``provenance``: for the header of MF4, as it is known at the end.
+    ``provenance``: for the header of MF4, as it is known at the end.
     """
 
     write: "Callable[[Frames | list[TimedFrame]], None]"
@@ -41,9 +40,7 @@ class CanLogWriter:
         format_: str,
         wall_ns: int | None,
         origin_ns: int = 0,
-        first_ns: int = 0,
         channel: str = "can0",
-        name: str = "",
         provenance: Mapping[str, str] | None = None,
     ) -> None:
         self.left_out: dict[str, int] = {}
@@ -56,7 +53,7 @@ class CanLogWriter:
         if wall_ns is not None:
             # Vector's and PEAK's headers count milliseconds, those of MF4 are read as microseconds
             unit = 1000 if format_ == "mf4" else _MS
-            start_ns = (wall_ns + first_ns - origin_ns) // unit * unit
+            start_ns = wall_ns // unit * unit
             self._base_ns = start_ns - wall_ns + origin_ns
         match format_:
             case "candump":
@@ -66,7 +63,7 @@ class CanLogWriter:
             case "blf":
                 self._blf(file, start_ns)
             case "trc":
-                self._trc(file, start_ns, name)
+                self._trc(file, start_ns)
             case _:
                 self._mf4(file, start_ns, provenance or {})
 
@@ -122,12 +119,12 @@ class CanLogWriter:
 
         self.close = close
 
-    def _trc(self, file: IO[bytes], start_ns: int, name: str) -> None:
+    def _trc(self, file: IO[bytes], start_ns: int) -> None:
         with without_asammdf():
             from can import TRCWriter
         text = io.TextIOWrapper(file, encoding="utf-8", newline="\r\n", write_through=True)
-        writer = TRCWriter(_Unclosed(text, name=name))
-        writer.filepath = name
+        writer = TRCWriter(_Unclosed(text))
+        writer.filepath = "kontronik-can-gw"
         writer.first_timestamp = 0.0
         writer.header_written = True
         writer.write_header(start_ns // _MS / 1000)
@@ -192,8 +189,10 @@ class CanLogWriter:
 class _Unclosed:
     """A file that does not let its writer close it."""
 
-    def __init__(self, file: Any, name: str = "") -> None:
-        self._file, self.name = file, name
+    name = ""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
