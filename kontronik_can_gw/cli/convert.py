@@ -51,7 +51,7 @@ def _names(text: str) -> list[str]:
 
 # fmt: off
 OPTIONS = (
-    option("IN", "capture, CAN log or UART bytes; - for standard input", dest="input"),
+    option("IN", "capture, CAN log or UART bytes", dest="input"),
     option("OUT", "file to write, or - for standard output", dest="output"),
     option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS),
     option("--force", "write over OUT if it is there"),
@@ -69,7 +69,6 @@ OPTIONS = (
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
 BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
-IN may be a pipe, or - for standard input: it is first read to its end, into a temporary file (in TMPDIR, else /tmp).
 
 OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
 bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .log .candump .asc .blf .trc .bin; --to where it

@@ -50,8 +50,8 @@ OPTIONS = (
 _ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}
 EPILOG = """\
 FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run) or a file of plain UART
-bytes; a pipe, or - for standard input, is read to its end first. A capture is replayed through the gateway's core with the
-recorded clock: frames and times equal those of the live gateway bit for bit.
+bytes. A capture is replayed through the gateway's core with the recorded clock: frames and times equal those of the live
+gateway bit for bit.
 
 --on can  sends the frames on a CAN bus. The gateway's state in them is set to Replay (GatewayState), since they are old;
           with --unmarked they are sent exactly as recorded. Refused while a gateway on this machine sends the same messages.

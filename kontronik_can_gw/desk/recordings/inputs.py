@@ -4,12 +4,7 @@ A capture (.kcap) goes through the gateway's core with the recorded clock. Plain
 come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what a file is by its content.
 """
 
-import os
-import shutil
-import stat
-import tempfile
-from pathlib import Path, PosixPath
-from typing import IO
+from pathlib import Path
 
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
 from kontronik_can_gw.config.keys import shipped
@@ -29,11 +24,10 @@ _HEAD = 1 << 16
 def open_input(path: Path, layout: BusLayout | None = None) -> Input:
     """Open a recording. UserError for other files, RunError for what cannot be read.
 
-    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run; a pipe, or ``-`` for
-    standard input, which is read to its end first. ``layout``: of CAN logs and plain
-    bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
+    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run. ``layout``: of CAN
+    logs and plain bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
     """
-    path = spooled(path)
+    _check_kind(path)
     parts = _parts(path)
     if parts is not None:
         return CaptureInput(parts, layout)
@@ -62,7 +56,16 @@ def open_input(path: Path, layout: BusLayout | None = None) -> Input:
 
 def open_bytes(path: Path, layout: BusLayout | None) -> Input:
     """Open the bytes of one ESC, whatever is in them."""
-    return BytesInput(spooled(path), layout)
+    _check_kind(path)
+    return BytesInput(path, layout)
+
+
+def _check_kind(path: Path) -> None:
+    """UserError for a pipe or a device. None is opened: it might be the port of an ESC."""
+    if str(path) == "-" or (path.exists() and not path.is_file() and not path.is_dir()):
+        raise UserError(
+            f"{path}: is no file. What comes through a pipe is written into one first: COMMAND > FILE"
+        )
 
 
 def _parts(path: Path) -> list[Path] | None:
@@ -84,57 +87,3 @@ def _parts(path: Path) -> list[Path] | None:
             f"{path}: has captures of {len(runs)} runs; give the beginning of the names of one: {', '.join(runs[-8:])}"
         )
     return found
-
-
-# --- what can be read only once
-
-
-class SpooledPath(PosixPath):
-    """A path that is shown under another name. It keeps its file open: that exists no longer than this."""
-
-    shown = ""
-    kept: IO[bytes] | None = None
-
-    def __str__(self) -> str:
-        return self.shown or super().__str__()
-
-    def __fspath__(self) -> str:
-        return super().__str__()
-
-    @property
-    def name(self) -> str:
-        return self.shown.rpartition("/")[2] or super().name
-
-
-def spooled(path: Path) -> Path:
-    """All that comes of ``-`` or of a pipe, in a temporary file without a name; any other path as it is.
-
-    UserError for a device, RunError where there is no room.
-    """
-    is_input = str(path) == "-"
-    shown = "standard input" if is_input else str(path)
-    try:
-        about = os.fstat(0) if is_input else path.stat()
-    except (OSError, ValueError):
-        return path
-    kind = stat.S_IFMT(about.st_mode)
-    if not is_input and kind in (stat.S_IFREG, stat.S_IFDIR):
-        return path
-    is_pipe = kind in (stat.S_IFIFO, stat.S_IFREG, stat.S_IFSOCK)
-    if not is_pipe and about.st_rdev != Path(os.devnull).stat().st_rdev:
-        # it is not opened: it might be the port of an ESC
-        raise UserError(
-            f"{shown}: is a terminal or another device. Give a file, or a pipe that brings a recording."
-        )
-    file = tempfile.TemporaryFile()  # noqa: SIM115  as long as its path
-    try:
-        with open(0 if is_input else path, "rb", closefd=not is_input) as stream:
-            shutil.copyfileobj(stream, file)
-        file.flush()
-    except OSError as error:
-        raise RunError(
-            f"{shown}: cannot be read into {tempfile.gettempdir()} (TMPDIR): {error.strerror}."
-        ) from None
-    made = SpooledPath(f"/proc/self/fd/{file.fileno()}")
-    made.shown, made.kept = shown, file
-    return made
