@@ -142,6 +142,8 @@ def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Pa
 
 def test_the_list_can_fail(tmp_path: Path) -> None:
     """With a library and a room of ours that do not belong there, imported on purpose."""
-    modules = imported(tmp_path, "", "import rich.console, kontronik_can_gw.desk.recordings.pacing")
+    modules = imported(
+        tmp_path, "", "import rich.console, kontronik_can_gw.desk.recordings.layouts"
+    )
     found = surplus(modules, ALWAYS | CANTOOLS)
-    assert {"rich", "kontronik_can_gw.desk.recordings.pacing"} <= found
+    assert {"rich", "kontronik_can_gw.desk.recordings.layouts"} <= found

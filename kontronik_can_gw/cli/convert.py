@@ -8,7 +8,7 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, number_from, option
+from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, option
 from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.progress import watched
@@ -25,8 +25,7 @@ from kontronik_can_gw.desk.recordings.convert import (
     to_log,
     to_table,
 )
-from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, Input, open_input
-from kontronik_can_gw.desk.recordings.log_input import CanLogInput
+from kontronik_can_gw.desk.recordings.inputs import CanLogInput, Input, open_input
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -50,42 +49,33 @@ def _names(text: str) -> list[str]:
     return found
 
 
-_RATE = number_from(0.001, 1e6, problem="is no rate between 0.001 and 1000000")
 # fmt: off
 OPTIONS = (
-    option("IN", "capture, CAN log or UART bytes; - for standard input", dest="input"),
+    option("IN", "capture, CAN log or UART bytes", dest="input"),
     option("OUT", "file to write, or - for standard output", dest="output"),
     option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS),
     option("--force", "write over OUT if it is there"),
     option("-q --quiet", "no summary"),
     LAYOUT,
-    option("--live-rate HZ", "live frames a second of plain UART bytes, which have no time (default 100)", type=_RATE),
     "a part of it",
     option("--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"),
     option("--until S", "up to this time after the start, in seconds", type=_seconds_ns, dest="end"),
-    option("--esc NAME", "only the signals (or bytes) of this ESC"),
     "tables",
     option("--signals A,B*", "only these signals, in this order; * and ? stand for others", type=_names, default=[]),
-    option("--rate HZ", "rows a second at most, the newest of each period", type=_RATE),
+    "bin",
+    option("--esc NAME", "the ESC whose bytes are wanted, of several"),
 )
 # fmt: on
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
 BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
-IN may be a pipe, or - for standard input: it is first read to its end, into a temporary file (in TMPDIR, else /tmp).
 
 OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
 bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .log .candump .asc .blf .trc .bin; --to where it
-does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, mf4-log needs asammdf; they are named
-where they are missing.
+does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, mf4-log needs asammdf.
 
-Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
-Columns are values by name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]): of captures and bytes all of them in full
-resolution, of CAN logs those that the DBC has.
-Time [s] counts from the recording's first row; Utc is there where the recording knows the time of day. What is not
-available is empty in CSV, null in JSON lines and Parquet.
-Flags are 0 and 1.
-
+A table has a row at each telemetry frame, or at each group of CAN frames that belong together, and a column for each value by its
+name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]). What is not available is empty in CSV, null elsewhere.
 Of a damaged recording everything that is intact is converted, and a summary says what is not.
 OUT takes its name only when it is whole; until then it is called OUT.part.
 
@@ -116,12 +106,7 @@ def _interrupt() -> None:
 def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input]) -> None:
     target = None if args.output == "-" else Path(args.output)
     begun = time.monotonic()
-    rate = args.live_rate or LIVE_RATE
-    with opened_by(Path(args.input), given_layout(args), rate) as recording:
-        if args.live_rate is not None and not recording.times_assumed:
-            raise UserError(
-                f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
-            )
+    with opened_by(Path(args.input), given_layout(args)) as recording:
         conversion = _conversion(args, form, recording)
         try:
             with Output(target) as out:
@@ -149,9 +134,7 @@ def _report(
         where = "standard output" if args.output == "-" else args.output
         say(f"{where}: {summary}, in {seconds:.1f} s", args.command)
         if recording.times_assumed and form != BYTES:
-            live_rate = args.live_rate or LIVE_RATE
-            assumed = f"times are assumed: {live_rate:g} live frames a second"
-            say(f"{assumed} (convert --live-rate)", args.command)
+            say(f"times are {recording.provenance['times']}", args.command)
     for line in damage:
         say(line, args.command)
 
@@ -171,11 +154,11 @@ def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
     """What is to be done with recording and output. UserError for what the recording has not."""
     if form == BYTES:
-        return partial(to_bytes, esc=_esc(args, recording, needed=True) or 0)
+        return partial(to_bytes, esc=_esc(args, recording))
+    times = {"start_ns": args.start, "end_ns": args.end}
     if form in LOGS:
-        return partial(to_log, form=LOGS[form], start_ns=args.start, end_ns=args.end)
-    times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
-    choice = Choice.of(recording.fields, args.signals, _esc(args, recording), **times)
+        return partial(to_log, form=LOGS[form], **times)
+    choice = Choice.of(recording.fields, args.signals, **times)
     return partial(to_table, form=form, choice=choice)
 
 
@@ -199,18 +182,15 @@ def _format(args: argparse.Namespace) -> str:
 def _check(args: argparse.Namespace, form: str) -> None:
     """Wrong usage that is known before anything is opened. UserError."""
     to_screen, start, end = args.output == "-", args.start, args.end
-    has_rows, is_bytes = form in TABLES, form == BYTES
-    only_rows = f"is for tables ({', '.join(TABLES)}), not for {form}"
+    is_bytes = form == BYTES
     # fmt: off
     rules = (
         (to_screen and form not in STREAMS,
          f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}"),
         (to_screen and is_bytes and sys.stdout.isatty(), "bin cannot go to a terminal. Give a file, or a pipe behind it."),
-        (args.signals and not has_rows, f"--signals {only_rows}"),
-        (args.rate and not has_rows, f"--rate {only_rows}"),
-        (args.esc is not None and form in LOGS, f"--esc is for tables and bin: {form} holds the frames as they are"),
+        (args.signals and form not in TABLES, f"--signals is for tables ({', '.join(TABLES)}), not for {form}"),
+        (args.esc is not None and not is_bytes, f"--esc is for bin, not for {form}; the columns of an ESC: --signals 'NAME.*'"),
         (is_bytes and not (start is None and end is None), "--from and --until are not for bin, which has no times"),
-        (is_bytes and args.live_rate is not None, "--live-rate is not for bin, which has no times"),
         (start is not None and end is not None and end < start, "--until is before --from"),
     )
     # fmt: on
@@ -228,13 +208,11 @@ def _check(args: argparse.Namespace, form: str) -> None:
         raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
 
 
-def _esc(args: argparse.Namespace, recording: Input, needed: bool = False) -> int | None:
-    """Index of the ESC that --esc names; None where none is named and none is needed. UserError."""
+def _esc(args: argparse.Namespace, recording: Input) -> int:
+    """Index of the ESC that --esc names, or of the only one. UserError."""
     names = [esc.name for esc in recording.bus.escs]
-    if args.esc is None:
-        if needed and len(names) > 1:
-            raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")
-        return None
-    if args.esc not in names:
+    if args.esc is None and len(names) > 1:
+        raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")
+    if args.esc not in (None, *names):
         raise UserError(f"--esc {args.esc}: there is no such ESC. There are: {', '.join(names)}")
-    return names.index(args.esc)
+    return names.index(args.esc) if args.esc else 0

@@ -7,7 +7,7 @@ from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.desk.recordings.inputs import open_bytes
 
 OPTIONS = (
-    option("FILE", "file of UART bytes, or - for standard input"),
+    option("FILE", "file of UART bytes"),
     option("--csv", "CSV with a header instead of JSON lines"),
 )
 EPILOG = """\

@@ -34,7 +34,7 @@ Without FILE it listens on the CAN bus, at any place: it only needs the DBC (-c,
 --dbc) and never sends a frame. With -c the interface and the channel are those
 of the configuration unless they are given. FILE is a capture (.kcap), a file of
 UART bytes or a CAN log (candump .log, .asc, .blf, .trc, .mf4), played in real
-time; a pipe, or - for standard input, is first read to its end (into TMPDIR).
+time.
 
 keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it,
       n and p next and previous, 0 all, space pause (FILE)

@@ -4,6 +4,7 @@ import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
@@ -12,10 +13,10 @@ from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.terminals import terminals
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.desk.recordings.pacing import Pace
 from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.id_locks import in_use, names_of
@@ -49,8 +50,8 @@ OPTIONS = (
 _ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}
 EPILOG = """\
 FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run) or a file of plain UART
-bytes; a pipe, or - for standard input, is read to its end first. A capture is replayed through the gateway's core with the
-recorded clock: frames and times equal those of the live gateway bit for bit.
+bytes. A capture is replayed through the gateway's core with the recorded clock: frames and times equal those of the live
+gateway bit for bit.
 
 --on can  sends the frames on a CAN bus. The gateway's state in them is set to Replay (GatewayState), since they are old;
           with --unmarked they are sent exactly as recorded. Refused while a gateway on this machine sends the same messages.
@@ -67,6 +68,29 @@ exit codes: 0 done, 1 failed while running, 2 wrong usage, or a file that is no 
 """
 
 
+class Pace:
+    """Recorded time against real time. ``speed``: recorded seconds in a real one; None: as fast as possible."""
+
+    def __init__(self, speed: float | None) -> None:
+        self.speed = speed
+        self.latest_ns = 0
+        """The most that anything came too late."""
+        self.stopped = Event()
+        self._origin: tuple[int, int] | None = None
+
+    def wait(self, time_ns: int) -> bool:
+        """Pause until a recorded time is due; the first call sets what time it is now. False: stopped."""
+        if self.speed is not None:
+            now = time.monotonic_ns()
+            begun, first_ns = self._origin = self._origin or (now, time_ns)
+            late = now - begun - int((time_ns - first_ns) / self.speed)
+            if late < 0:
+                self.stopped.wait(-late / SECOND)
+                late += time.monotonic_ns() - now
+            self.latest_ns = max(self.latest_ns, late)
+        return not self.stopped.is_set()
+
+
 def main(args: argparse.Namespace) -> int:
     """Replay args.file."""
     for place, names in _ONLY_FOR.items():
@@ -74,7 +98,10 @@ def main(args: argparse.Namespace) -> int:
         if place != args.on and given:
             raise UserError(f"--{given[0]} is for --on {place}")
     pace = Pace(args.speed)
-    with open_input(args.file, given_layout(args)) as recording, stopping_on_signals(pace.stop):
+    with (
+        open_input(args.file, given_layout(args)) as recording,
+        stopping_on_signals(pace.stopped.set),
+    ):
         if not isinstance(recording, PlayedInput):
             raise UserError(
                 f"{args.file}: is a log of CAN frames, which has no bytes of ESCs. Type canplayer -I FILE (of can-utils) to send "
@@ -83,9 +110,8 @@ def main(args: argparse.Namespace) -> int:
         play = {"can": _on_can, "pty": _on_pty}[args.on]
         text = play(args, recording, pace)
         if recording.times_assumed:
-            assumed = recording.provenance["times"].removeprefix("assumed: ")
-            text += f"; times are assumed: {assumed}"
-        say(f"{text}{', stopped' if pace.stopped else ''}")
+            text += f"; times are {recording.provenance['times']}"
+        say(f"{text}{', stopped' if pace.stopped.is_set() else ''}")
         for line in recording.damage:
             say(f"warning: {line}")
     return 0
@@ -99,8 +125,9 @@ def _on_can(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
         _hold(locks, can.channel, recording)
     port = open_can(can)
     count = 0
+    recording.marked = not args.unmarked
     try:
-        for time_ns, frame, received in recording.frames(marked=not args.unmarked):
+        for time_ns, frame, received in recording.frames():
             if received:
                 continue
             if not pace.wait(time_ns):
@@ -138,7 +165,7 @@ def _send(port: CanPort, frame: CanFrame, channel: str, pace: Pace) -> None:
     while (answer := port.send(frame)) is not Sent.OK:
         if answer in (Sent.DOWN, Sent.GONE):
             raise RunError(f"CAN {channel}: went down, or away.")
-        if pace.stopped:
+        if pace.stopped.is_set():
             return
         if time.monotonic() - since > _MAX_BUSY_S:
             raise RunError(
@@ -151,7 +178,7 @@ def _on_pty(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
     names = [esc.name for esc in recording.setup.escs]
     total = 0
     with terminals(names, args.link) as opened:
-        pace.pause(args.delay)
+        pace.stopped.wait(args.delay)
         for entry in recording.entries():
             if entry.kind != Kind.BYTES:
                 continue
@@ -160,7 +187,7 @@ def _on_pty(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
             if entry.esc < len(opened):
                 opened[entry.esc].write(entry.data)
                 total += len(entry.data)
-        pace.pause(_DRAIN_S)
+        pace.stopped.wait(_DRAIN_S)
         for terminal in opened:
             terminal.check()
     if received := [n for n, terminal in zip(names, opened, strict=True) if terminal.received]:

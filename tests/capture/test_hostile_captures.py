@@ -79,7 +79,8 @@ def read_all(path: Path) -> None:
     try:
         with open_input(path) as found:
             assert isinstance(found, CaptureInput)
-            for _ in found.frames(marked=True):
+            found.marked = True
+            for _ in found.frames():
                 pass
             for row in found.samples():
                 found.wall_ns(row.time_ns)

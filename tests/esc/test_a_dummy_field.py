@@ -15,7 +15,7 @@ from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.config.nodes import shipped_canopen
-from kontronik_can_gw.desk.recordings.columns import fields_of_values, reader_of, values_of_fields
+from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.esc.kontronik import Device, Layout, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.values import VALUES
@@ -36,7 +36,7 @@ for now in range(0, 3_000_000_000, 10_000_000):
     gateway.advance(now)
     frames += [f"{now} {f.can_id:X} {f.data.hex()}" for f in gateway.take_frames(now)]
 fields = [f for f in fields_of_values(config.escs) if f.source != "dummy"]
-read = [reader_of(v) for f, v in values_of_fields(fields, config.escs) if f.esc == 1]
+read = [f.reader for f in fields if f.esc == 1]
 port = PortFacts("esc", "/dev/null", open=True)
 status = _esc(gateway.escs[1], port, gateway.status, now)
 status["values"].pop("dummy", None)

@@ -17,7 +17,7 @@ from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.desk.recordings.columns import fields_of_values, reader_of, values_of_fields
+from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
@@ -152,10 +152,10 @@ def test_node_status_and_tables_show_what_there_is_and_nothing_else() -> None:
     assert document["counters"]["live"] == 1
     assert (document["operating_state"], document["errors"], document["device"]) == (None,) * 3
 
-    escs = [esc.settings for esc in gateway.escs]
+    escs, esc = [esc.settings for esc in gateway.escs], gateway.escs[1]
     live = {
-        field.source: reader_of(value)(gateway.escs[1], gateway.status, flight.now)
-        for field, value in values_of_fields(fields_of_values(escs), escs)
+        field.source: field.reader(esc, gateway.status, flight.now)
+        for field in fields_of_values(escs)
         if field.esc == 1 and VALUES[field.source].group is Group.LIVE
     }
     assert {name: value for name, value in live.items() if value is not None} == {

@@ -7,6 +7,7 @@ from typing import Any
 
 import can
 
+from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
@@ -47,11 +48,9 @@ def write_log(
     path: Path, format_: str, items: list[Item], wall_start_ns: int | None = WALL_NS
 ) -> None:
     """By our writer."""
-    first = items[0][0] if items else 0
     with path.open("wb") as file:
-        writer = CanLogWriter(file, format_, wall_start_ns, first, name=path.name)
-        for item in items:
-            writer.write(*item)
+        writer = CanLogWriter(file, format_, wall_start_ns)
+        writer.write([TimedFrame(*item) for item in items])
         writer.close()
 
 

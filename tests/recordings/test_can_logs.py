@@ -4,6 +4,7 @@ from pathlib import Path
 
 import can
 import pytest
+from command_line import run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from log_files import (
@@ -20,7 +21,6 @@ from log_files import (
 )
 
 from kontronik_can_gw.desk.recordings.can_logs.log import log_format
-from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 
@@ -150,10 +150,10 @@ def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
 
 
 def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:
-    with (tmp_path / "fd.trc").open("wb") as file:
-        writer = CanLogWriter(file, "trc", None)
-        for item in (some := some_frames(100, fd=True)):
-            writer.write(*item)
-        writer.close()
-    assert writer.left_out == {"CAN FD frames": sum(frame.fd for _, frame, _ in some)}
-    assert read_log(tmp_path / "fd.trc")[0] == [item for item in some if not item[1].fd]
+    some, source = some_frames(100, fd=True), tmp_path / "fd.log"
+    write_log(source, "candump", some)
+    said = run("convert", source, tmp_path / "fd.trc").err
+    wide = sum(frame.fd for _, frame, _ in some)
+    assert f"{wide} CAN FD frames left out, which trc does not know" in said
+    found = [item[1:] for item in read_log(tmp_path / "fd.trc")[0]]
+    assert found == [item[1:] for item in some if not item[1].fd]

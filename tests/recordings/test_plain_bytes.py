@@ -16,7 +16,7 @@ from kontronik_can_gw.desk.recordings import bytes_input
 from kontronik_can_gw.desk.recordings.bytes_input import BytesInput
 
 NAMES = ("electrical_speed", "battery_voltage", "battery_current")
-PERIOD_NS = 20_000_000
+PERIOD_NS = 10_000_000
 STREAMS: dict[str, Callable[[random.Random], bytes]] = {
     "frames and pieces of frames": lambda source: random_stream(source, 60),
     "long rubbish": lambda source: b"".join(
@@ -27,12 +27,6 @@ STREAMS: dict[str, Callable[[random.Random], bytes]] = {
     ),
     "nothing": lambda _: b"",
 }
-
-
-def recording(tmp_path: Path, stream: bytes, live_rate: float) -> BytesInput:
-    path = tmp_path / "esc.bin"
-    path.write_bytes(stream)
-    return BytesInput(path, None, live_rate)
 
 
 def assumed_times(found: list[Found]) -> list[int]:
@@ -57,7 +51,8 @@ def test_rows_are_the_frames_that_brute_force_finds(
     source = random.Random(f"{kind} {seed}")
     monkeypatch.setattr(bytes_input, "CHUNK", source.choice([1, 7, 44, 100, 5000, 1 << 18]))
     stream = STREAMS[kind](source)
-    dump = recording(tmp_path, stream, live_rate=1e9 / PERIOD_NS)
+    (path := tmp_path / "esc.bin").write_bytes(stream)
+    dump = BytesInput(path)
     found = frames_of(stream)
     times = assumed_times(found)
 

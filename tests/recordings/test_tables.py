@@ -22,13 +22,12 @@ from recordings import (
 )
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.columns import fields_of_values
 from kontronik_can_gw.desk.recordings.convert import _table_writer
-from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table, distinct
+from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table, distinct, fields_of_values
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.desk.recordings.tables.rows import Choice, thinned
+from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.stream import EscStream
@@ -133,20 +132,6 @@ def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Pa
         row for row in every if 1 <= row["Time"] <= 2.5
     ]
     assert _rows(tmp_path, "--from", "0", "--until", "0") == every[:1]
-
-
-@given(st.lists(st.integers(0, 10**10), max_size=200), st.floats(0.1, 1000))
-def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(
-    times: list[int], rate: float
-) -> None:
-    rows = [*enumerate(sorted(times))]
-    blocks = [rows[at : at + 7] for at in range(0, len(rows), 7)]
-    made = (Block([at for _, at in some], [[n for n, _ in some]], None) for some in blocks)
-    thin = [row for block in thinned(made, rate, 0) for row in block.rows()]
-    assert [(row.values[0], row.time_ns) for row in thin][-1:] == rows[-1:]
-    assert all((row.values[0], row.time_ns) in rows for row in thin)
-    slots = [int(row.time_ns // (1e9 / rate)) for row in thin]
-    assert len(slots) == len(set(slots)) == len({int(at // (1e9 / rate)) for _, at in rows})
 
 
 def test_names_that_are_there_twice_get_their_message_in_front() -> None:

@@ -1,4 +1,4 @@
-"""The UART bytes of one ESC, which have no times: their live frames are taken to come at a fixed rate."""
+"""The UART bytes of one ESC, which have no times: their live frames are taken to come a hundred times a second."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,7 +17,7 @@ from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
-from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.transmit_queue import TransmitQueue
@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.player import Player
 
 CHUNK = 1 << 16
-LIVE_RATE = 100.0
-"""Live frames a second that plain bytes are taken to have come at."""
+PERIOD_NS = 10 * MS
 UART_MAGIC = b"KOD"
 """What a telemetry frame begins with."""
 _UNDECIDED = len(UART_MAGIC) - 1
@@ -38,22 +37,19 @@ _UNDECIDED = len(UART_MAGIC) - 1
 class BytesInput(PlayedInput):
     """The bytes of one ESC, without times."""
 
-    def __init__(
-        self, path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE
-    ) -> None:
+    def __init__(self, path: Path, layout: BusLayout | None = None) -> None:
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         if len(layout.escs) != 1:
             raise UserError(
                 f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}"
             )
         self._path = path
-        self._period_ns = max(1, round(SECOND / live_rate))
-        timeout_ns = max(layout.escs[0].timeout_ns, 3 * self._period_ns)
+        timeout_ns = max(layout.escs[0].timeout_ns, 3 * PERIOD_NS)
         escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
         setup = CaptureSetup(escs, (str(path),), None, DbcSettings(), False, False, None)
         super().__init__(str(path), layout, setup)
         self.times_assumed = True
-        self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
+        self.provenance["times"] = "assumed: 100 live frames a second"
         if layout.config is None:
             self.provenance["motor"] = (
                 "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
@@ -84,12 +80,12 @@ class BytesInput(PlayedInput):
         return None
 
     def _play(
-        self, gateway: Gateway, player: "Player | None" = None, marked: bool = False
+        self, gateway: Gateway, player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
         # it runs before the first byte
         gateway.port(0, True, 0)
         gateway.start(0)
-        if marked:
+        if self.marked:
             gateway.status.state = GatewayState.REPLAY
         if player is not None:
             yield from self._play_in_c(player)
@@ -110,8 +106,7 @@ class BytesInput(PlayedInput):
 
     def _play_in_c(self, player: "Player") -> "Iterator[Frames]":
         """The same, and what ``_found`` does."""
-        self.damage = []
-        player.set_bytes(self._period_ns)
+        player.set_bytes(PERIOD_NS)
         rest, begin = b"", 0
         for data in chain(self.esc_bytes(0), (None,)):
             rest = rest[player.position - begin :] + (data or b"")
@@ -123,25 +118,16 @@ class BytesInput(PlayedInput):
 
     def _found(self, decoder: Any) -> Iterator[tuple[int, Reading]]:
         """Each frame at its time. The decoder is given the bytes up to the next header with it: its counters are of that time."""
-        self.damage = []
         now = lives = 0
         for piece in chain(self._pieces(), (b"",)):
             for frame in decoder.feed(piece) if piece else decoder.flush():
                 if not frame.form.is_info:
-                    now = lives * self._period_ns
+                    now = lives * PERIOD_NS
                     lives += 1
                 else:
-                    now = max(now, lives * self._period_ns - self._period_ns // 2)
+                    now = max(now, lives * PERIOD_NS - PERIOD_NS // 2)
                 yield now, frame
         self._describe_damage(decoder.counters)
-
-    def _describe_damage(self, counters: Counters) -> None:
-        if counters.dropped_bytes:
-            self.damage.append(
-                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
-            )
-        if not counters.live:
-            self.damage.append(counters.diagnosis() or "no live frame")
 
     def _pieces(self) -> Iterator[bytes]:
         """The bytes of the file, each header at the beginning of a piece."""
@@ -154,3 +140,12 @@ class BytesInput(PlayedInput):
             yield from filter(None, pieces)
         if rest:
             yield rest
+
+    def _describe_damage(self, counters: Counters) -> None:
+        self.damage = []
+        if counters.dropped_bytes:
+            self.damage.append(
+                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
+            )
+        if not counters.live:
+            self.damage.append(counters.diagnosis() or "no live frame")

@@ -2,10 +2,8 @@
 
 import re
 import tomllib
-from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -25,15 +23,14 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
-from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock, timed
+from kontronik_can_gw.desk.recordings.recording import timed
 from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
     from kontronik_can_gw.gateway import Gateway
-    from kontronik_can_gw.native.offline import Frames, Rows
+    from kontronik_can_gw.native.offline import Frames
     from kontronik_can_gw.native.player import Player
 
-Damaged = Callable[[str], None]
 CHUNK = 1 << 18
 _PLAYED = frozenset({Kind.BYTES, Kind.ADVANCE, Kind.COUNTERS})
 """What a player plays, and by which frames of the turn before are certain."""
@@ -71,7 +68,8 @@ class CaptureInput(PlayedInput):
         self.sent_layout = NO_MESSAGES if found is None else found[1]
         self.created_ns = int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
         self._last_ns = self._impossible = 0
-        self._offsets: list[tuple[int, int]] = []
+        self._place = ""
+        """Of the block that is being read, in words."""
         self._devices: list[Any] = list(self.header.get("devices") or [])
         self._describe()
 
@@ -96,8 +94,8 @@ class CaptureInput(PlayedInput):
 
     def entries(self) -> Iterator[Entry]:
         """All entries. What is damaged is left out, and reported in ``damage``."""
-        for payload, damaged in self._data():
-            yield from self._entries_of(payload, damaged)
+        for payload in self._payloads():
+            yield from self._entries_of(payload)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         for entry in self.entries():
@@ -105,9 +103,9 @@ class CaptureInput(PlayedInput):
                 yield entry.data
 
     def _play(
-        self, gateway: "Gateway", player: "Player | None" = None, marked: bool = False
+        self, gateway: "Gateway", player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
-        replay = Replay(gateway, self.header.get("state"), marked)
+        replay = Replay(gateway, self.header.get("state"), self.marked)
         for frames in self._steps(replay, player):
             if player is not None and len(sent := player.take_frames()):
                 yield sent
@@ -115,15 +113,12 @@ class CaptureInput(PlayedInput):
         if player is not None:
             yield player.take_frames(final=True)
         yield replay.finish()
-        self._add_losses(replay)
-
-    def _timed(self, rows: "Rows") -> Iterator[Block]:
-        """Blocks of rows in which the wall clock goes on as it began."""
-        times = rows.times
-        cuts = {bisect_left(times, since) for since, _ in self._offsets}
-        for begin, end in pairwise(sorted({0, rows.count, *cuts})):
-            wall_ns = self.wall_ns(times[begin])
-            yield PlayedBlock(rows, begin, end, None if wall_ns is None else wall_ns - times[begin])
+        if replay.lost:
+            self.damage.append(
+                f"{replay.lost} entries could not be recorded: the disk was too slow or full"
+            )
+        if replay.rejected:
+            self.damage.append(f"{replay.rejected} entries make no sense to this version")
 
     def _steps(self, replay: Replay, player: "Player | None") -> Iterator[list[TimedFrame]]:
         """Give all entries to a replay's gateway; the frames that Python made of each, or nothing where ``player`` gave some.
@@ -131,13 +126,13 @@ class CaptureInput(PlayedInput):
         The player plays what comes all the time. Any other entry, and the rest of its turn, is played here.
         """
         here = True
-        for payload, damaged in self._data():
+        for payload in self._payloads():
             if player is None or not player.begin(payload):
                 if player is not None:
                     here = True
                     yield []
                     replay.go_on(list(timed(player.take_frames(final=True))))
-                for entry in self._entries_of(payload, damaged):
+                for entry in self._entries_of(payload):
                     yield replay.play(entry)
                 continue
             while (kind := player.next_kind) is not None:
@@ -152,13 +147,13 @@ class CaptureInput(PlayedInput):
                     if here:
                         replay.go_on(list(timed(player.take_frames(final=True))))
 
-    def _entries_of(self, payload: bytes, damaged: Damaged) -> Iterator[Entry]:
+    def _entries_of(self, payload: bytes) -> Iterator[Entry]:
         try:
             for entry in read_entries(payload, self.setup.version):
                 if (found := self._checked(entry)) is not None:
                     yield found
         except ValueError as error:
-            damaged(str(error))
+            self._damaged(f"{self._place} {error}")
 
     def _checked(self, entry: Entry) -> Entry | None:
         """The entry; not before the one before. None where it has no possible time."""
@@ -174,14 +169,6 @@ class CaptureInput(PlayedInput):
             return entry._replace(time_ns=self._last_ns)
         self._last_ns = time_ns
         return entry
-
-    def _add_losses(self, replay: Replay) -> None:
-        if replay.lost:
-            self.damage.append(
-                f"{replay.lost} entries could not be recorded: the disk was too slow or full"
-            )
-        if replay.rejected:
-            self.damage.append(f"{replay.rejected} entries make no sense to this version")
 
     def _describe(self) -> None:
         """Say in ``provenance`` what is known by now."""
@@ -228,43 +215,48 @@ class CaptureInput(PlayedInput):
             raise RunError(f"{path}: cannot be read: {error.strerror}.") from None
         yield from scanner.flush()
 
-    def _data(self) -> Iterator[tuple[bytes, Damaged]]:
+    def _payloads(self) -> Iterator[bytes]:
+        """The data blocks of all parts. What the other blocks tell goes into ``damage`` and ``provenance``."""
         self._last_ns = self._impossible = 0
         self.damage = list(self._headerless)
         self._offsets = []
         for number, path in enumerate(self._paths):
-            yield from self._data_of(path, number)
+            expected, ended = 0, False
+            for found in self._blocks(path):
+                if isinstance(found, Damage):
+                    text = f"{found.length} bytes at {found.offset} are damaged"
+                    self._damaged(f"{path.name}: {text}")
+                    continue
+                if missing := max(0, found.number - expected):
+                    text = f"{missing} blocks in front of byte {found.offset} are missing"
+                    self._damaged(f"{path.name}: {text}")
+                expected, ended = found.number + 1, found.kind == b"E"
+                self._place = f"{path.name}: the block at {found.offset}"
+                if found.kind == b"D":
+                    yield found.payload
+                elif found.kind in (b"I", b"H"):
+                    self._read_json(found, path, number)
+            if not ended:
+                text = "was not closed: up to the last second before its end may be missing"
+                self._damaged(f"{path.name}: {text}")
         if self._impossible:
             self.damage.append(f"{self._impossible} entries have no possible time")
 
-    def _data_of(self, path: Path, part: int) -> Iterator[tuple[bytes, Damaged]]:
-        expected, ended = 0, False
+    def _damaged(self, text: str) -> None:
+        if len(self.damage) <= _MAX_DAMAGE:
+            is_last = len(self.damage) == _MAX_DAMAGE
+            self.damage.append("and more of that kind" if is_last else text)
 
-        def damaged(text: str) -> None:
-            if len(self.damage) <= _MAX_DAMAGE:
-                is_last = len(self.damage) == _MAX_DAMAGE
-                self.damage.append("and more of that kind" if is_last else f"{path.name}: {text}")
-
-        for found in self._blocks(path):
-            if isinstance(found, Damage):
-                damaged(f"{found.length} bytes at {found.offset} are damaged")
-                continue
-            if missing := max(0, found.number - expected):
-                damaged(f"{missing} blocks in front of byte {found.offset} are missing")
-            expected, ended = found.number + 1, found.kind == b"E"
-            try:
-                if found.kind == b"D":
-                    begin = f"the block at {found.offset} "
-                    yield found.payload, lambda text, begin=begin: damaged(begin + text)  # type: ignore[misc]
-                elif found.kind == b"I":
-                    self._devices = read_json(found.payload).get("devices", self._devices)
-                    self._describe()
-                elif found.kind == b"H":
-                    self._check_part(read_json(found.payload), path, part)
-            except ValueError as error:
-                damaged(f"the block at {found.offset} {error}")
-        if not ended:
-            damaged("was not closed: up to the last second before its end may be missing")
+    def _read_json(self, block: DataBlock, path: Path, part: int) -> None:
+        try:
+            found = read_json(block.payload)
+            if block.kind == b"H":
+                self._check_part(found, path, part)
+            else:
+                self._devices = found.get("devices", self._devices)
+                self._describe()
+        except ValueError as error:
+            self._damaged(f"{self._place} {error}")
 
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):

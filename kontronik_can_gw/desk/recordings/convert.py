@@ -5,7 +5,6 @@ Each conversion returns what it wrote, in words; None where the recording has no
 
 import os
 import sys
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -14,13 +13,9 @@ from typing import IO, TYPE_CHECKING, Any, Self
 from kontronik_can_gw.errors import RunError
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.capture.replay import TimedFrame
     from kontronik_can_gw.desk.recordings.fields import Table
     from kontronik_can_gw.desk.recordings.recording import Input
-    from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
     from kontronik_can_gw.desk.recordings.tables.rows import Choice
-    from kontronik_can_gw.desk.recordings.tables.text import TextTable
-    from kontronik_can_gw.native.offline import Frames
 
 TABLES = ("csv", "jsonl", "parquet")
 LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
@@ -42,8 +37,8 @@ ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """What may go to standard output: it is text, and is written from its beginning to its end."""
 STREAMS = (*ON_SCREEN, BYTES)
 """What may go through a pipe."""
-_CLOCK_SET_NS = _DISORDER_NS = 1_000_000_000
-"""How far a clock must be set to be worth a word; how far frames of several interfaces may stand out of order."""
+_CLOCK_SET_NS = 1_000_000_000
+"""How far a clock must be set to be worth a word."""
 
 
 class Output:
@@ -57,28 +52,27 @@ class Output:
         self.is_whole = False
         self.watch: Callable[[Iterable[Any]], Iterable[Any]] = iter
         """What is converted passes through this, block by block."""
-        self.name = "" if target is None else target.name
         self._target, self._what = target, what
-        self._part: Path | None = None
-        self._made = False
-        if target is not None and (not target.exists() or target.is_file()):
-            self._part = Path(os.path.realpath(target)).with_name(f"{target.name}.part")
         self._file: IO[bytes] | None = None
+        self._part: Path | None = None
+        """What may have been made."""
 
     def open(self) -> IO[bytes]:
         """What to write to. RunError where it cannot be opened."""
-        if self._target is None:
+        target = self._target
+        if target is None:
             return sys.stdout.buffer
         try:
-            if self._part is None:
-                self._file = self._target.open("wb")
+            if target.exists() and not target.is_file():
+                self._file = target.open("wb")
             else:
-                self._part.unlink(missing_ok=True)
-                self._made = True  # a signal may come before the file is known
-                self._file = self._part.open("xb")  # follows no link that somebody put there
+                part = Path(os.path.realpath(target)).with_name(f"{target.name}.part")
+                part.unlink(missing_ok=True)
+                self._part = part  # a signal may come before the file is known
+                self._file = part.open("xb")  # follows no link that somebody put there
         except OSError as error:
             raise RunError(
-                f"{self._target}: cannot be written: {error.strerror}. Give another {self._what}."
+                f"{target}: cannot be written: {error.strerror}. Give another {self._what}."
             ) from None
         return self._file
 
@@ -96,12 +90,11 @@ class Output:
                 if is_kept and self._part is not None:
                     os.fsync(self._file.fileno())
                 self._file.close()
-        if self._part is None or self._target is None or not self._made:
-            return
-        if is_kept:
-            self._part.replace(os.path.realpath(self._target))
-        else:
-            self._part.unlink(missing_ok=True)
+        if self._part is not None and self._target is not None:
+            if is_kept:
+                self._part.replace(os.path.realpath(self._target))
+            else:
+                self._part.unlink(missing_ok=True)
 
 
 def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> str | None:
@@ -111,22 +104,12 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     table, blocks = rows_of(recording, choice)
     if table is None:
         return None
-    count, last_ns = 0, 0
-    writer = _table_writer(out.open(), form, table)
-    try:
-        for block in out.watch(blocks):
-            writer.write(block)
-            count += len(block)
-            last_ns = block.times[-1] - table.origin_ns
-        writer.close()
-    except BaseException:
-        writer.discard()
-        raise
-    out.is_whole = True
-    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {last_ns / 1e9:.3f} s"
+    count, last_ns = _write_all(_table_writer(out.open(), form, table), blocks, out)
+    lasted = last_ns - table.origin_ns
+    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {lasted / 1e9:.3f} s"
 
 
-def _table_writer(file: IO[bytes], form: str, table: "Table") -> "ParquetTable | TextTable":
+def _table_writer(file: IO[bytes], form: str, table: "Table") -> Any:
     """What has ``write`` for blocks of rows; RunError where a library is missing."""
     if form == "parquet":
         from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
@@ -146,31 +129,20 @@ def to_log(
 ) -> str | None:
     """To a log of CAN frames (a format of can_logs), from ``start_ns`` to ``end_ns`` after the recording's first frame."""
     from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
-    from kontronik_can_gw.desk.recordings.tables.rows import first_of, limits
+    from kontronik_can_gw.desk.recordings.recording import time_at
+    from kontronik_can_gw.desk.recordings.tables.rows import cut, first_of
 
     first, batches = first_of(filter(len, recording.batches()))
     if first is None:
         return None
-    origin_ns = _time_at(first, 0)
+    origin_ns = time_at(first, 0)
     wall_ns = recording.wall_ns(origin_ns)
-    first, batches = first_of(_cut(batches, *limits(start_ns, end_ns, origin_ns)))
+    first, batches = first_of(cut(batches, start_ns, end_ns, origin_ns))
     if first is None:
         return None
-    begins, channel = _time_at(first, 0) - origin_ns, recording.channel
-    writer = CanLogWriter(
-        out.open(), form, wall_ns, begins, channel, out.name, recording.provenance
-    )
-    count = 0
-    try:
-        for frames in out.watch(batches):
-            writer.write_all(frames, origin_ns)
-            count += len(frames)
-            last_ns = _time_at(frames, -1)
-        writer.close()
-    except BaseException:
-        writer.discard()
-        raise
-    out.is_whole = True
+    known = wall_ns, origin_ns, recording.channel, recording.provenance
+    writer = CanLogWriter(out.open(), form, *known)
+    count, last_ns = _write_all(writer, batches, out)
     lasted = last_ns - origin_ns
     frames_written = _many(count - sum(writer.left_out.values()), "CAN frame")
     summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
@@ -182,25 +154,22 @@ def to_log(
     return summary
 
 
-def _time_at(frames: "Frames | list[TimedFrame]", index: int) -> int:
-    found: int = frames[index].time_ns if isinstance(frames, list) else frames.times[index]
-    return found
+def _write_all(writer: Any, items: Iterator[Any], out: Output) -> tuple[int, int]:
+    """Write blocks of rows or batches of frames; how many of these, and the time of the last."""
+    from kontronik_can_gw.desk.recordings.recording import time_at
 
-
-def _cut(
-    batches: "Iterator[Frames | list[TimedFrame]]", low_ns: int, high_ns: int
-) -> "Iterator[Frames | list[TimedFrame]]":
-    """The frames from one time to another, both included. No batch is empty."""
-    for frames in batches:
-        if _time_at(frames, 0) > high_ns + _DISORDER_NS:
-            return
-        if isinstance(frames, list):
-            found: Any = [one for one in frames if low_ns <= one.time_ns <= high_ns]
-        else:
-            begin = bisect_left(frames.times, low_ns)
-            found = frames.part(begin, max(begin, bisect_right(frames.times, high_ns)))
-        if len(found):
-            yield found
+    count = last_ns = 0
+    try:
+        for some in out.watch(items):
+            writer.write(some)
+            count += len(some)
+            last_ns = time_at(some, -1)
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
+    out.is_whole = True
+    return count, last_ns
 
 
 def to_bytes(recording: "Input", out: Output, esc: int) -> str | None:

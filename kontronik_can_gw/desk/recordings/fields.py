@@ -2,13 +2,25 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
+
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps, values_of_esc
+from kontronik_can_gw.esc.values import Value as EscValue
+from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.signals.unpacker import Value
 
 TIME = "Time"
 UTC = "Utc"
 _OWN = (TIME, UTC)
+Read = Callable[[Any, GatewayStatus, int], Value]
+"""Gives a value of an EscTelemetry (None for one of the gateway), or of the GatewayStatus, at a time; None where it is not fresh."""
+LEFT_OUT = frozenset({"sent_frames"})
+"""Only the frames themselves show it: they are not made for a table."""
+_ORDER = (Group.LIVE, Group.LINK, Group.INFO, Group.GATEWAY)
 
 
 class Kind(Enum):
@@ -38,11 +50,72 @@ class Field:
     """Name of the signal in the DBC, of a value that came in a CAN frame."""
     high: float = math.inf
     """The greatest value, at which a counter begins again."""
+    value: EscValue | None = None
+    """As its ESC supplies it, of a value that came of its bytes."""
 
     @property
     def header(self) -> str:
         """Name with unit: ``battery_voltage [V]``."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def reader(self) -> Read:
+        """Gives the value, or its text."""
+        value = self.value
+        assert value is not None
+        names, is_whole = value.names, self.kind in (Kind.FLAG, Kind.WHOLE)
+
+        def read(esc: Any, status: GatewayStatus, now: int) -> Value:
+            found = steps(value, esc, status, now)
+            if found is None:
+                return None
+            if names:
+                return names.get(found)
+            return int(found) if is_whole else physical(value, esc, found)
+
+        return read
+
+
+@dataclass(frozen=True)
+class Table:
+    """The frame of a table. ``has_utc``: its rows have Unix times. ``origin_ns``: the recording's time at the table's time 0."""
+
+    fields: Sequence[Field]
+    has_utc: bool
+    origin_ns: int = 0
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+
+def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
+    """A field for each value, of all ESCs and then of the gateway; with several ESCs named ``esc1.battery_voltage``."""
+    found = []
+    for index, esc in [*enumerate(escs), (None, None)]:
+        prefix = f"{esc.name}." if esc is not None and len(escs) > 1 else ""
+        every = (VALUES if esc is None else values_of_esc(esc)).values()
+        for group in _ORDER:
+            found += [
+                _field(value, prefix, index)
+                for value in every
+                if value.group is group
+                and (group is Group.GATEWAY) is (esc is None)
+                and value.supplied
+                and value.name not in LEFT_OUT
+            ]
+    return found
+
+
+def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
+    texts = tuple(sorted(value.names.items()))
+    high = math.inf if value.high is None else value.high / value.per_unit
+    kind = Kind.FLOAT
+    if value.names:
+        kind = Kind.TEXT
+    elif value.bit is not None:
+        kind = Kind.FLAG
+    elif value.per_unit == 1 and value.divisor is Divisor.ONE:
+        kind = Kind.WHOLE
+    name = prefix + value.name
+    return Field(name, value.unit, kind, "", texts, value.name, esc, high=high, value=value)
 
 
 def distinct(fields: Sequence[Field]) -> list[Field]:
@@ -65,13 +138,3 @@ def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | No
     """Index of the first field with a value of values.py; None where there is none."""
     places = (i for i, one in enumerate(fields) if (one.source, one.esc) == (source, esc))
     return next(places, None)
-
-
-@dataclass(frozen=True)
-class Table:
-    """The frame of a table. ``has_utc``: its rows have Unix times. ``origin_ns``: the recording's time at the table's time 0."""
-
-    fields: Sequence[Field]
-    has_utc: bool
-    origin_ns: int = 0
-    provenance: Mapping[str, str] = field(default_factory=dict)

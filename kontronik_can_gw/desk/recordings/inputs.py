@@ -8,28 +8,26 @@ from pathlib import Path
 
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.bytes_input import LIVE_RATE, UART_MAGIC, BytesInput
+from kontronik_can_gw.desk.recordings.bytes_input import UART_MAGIC, BytesInput
 from kontronik_can_gw.desk.recordings.can_logs.log import NAMES, SUFFIXES, log_format
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.log_input import CanLogInput
 from kontronik_can_gw.desk.recordings.recording import Input
-from kontronik_can_gw.desk.recordings.spool import spooled
 from kontronik_can_gw.errors import RunError, UserError
 
-__all__ = ["LIVE_RATE", "BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
+__all__ = ["BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
 
 _HEAD = 1 << 16
 
 
-def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE) -> Input:
+def open_input(path: Path, layout: BusLayout | None = None) -> Input:
     """Open a recording. UserError for other files, RunError for what cannot be read.
 
-    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run; a pipe, or ``-`` for
-    standard input, which is read to its end first. ``layout``: of CAN logs and plain
-    bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
+    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run. ``layout``: of CAN
+    logs and plain bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
     """
-    path = spooled(path)
+    _check_kind(path)
     parts = _parts(path)
     if parts is not None:
         return CaptureInput(parts, layout)
@@ -46,7 +44,7 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         return CanLogInput(path, layout, found)
     if UART_MAGIC in head:
-        return BytesInput(path, layout, live_rate)
+        return BytesInput(path, layout)
     if (called := SUFFIXES.get(path.suffix.lower())) is not None:
         raise UserError(
             f"{path}: is no {NAMES[called]}, whatever its name says, and no other recording"
@@ -56,9 +54,18 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
     )
 
 
-def open_bytes(path: Path, layout: BusLayout | None, live_rate: float) -> Input:
+def open_bytes(path: Path, layout: BusLayout | None) -> Input:
     """Open the bytes of one ESC, whatever is in them."""
-    return BytesInput(spooled(path), layout, live_rate)
+    _check_kind(path)
+    return BytesInput(path, layout)
+
+
+def _check_kind(path: Path) -> None:
+    """UserError for a pipe or a device. None is opened: it might be the port of an ESC."""
+    if str(path) == "-" or (path.exists() and not path.is_file() and not path.is_dir()):
+        raise UserError(
+            f"{path}: is no file. What comes through a pipe is written into one first: COMMAND > FILE"
+        )
 
 
 def _parts(path: Path) -> list[Path] | None:

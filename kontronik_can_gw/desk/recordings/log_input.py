@@ -7,7 +7,7 @@ from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs.log import reader_of
-from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS, Damage
+from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import Input, Sample
@@ -25,18 +25,16 @@ class CanLogInput(Input):
     """A log of CAN frames. UserError for a table in MF4, RunError where it cannot be read."""
 
     def __init__(self, path: Path, layout: BusLayout, format_: str) -> None:
-        self.format = format_
         super().__init__(str(path), layout)
-        self._path = path
+        self._path, self._format = path, format_
         self._open()
 
     def _open(self) -> None:
-        self._damage = Damage()
         try:
             self._file = self._path.open("rb")
         except OSError as error:
             raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
-        self._reader = reader_of(self.format)(self._file, self._damage)
+        self._reader = reader_of(self._format)(self._file)
 
     def batches(self) -> Iterator[list[TimedFrame]]:
         frames = self.frames()
@@ -54,30 +52,26 @@ class CanLogInput(Input):
                 yield item
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
-        self.damage = self._damage.texts()
+        self.damage = self._reader.damage
 
     def _in_time(self) -> Iterator[TimedFrame]:
         """Left out is what has a time that leads far away and back: a digit or a bit of it is damaged."""
         last: TimedFrame | None = None
-        doubtful: TimedFrame | None = None
         wrong = 0
-        for item in self._reader:
-            if last is None or _follows(item, last):
-                wrong += doubtful is not None
-            elif doubtful is not None and _follows(item, doubtful):
-                # two agree: the clock was set, or the first frame was the damaged one
-                yield doubtful
+        frames = iter(self._reader)
+        item = next(frames, None)
+        while item is not None:
+            after = next(frames, None)
+            # where two agree the clock was set, or the first frame was the damaged one
+            if last is None or _follows(item, last) or after is None or _follows(after, item):
+                last = item
+                yield item
             else:
-                wrong += doubtful is not None
-                doubtful = item
-                continue
-            doubtful, last = None, item
-            yield item
-        if doubtful is not None:
-            yield doubtful
+                wrong += 1
+            item = after
         if wrong:
             plural = "s" if wrong > 1 else ""
-            self._damage.notes.append(f"{wrong} frame{plural} with an impossible time left out")
+            self._reader.damage.append(f"{wrong} frame{plural} with an impossible time left out")
 
     @cached_property
     def fields(self) -> Sequence[Field]:

@@ -1,17 +1,18 @@
 """Recordings of what ESCs sent are played through the gateway's core: the one in C at full speed (native/player.py), else Python's."""
 
 from abc import abstractmethod
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.capture.format import Entry
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.desk.recordings.columns import values_of_fields
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample, timed
+from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.gateway import Gateway, MakeOutput
 from kontronik_can_gw.native import load
@@ -29,11 +30,15 @@ class PlayedInput(Input):
 
     created_ns = 0
     """When the gateway was made: its cycles count from there."""
+    marked = False
+    """True: the gateway's state in the frames is REPLAY."""
 
     def __init__(self, name: str, bus: BusLayout, setup: CaptureSetup) -> None:
         super().__init__(name, bus)
         self.setup = setup
         self.sent_layout = bus.layout
+        self._offsets: list[tuple[int, int]] = []
+        """From when on, in the order of time, Unix time is so much more than the recording's."""
 
     @abstractmethod
     def entries(self) -> Iterator[Entry]:
@@ -41,24 +46,17 @@ class PlayedInput(Input):
 
     @abstractmethod
     def _play(
-        self, gateway: Gateway, player: "Player | None" = None, marked: bool = False
+        self, gateway: Gateway, player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
         """Give all that was recorded to a gateway, or to the player of its core; the CAN frames that were sent and received."""
 
-    def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
-        for frames in self.batches(marked):
-            yield from timed(frames)
-
-    def batches(self, marked: bool = False) -> "Iterator[list[TimedFrame] | Frames]":
-        """``marked``: the gateway's state in the frames is REPLAY."""
-
+    def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
         def make(_: Sequence[MakeOutput] = ()) -> Gateway:
             return self.setup.gateway(self.sent_layout, self.created_ns)
 
         has_frames_of_its_own = self.setup.canopen is not None or self.setup.outputs
         found = None if has_frames_of_its_own else self._player_of(make, None)
-        player, gateway = found or (None, make())
-        return self._play(gateway, player, marked)
+        return self._play(*(found or (make(),)))
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         fields = [self.fields[index] for index in chosen]
@@ -73,11 +71,11 @@ class PlayedInput(Input):
         yield from makers[0].finish()
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
-        fields = [self.fields[index] for index in self._chosen(chosen)]
+        fields = self.fields if chosen is None else [self.fields[index] for index in chosen]
         found = self._player_of(self._silent_gateway, fields)
         return super().blocks(chosen) if found is None else self._played(*found)
 
-    def _played(self, player: "Player", gateway: Gateway) -> Iterator[Block]:
+    def _played(self, gateway: Gateway, player: "Player") -> Iterator[Block]:
         is_first = True
         for _ in self._play(gateway, player):
             if player.is_full or (is_first and player.has_rows):
@@ -87,7 +85,11 @@ class PlayedInput(Input):
 
     def _timed(self, rows: "Rows") -> Iterator[Block]:
         """Blocks of rows in which the wall clock goes on as it began."""
-        yield PlayedBlock(rows, 0, rows.count, None)
+        times = rows.times
+        cuts = {bisect_left(times, since) for since, _ in self._offsets}
+        for begin, end in pairwise(sorted({0, rows.count, *cuts})):
+            wall_ns = self.wall_ns(times[begin])
+            yield PlayedBlock(rows, begin, end, None if wall_ns is None else wall_ns - times[begin])
 
     def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
         """Without messages; nodes are there, because they may change pole pairs and gear."""
@@ -102,8 +104,8 @@ class PlayedInput(Input):
 
     def _player_of(
         self, make: Callable[[Sequence[MakeOutput]], Gateway], fields: Sequence[Field] | None
-    ) -> "tuple[Player, Gateway] | None":
-        """What plays at once, for rows of ``fields`` or for frames (None), and the gateway that it plays. None: Python must."""
+    ) -> "tuple[Gateway, Player] | None":
+        """A gateway, and what plays it at once for rows of ``fields`` or for frames (None). None: Python must."""
         if self.setup.version == 1 or load.library()[0] is None:
             return None
         from kontronik_can_gw.native.offline import ColumnOf
@@ -112,8 +114,7 @@ class PlayedInput(Input):
 
         columns = None
         if fields is not None:
-            found = values_of_fields(fields, self.bus.escs)
-            columns = [ColumnOf(value, field.esc) for field, value in found]
+            columns = [ColumnOf(cast(Any, field.value), field.esc) for field in fields]
         player = Player(columns)
         gateway = make(() if fields is None else (lambda *_: player,))
         if gateway.core.language != "C":
@@ -122,4 +123,4 @@ class PlayedInput(Input):
             player.bind(cast(Any, gateway.core), self.created_ns)
         except NotInCore:
             return None
-        return player, gateway
+        return gateway, player

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.columns import Values, fields_of_values
-from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.recordings.fields import Field, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.signals.unpacker import SignalReader
+from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames, Rows
@@ -26,7 +25,7 @@ class Sample(NamedTuple):
     """A row. ``values``: in the order of the columns."""
 
     time_ns: int
-    values: Values
+    values: tuple[Value, ...]
 
 
 class Block:
@@ -52,15 +51,10 @@ class Block:
         columns = [column[begin:end] for column in self._columns]
         return Block(self.times[begin:end], columns, self.wall_ns)
 
-    def between(self, low_ns: int, high_ns: int) -> "Block":
+    def between(self, low_ns: int, high_ns: int) -> Self:
         """The rows from one time to another, both included."""
-        begin = bisect_left(self.times, low_ns)
-        return self.part(begin, max(begin, bisect_right(self.times, high_ns)))
-
-    def pick(self, rows: Sequence[int]) -> "Block":
-        """The rows with these numbers."""
-        columns = [[column[row] for row in rows] for column in self.columns]
-        return Block([self.times[row] for row in rows], columns, self.wall_ns)
+        found: Self = between(self, low_ns, high_ns)
+        return found
 
     def rows(self) -> Iterator[Sample]:
         """The rows one by one."""
@@ -137,7 +131,7 @@ class Input(ABC):
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
         """Rows of the values of ``chosen`` fields, in that order; None: of all."""
-        samples = self.samples_in_python(self._chosen(chosen))
+        samples = self.samples_in_python(range(len(self.fields)) if chosen is None else chosen)
         found = ((self._wall_of(row), *row) for row in samples)
         while some := list(islice(found, ROWS)):
             for wall_ns, rows in groupby(some, itemgetter(0)):
@@ -170,9 +164,6 @@ class Input(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _chosen(self, chosen: Sequence[int] | None) -> Sequence[int]:
-        return range(len(self.fields)) if chosen is None else chosen
-
     def _wall_of(self, row: Sample) -> int | None:
         wall_ns = self.wall_ns(row.time_ns)
         return None if wall_ns is None else wall_ns - row.time_ns
@@ -183,3 +174,17 @@ def timed(frames: "Frames | list[TimedFrame]") -> Iterator[TimedFrame]:
     if isinstance(frames, list):
         return iter(frames)
     return (TimedFrame(time_ns, frame) for time_ns, frame in frames)
+
+
+def time_at(items: Any, index: int) -> int:
+    """Time of one of a Block, Frames or a list of TimedFrames."""
+    found: int = items[index].time_ns if isinstance(items, list) else items.times[index]
+    return found
+
+
+def between(items: Any, low_ns: int, high_ns: int) -> Any:
+    """Those of a Block, Frames or a list of TimedFrames that are from one time to another, both included."""
+    if isinstance(items, list):
+        return [one for one in items if low_ns <= one.time_ns <= high_ns]
+    begin = bisect_left(items.times, low_ns)
+    return items.part(begin, max(begin, bisect_right(items.times, high_ns)))

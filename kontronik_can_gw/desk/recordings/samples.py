@@ -9,8 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.recordings.columns import Read, reader_of, values_of_fields
-from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct
+from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
 from kontronik_can_gw.desk.recordings.recording import Sample
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES
@@ -51,11 +50,10 @@ class RowMaker(Output):
         self._gateway_ns = now - GATEWAY_NS
         self._readers: dict[int | None, list[tuple[int, Read]]] = {}
         self._ages: list[tuple[int, int, Read]] = []
-        found = values_of_fields(fields, [esc.settings for esc in escs])
-        for index, (field, value) in enumerate(found):
-            self._readers.setdefault(field.esc, []).append((index, reader_of(value)))
-            if value.kind is How.AGE and field.esc is not None:
-                self._ages.append((field.esc, index, reader_of(value)))
+        for index, field in enumerate(fields):
+            self._readers.setdefault(field.esc, []).append((index, field.reader))
+            if field.value and field.value.kind is How.AGE and field.esc is not None:
+                self._ages.append((field.esc, index, field.reader))
 
     def take_rows(self) -> Sequence[Sample]:
         """The rows that are complete."""

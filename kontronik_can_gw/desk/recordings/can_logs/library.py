@@ -19,7 +19,7 @@ from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs.text import (
     OLDEST_WALL_S,
     SECOND_NS,
-    Damage,
+    LogReader,
     frame_of,
 )
 from kontronik_can_gw.errors import RunError, UserError
@@ -38,15 +38,10 @@ _MIN_OBJECT, _MAX_OBJECT = 32, 1 << 20
 _MS = 1_000_000
 
 
-class LibraryReader:
+class LibraryReader(LogReader):
     """Frames of a log by one of python-can's readers."""
 
-    wall_start_ns: int | None = None
     _reader: Any = None
-
-    def __init__(self, file: BinaryIO, damage: Damage) -> None:
-        self._file = file
-        self._damage = damage
 
     def __iter__(self) -> Iterator[TimedFrame]:
         done = wrong = 0
@@ -60,12 +55,9 @@ class LibraryReader:
                     except ValueError:
                         wrong += 1
         except Exception as error:  # whatever a damaged file makes of it
-            self._damage.notes.append(f"damaged after {done} frames ({_short(error)})")
+            self.damage.append(f"damaged after {done} frames ({_short(error)})")
         if wrong:
-            self._damage.notes.append(f"{wrong} damaged frame{'s' if wrong > 1 else ''} left out")
-
-    def close(self) -> None:
-        """Release what the library holds."""
+            self.damage.append(f"{wrong} damaged frame{'s' if wrong > 1 else ''} left out")
 
 
 class _SoundObjects(BLFReader):
@@ -86,19 +78,19 @@ class _SoundObjects(BLFReader):
 class BlfReader(LibraryReader):
     """BLF."""
 
-    def __init__(self, file: BinaryIO, damage: Damage) -> None:
-        super().__init__(file, damage)
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__(file)
         size = os.fstat(file.fileno()).st_size
         try:
             self._reader = reader = _SoundObjects(file)
         except (BLFParseError, struct.error, ValueError, OverflowError):
-            damage.notes.append("its header is damaged")
+            self.damage.append("its header is damaged")
             return
         if size < reader.file_size < 1 << 48:
             sizes = f"{size} of its {reader.file_size} bytes are there"
-            damage.notes.append(f"the file is cut off: {sizes}")
+            self.damage.append(f"the file is cut off: {sizes}")
         elif problem := _faulty_size(file, size):
-            damage.notes.append(problem)
+            self.damage.append(problem)
         if reader.start_timestamp >= OLDEST_WALL_S:
             self.wall_start_ns = round(reader.start_timestamp * 1000) * _MS
         reader.start_timestamp = 0.0
@@ -106,7 +98,7 @@ class BlfReader(LibraryReader):
     def __iter__(self) -> Iterator[TimedFrame]:
         yield from super().__iter__()
         if self._reader is not None and self._reader._tail.strip(b"\0"):
-            self._damage.notes.append("the last frame is cut off")
+            self.damage.append("the last frame is cut off")
 
 
 def _faulty_size(file: BinaryIO, end: int) -> str | None:
@@ -125,8 +117,8 @@ def _faulty_size(file: BinaryIO, end: int) -> str | None:
 class Mf4Reader(LibraryReader):
     """MF4 bus logging. RunError where asammdf is missing or cannot read it; UserError for a table."""
 
-    def __init__(self, file: BinaryIO, damage: Damage) -> None:
-        super().__init__(file, damage)
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__(file)
         path = Path(file.name)
         self._reader = reader = _opened(mf4_library().MF4Reader, path)
         start = reader._mdf.header.start_time.timestamp()
@@ -144,7 +136,6 @@ class Mf4Reader(LibraryReader):
         reader._start_timestamp = 0.0
 
     def close(self) -> None:
-        """Close the file."""
         with warnings.catch_warnings(action="ignore"):
             self._reader.stop()
 
@@ -164,20 +155,18 @@ def mf4_library() -> Any:
 
 def _opened(mf4_reader: Any, path: Path) -> Any:
     """The reader; RunError where asammdf cannot read the file."""
-    hook = sys.unraisablehook
-    sys.unraisablehook = lambda _: None  # what is half made complains when it is thrown away
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
-        try:
-            with warnings.catch_warnings(action="ignore"):
-                reader = mf4_reader(os.fspath(path))
-                reader._mdf.header.start_time.timestamp()
-                return reader
-        except Exception as error:  # whatever a damaged file makes of it
-            reason = _short(error)
-        gc.collect()
-        raise RunError(f"{path}: cannot be read as MF4: {reason}.")
+        with warnings.catch_warnings(action="ignore"):
+            reader = mf4_reader(os.fspath(path))
+            reader._mdf.header.start_time.timestamp()
+            return reader
+    except Exception as error:  # whatever a damaged file makes of it
+        reason = _short(error)
     finally:
+        gc.collect()  # what is half made complains when it is thrown away
         sys.unraisablehook = hook
+    raise RunError(f"{path}: cannot be read as MF4: {reason}.")
 
 
 def _short(error: Exception) -> str:

@@ -1,7 +1,6 @@
 """The format of a CAN log, by its content, and what reads it."""
 
 from collections.abc import Callable
-from typing import Any
 
 from kontronik_can_gw.desk.recordings.can_logs import text
 
@@ -43,8 +42,8 @@ def log_format(head: bytes, suffix: str) -> str | None:
     return None if head.strip() else SUFFIXES.get(suffix.lower())
 
 
-def reader_of(format_: str) -> Callable[..., Any]:
-    """What reads a format: made from an open file and a Damage, it gives TimedFrames; RunError where a library is missing."""
+def reader_of(format_: str) -> Callable[..., text.LogReader]:
+    """What reads a format, made from an open file; RunError where a library is missing."""
     if format_ in _LINES:
         return {"candump": text.CandumpReader, "asc": text.AscReader}.get(format_, text.TrcReader)
     from kontronik_can_gw.desk.recordings.can_logs import library

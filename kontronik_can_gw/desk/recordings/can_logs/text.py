@@ -50,61 +50,48 @@ def frame_of(message: Any) -> TimedFrame | None:
     return checked(TimedFrame(time_ns, frame, message.is_rx))
 
 
-class Damage:
-    """Counts what cannot be read. Memory stays small however much it is."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-        self._ranges: list[list[int]] = []
-        self._lines = self._last = 0
-
-    def line(self, number: int) -> None:
-        """A line (counted from 1) is no line of this format; a long one may come several times."""
-        if number == self._last:
-            return
-        if self._ranges and self._ranges[-1][1] == number - 1:
-            self._ranges[-1][1] = number
-        elif len(self._ranges) < _SHOWN:
-            self._ranges.append([number, number])
-        self._last = number
-        self._lines += 1
-
-    def texts(self) -> list[str]:
-        """One line for each kind of damage."""
-        if not self._lines:
-            return self.notes
-        shown = [f"{a}" if a == b else f"{a} to {b}" for a, b in self._ranges]
-        if rest := self._lines - sum(b - a + 1 for a, b in self._ranges):
-            shown.append(f"and {rest} more")
-        plural = "s" if self._lines > 1 else ""
-        return [f"{self._lines} damaged line{plural}: {', '.join(shown)}", *self.notes]
-
-
-class TextReader:
-    """Reads an open log line by line."""
+class LogReader:
+    """Gives the TimedFrames of an open log. ``damage``: what is not intact, a line each; complete at its end."""
 
     wall_start_ns: int | None = None
     """Unix time of the log's time 0; None where it does not say."""
 
-    def __init__(self, file: BinaryIO, damage: Damage) -> None:
+    def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._damage = damage
+        self.damage: list[str] = []
+
+    def close(self) -> None:
+        """Release what is held beside the file."""
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        raise NotImplementedError
+
+
+class TextReader(LogReader):
+    """Reads a log line by line."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__(file)
         self._read_head([file.readline(LONGEST_LINE) for _ in range(_HEAD_LINES)])
         file.seek(0)
 
-    def close(self) -> None:
-        """Nothing is held."""
-
     def __iter__(self) -> Iterator[TimedFrame]:
-        number = 1
+        number, last, count = 1, 0, 0
+        shown: list[str] = []
         while line := self._file.readline(LONGEST_LINE):
             try:
                 item = self._frame(line) if line.strip() else None
                 if item is not None:
                     yield checked(item)
             except (ValueError, LookupError):  # of numbers, texts, lengths
-                self._damage.line(number)
+                if number != last:  # a long line comes several times
+                    last, count = number, count + 1
+                    shown += [str(number)] * (count <= _SHOWN)
             number += line.endswith(b"\n")
+        if count:
+            more = f" and {count - _SHOWN} more" if count > _SHOWN else ""
+            plural = "s" if count > 1 else ""
+            self.damage.insert(0, f"{count} damaged line{plural}: {', '.join(shown)}{more}")
 
     def _read_head(self, lines: list[bytes]) -> None:
         """Find out what the log says of itself."""
@@ -260,10 +247,10 @@ class TrcReader(TextReader):
         try:
             parser._extract_header()
         except (ValueError, OverflowError):
-            self._damage.notes.append("its head is damaged")
+            self.damage.append("its head is damaged")
         if parser.file_version is TRCFileVersion.UNKNOWN and _NEWER_TRC.search(head):
             parser._parse_cols = lambda _: None
-            self._damage.notes.append("its file version is not known")
+            self.damage.append("its file version is not known")
         if parser._start_time >= OLDEST_WALL_S:
             self.wall_start_ns = round(parser._start_time * 1e6) * 1000
         parser._start_time = 0.0

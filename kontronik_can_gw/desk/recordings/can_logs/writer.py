@@ -11,7 +11,6 @@ from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
 from kontronik_can_gw.desk.recordings.recording import timed
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
 if TYPE_CHECKING:
@@ -22,80 +21,68 @@ if TYPE_CHECKING:
 
 _MS = 1_000_000
 _LATEST_NS = 1 << 61
+"""Of what the core in C writes as text."""
 
 
 class CanLogWriter:
     """Writes one log.
 
-    ``file``: open for bytes, stays open. ``wall_start_ns``: Unix time in ns of time 0, None where unknown.
-    ``first_ns``: time of the first frame, where an ASC, BLF, TRC or MF4 file with the Unix time begins.
-    ``name``: what the file will be called (TRC says it). ``provenance``: for the header of MF4, as it is known at the end.
+    ``file``: open for bytes, stays open. ``wall_ns``: Unix time at ``origin_ns``, the log's time 0; None where unknown.
+    ``provenance``: for the header of MF4, as it is known at the end.
     """
 
-    write: Callable[[int, CanFrame, bool], None]
-    """Add a frame: its time in ns, the frame, whether it was received."""
+    write: "Callable[[Frames | list[TimedFrame]], None]"
+    """Add frames."""
 
     def __init__(
         self,
         file: IO[bytes],
         format_: str,
-        wall_start_ns: int | None,
-        first_ns: int = 0,
+        wall_ns: int | None,
+        origin_ns: int = 0,
         channel: str = "can0",
-        name: str = "",
         provenance: Mapping[str, str] | None = None,
     ) -> None:
         self.left_out: dict[str, int] = {}
         """Frames that the format does not know, by what they are."""
-        self._at_once: Callable[[Frames, int], object] | None = None
         self.close: Callable[[], object] = lambda: None
         """Write what is held back, and the end. The file stays open."""
         self.discard: Callable[[], object] = lambda: None
         """Release what is held, where the log is not to be kept."""
-        self._base_ns = start_ns = 0
-        if wall_start_ns is not None:
+        self._base_ns, start_ns = origin_ns, 0
+        if wall_ns is not None:
             # Vector's and PEAK's headers count milliseconds, those of MF4 are read as microseconds
             unit = 1000 if format_ == "mf4" else _MS
-            start_ns = (wall_start_ns + first_ns) // unit * unit
-            self._base_ns = start_ns - wall_start_ns
+            start_ns = wall_ns // unit * unit
+            self._base_ns = start_ns - wall_ns + origin_ns
         match format_:
             case "candump":
-                self._candump(file, wall_start_ns or 0, channel)
+                self._candump(file, (wall_ns or 0) - origin_ns, channel)
             case "asc":
-                self._asc(file, None if wall_start_ns is None else start_ns)
+                self._asc(file, None if wall_ns is None else start_ns)
             case "blf":
                 self._blf(file, start_ns)
             case "trc":
-                self._trc(file, start_ns, name)
+                self._trc(file, start_ns)
             case _:
                 self._mf4(file, start_ns, provenance or {})
 
-    def write_all(self, frames: "Frames | list[TimedFrame]", origin_ns: int) -> None:
-        """Add frames, whose times are those of a recording that begins at ``origin_ns``."""
-        if self._at_once is not None and not isinstance(frames, list):
-            self._at_once(frames, origin_ns)
-            return
-        write = self.write
-        for time_ns, frame, received in timed(frames):
-            write(time_ns - origin_ns, frame, received)
+    def _candump(self, file: IO[bytes], offset_ns: int, channel: str) -> None:
+        half = 500 + offset_ns
 
-    def _candump(self, file: IO[bytes], wall_start_ns: int, channel: str) -> None:
-        half = 500 + wall_start_ns
-
-        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
-            us = (time_ns + half) // 1000
-            can_id, data, extended, fd = frame[:4]
-            flags = "#1" if fd else ""  # with a switched bit rate, as the gateway sends them
-            name = f"{can_id:08X}" if extended else f"{can_id:03X}"
-            end = "R" if received else "T"
-            line = f"({us // 1000000}.{us % 1000000:06d}) {channel} {name}#{flags}{data.hex().upper()} {end}\n"
-            file.write(line.encode("ascii"))
+        def write(frames: "Frames | list[TimedFrame]") -> None:
+            if not isinstance(frames, list) and 0 <= frames.times[0] + half < _LATEST_NS:
+                file.write(frames.candump(half, channel))
+                return
+            for time_ns, (can_id, data, extended, fd, *_), received in timed(frames):
+                us = (time_ns + half) // 1000
+                flags = "#1" if fd else ""  # with a switched bit rate, as the gateway sends them
+                name = f"{can_id:08X}" if extended else f"{can_id:03X}"
+                end = "R" if received else "T"
+                line = f"({us // 1000000}.{us % 1000000:06d}) {channel} {name}#{flags}{data.hex().upper()} {end}\n"
+                file.write(line.encode("ascii"))
 
         self.write = write
-        if 0 <= half < _LATEST_NS:
-            self._at_once = lambda frames, origin_ns: file.write(
-                frames.candump(half - origin_ns, channel)
-            )
 
     def _asc(self, file: IO[bytes], start_ns: int | None) -> None:
         with without_asammdf():
@@ -132,12 +119,12 @@ class CanLogWriter:
 
         self.close = close
 
-    def _trc(self, file: IO[bytes], start_ns: int, name: str) -> None:
+    def _trc(self, file: IO[bytes], start_ns: int) -> None:
         with without_asammdf():
             from can import TRCWriter
         text = io.TextIOWrapper(file, encoding="utf-8", newline="\r\n", write_through=True)
-        writer = TRCWriter(_Unclosed(text, name=name))
-        writer.filepath = name
+        writer = TRCWriter(_Unclosed(text))
+        writer.filepath = "kontronik-can-gw"
         writer.first_timestamp = 0.0
         writer.header_written = True
         writer.write_header(start_ns // _MS / 1000)
@@ -182,18 +169,19 @@ class CanLogWriter:
         """Write by one of python-can's writers. Times go in seconds since the start, for which a float is exact enough."""
         from can import Message
 
-        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
-            take(
-                Message(
-                    (max(time_ns - self._base_ns, 0) + more_ns) / SECOND_NS,
-                    frame.can_id,
-                    frame.extended,
-                    data=frame.data,
-                    is_fd=frame.fd,
-                    bitrate_switch=frame.fd,
-                    is_rx=received,
+        def write(frames: "Frames | list[TimedFrame]") -> None:
+            for time_ns, frame, received in timed(frames):
+                take(
+                    Message(
+                        (max(time_ns - self._base_ns, 0) + more_ns) / SECOND_NS,
+                        frame.can_id,
+                        frame.extended,
+                        data=frame.data,
+                        is_fd=frame.fd,
+                        bitrate_switch=frame.fd,
+                        is_rx=received,
+                    )
                 )
-            )
 
         self.write = write
 
@@ -201,9 +189,10 @@ class CanLogWriter:
 class _Unclosed:
     """A file that does not let its writer close it."""
 
-    def __init__(self, file: Any, **more: Any) -> None:
+    name = ""
+
+    def __init__(self, file: Any) -> None:
         self._file = file
-        self.__dict__ |= more
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)

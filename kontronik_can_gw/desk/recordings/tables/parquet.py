@@ -31,20 +31,14 @@ class ParquetTable:
         self._pa: Any = pa
         self._compute: Any = compute
         self._table = table
-        # the same text may stand for several numbers
-        self._codes = [
-            {text: code for code, text in enumerate(dict.fromkeys(text for _, text in one.texts))}
-            for one in table.fields
-        ]
-        self._texts = [pa.array(list(codes), pa.string()) for codes in self._codes]
-        self._numbers = [
+        self._texts = [
             (
                 pa.array([number for number, _ in one.texts], pa.int64()),
-                pa.array([codes[text] for _, text in one.texts], pa.int32()),
+                pa.array([text for _, text in one.texts], pa.string()),
             )
-            for one, codes in zip(table.fields, self._codes, strict=True)
+            for one in table.fields
         ]
-        """Of a column of texts: its numbers, and the place in ``_texts`` of each."""
+        """Of a column of texts: its numbers, and the text of each."""
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
             heads.append(pa.field(UTC, pa.timestamp("ns", tz="UTC")))
@@ -89,7 +83,7 @@ class ParquetTable:
         arrays += [
             self._played(block, index, one)
             if isinstance(block, PlayedBlock)
-            else self._plain(block, index, one)
+            else pa.array(block.columns[index], self._type(one))
             for index, one in enumerate(self._table.fields)
         ]
         self._batches.append(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
@@ -107,14 +101,6 @@ class ParquetTable:
         with suppress(OSError):  # there is no room for its end
             self._writer.close()
 
-    def _plain(self, block: Block, index: int, one: Field) -> Any:
-        """A column of values."""
-        pa, values = self._pa, block.columns[index]
-        if one.kind is not Kind.TEXT:
-            return pa.array(values, self._type(one))
-        found = pa.array(map(self._codes[index].get, values), pa.int32())
-        return pa.DictionaryArray.from_arrays(found, self._texts[index])
-
     def _played(self, block: PlayedBlock, index: int, one: Field) -> Any:
         """A column of the core in C, as it is."""
         pa, made, begin, end = self._pa, block.made, block.begin, block.end
@@ -125,15 +111,14 @@ class ParquetTable:
             return found.cast(pa.int8(), safe=False)
         if one.kind is not Kind.TEXT:
             return found
-        numbers, places = self._numbers[index]
-        codes = places.take(self._compute.index_in(found, numbers))
-        return pa.DictionaryArray.from_arrays(codes, self._texts[index])
+        numbers, texts = self._texts[index]
+        return texts.take(self._compute.index_in(found, numbers)).dictionary_encode()
 
     def _write_group(self) -> None:
         if self._batches:
             table = self._pa.Table.from_batches(self._batches, self._schema)
             self._batches, self._held = [], 0
-            self._writer.write_table(table, GROUP)
+            self._writer.write_table(table.unify_dictionaries(), GROUP)
 
     def _type(self, one: Field) -> Any:
         pa = self._pa

@@ -1,4 +1,4 @@
-"""Rows of a table out of a recording: which columns, from when to when, how many a second."""
+"""Rows of a table out of a recording: which columns, from when to when."""
 
 import fnmatch
 from collections.abc import Iterator, Sequence
@@ -8,33 +8,27 @@ from itertools import chain
 from typing import Any, TypeVar
 
 from kontronik_can_gw.desk.recordings.fields import Field, Table
-from kontronik_can_gw.desk.recordings.recording import Block, Input
+from kontronik_can_gw.desk.recordings.recording import Block, Input, between, time_at
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import SECOND
 
 LATEST_NS = 1 << 63
 """Later than any time of a recording."""
+_DISORDER_NS = 1_000_000_000
+"""How far frames of several interfaces may stand out of order."""
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a recording is wanted. Times in ns since its start, ``end_ns`` included; ``rate``: rows a second."""
+    """What of a recording is wanted. Times in ns since its start, ``end_ns`` included."""
 
     columns: Sequence[int]
     start_ns: int | None = None
     end_ns: int | None = None
-    rate: float | None = None
 
     @classmethod
-    def of(
-        cls,
-        fields: Sequence[Field],
-        names: Sequence[str] = (),
-        esc: int | None = None,
-        **times: Any,
-    ) -> "Choice":
-        """The fields with one of these names (with * and ?), of one ESC. UserError for a name that fits none.
+    def of(cls, fields: Sequence[Field], names: Sequence[str] = (), **times: Any) -> "Choice":
+        """The fields with one of these names (with * and ?). UserError for a name that fits none.
 
         Case, underscores and dots do not matter, nor ``Percent`` at the end. With several ESCs a name may be that of a value alone; of
         a CAN log it may be the signal's.
@@ -61,10 +55,7 @@ class Choice:
             chosen |= dict.fromkeys(found)
         if problems:
             raise UserError(*problems)
-        columns = [index for index in chosen if esc is None or fields[index].esc == esc]
-        if not columns:
-            raise UserError("no signal is left: --esc and --signals leave out each other's")
-        return cls(columns, **times)
+        return cls([*chosen], **times)
 
 
 def _plain(name: str) -> str:
@@ -77,10 +68,16 @@ def first_of(items: Iterator[T]) -> tuple[T | None, Iterator[T]]:
     return first, items if first is None else chain((first,), items)
 
 
-def limits(start_ns: int | None, end_ns: int | None, origin_ns: int) -> tuple[int, int]:
-    """Two times after ``origin_ns`` on the recording's clock; None: no limit."""
+def cut(
+    items: Iterator[Any], start_ns: int | None, end_ns: int | None, origin_ns: int
+) -> Iterator[Any]:
+    """What of Blocks, or of batches of frames, is from one time after ``origin_ns`` to another, both included; None: no limit."""
     low = -LATEST_NS if start_ns is None else start_ns + origin_ns
-    return low, LATEST_NS if end_ns is None else end_ns + origin_ns
+    high = LATEST_NS if end_ns is None else end_ns + origin_ns
+    for some in items:
+        if time_at(some, 0) > high + _DISORDER_NS:
+            return
+        yield from filter(len, (between(some, low, high),))
 
 
 def rows_of(recording: Input, choice: Choice) -> tuple[Table | None, Iterator[Block]]:
@@ -89,35 +86,9 @@ def rows_of(recording: Input, choice: Choice) -> tuple[Table | None, Iterator[Bl
     if first is None:
         return None, blocks
     origin_ns = first.times[0]
-    blocks = _cut(blocks, *limits(choice.start_ns, choice.end_ns, origin_ns))
-    if choice.rate is not None:
-        blocks = thinned(blocks, choice.rate, origin_ns)
-    first, blocks = first_of(blocks)
+    first, blocks = first_of(cut(blocks, choice.start_ns, choice.end_ns, origin_ns))
     if first is None:
         return None, blocks
     fields = [recording.fields[index] for index in choice.columns]
     has_utc = recording.wall_ns(origin_ns) is not None
     return Table(fields, has_utc, origin_ns, recording.provenance), blocks
-
-
-def _cut(blocks: Iterator[Block], low_ns: int, high_ns: int) -> Iterator[Block]:
-    for block in blocks:
-        if block.times[0] > high_ns:
-            return
-        yield from filter(len, (block.between(low_ns, high_ns),))
-
-
-def thinned(blocks: Iterator[Block], rate: float, origin_ns: int) -> Iterator[Block]:
-    """At most ``rate`` rows a second: the newest of each period."""
-    period = SECOND / rate
-    held: tuple[float, Block] | None = None
-    for block in blocks:
-        slots = [(time_ns - origin_ns) // period for time_ns in block.times]
-        if held is not None and held[0] != slots[0]:
-            yield held[1]
-        last = len(slots) - 1
-        if newest := [row for row in range(last) if slots[row] != slots[row + 1]]:
-            yield block.pick(newest)
-        held = slots[last], block.pick([last])
-    if held is not None:
-        yield held[1]
