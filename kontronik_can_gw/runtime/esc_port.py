@@ -96,6 +96,7 @@ class EscPort:
             return
         noted = self._noted
         noted.empty_ns, noted.undrained_ns, noted.is_plain = self._clock(), NEVER, False
+        noted.settings[:] = port.settings
         port.discard()  # what came before we listened has no time
         self.port = port
         self.identity = port.identity()
@@ -175,7 +176,8 @@ class EscPort:
             return
         if (counts := self.port.line_errors()) is not self._counted:
             self._count(counts)
-        if not self.port.settings_hold():
+        if not self.port.settings_hold() or self._noted.restored:
+            self._noted.restored = False
             text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
             self._conditions.event(f"{self.name}: settings", text, now)
         self.log.diagnose(self.line_errors, now)

@@ -139,7 +139,7 @@ class Loop:
         """Wait until something has come or is due, and do it."""
         period = self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
         ready = self._turn_in_c(period) if self._poller.is_native else None
-        if ready is None:
+        if in_python := ready is None:
             if self._due is None:
                 self._due = self._next_deadline()
             ready = self._poller.wait(self._now, min(self._now + period, self._due))
@@ -157,7 +157,7 @@ class Loop:
             self._due = None
         self._now = now
         if now >= self._housekeeping.due:
-            self._housekeeping.run(now)
+            self._housekeeping.run(now, in_python)
             self._due = None
 
     def _turn_in_c(self, period: int) -> list[tuple[Handler, int]] | None:

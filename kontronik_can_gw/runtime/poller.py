@@ -31,12 +31,15 @@ class PortInput:
 
     ``empty_ns``: the port was empty then. ``undrained_ns``: the last read left something, which came after this; NEVER: it left
     nothing. ``is_plain``: what comes is to be read and nothing else. ``served``: it was read since this was set to False.
+    ``settings``: as the port was set; ``restored``: C has set it so again, since this was set to False.
     """
 
     def __init__(self) -> None:
         self.empty_ns, self.undrained_ns = 0, NEVER
         self.is_plain = False
         self.served = True
+        self.settings = bytearray()
+        self.restored = False
 
 
 class StuckCheck:
