@@ -170,13 +170,13 @@ class EscPort:
         """True if the loop does not serve this port."""
         return self._stuck.is_stuck(self.port)
 
-    def report(self, now: int) -> None:
-        """Count line errors, look at the port's settings; say why nothing comes."""
+    def report(self, now: int, looks_too: bool = True) -> None:
+        """Count line errors, look at the port's settings (``looks_too`` False: C does); say why nothing comes."""
         if self.port is None:
             return
         if (counts := self.port.line_errors()) is not self._counted:
             self._count(counts)
-        if not self.port.settings_hold() or self._noted.restored:
+        if self._noted.restored or (looks_too and not self.port.settings_hold()):
             self._noted.restored = False
             text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
             self._conditions.event(f"{self.name}: settings", text, now)

@@ -72,7 +72,7 @@ class Housekeeping:
         """One round. ``looks_too`` False: the core in C looks at the ports' settings more often."""
         self.due = now + (LOOK_NS if looks_too else SECOND)
         for esc in self._escs:
-            esc.report(now)
+            esc.report(now, looks_too)
         self._log_conflicts(now)
         self._conditions.advance(now)
         self.follow_recorder(now)

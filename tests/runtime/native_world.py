@@ -14,7 +14,7 @@ from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.native_poller import NativePoller
-from kontronik_can_gw.runtime.poller import Bounds, Handler
+from kontronik_can_gw.runtime.poller import Handler
 from kontronik_can_gw.transmit_queue import Sent
 
 if TYPE_CHECKING:
@@ -80,8 +80,10 @@ class FakeNativePoller(NativePoller):
         self._world.unregister(fd)
         self.changes += 1
 
-    def turn(self, can: CanLink, bounds: Bounds) -> list[tuple[Handler, int]] | None:
-        return super().turn(can, bounds._replace(due=min(bounds.due, self._world.until)))
+    def turn(
+        self, can: CanLink, last: int, due: int, leave: int, period: int
+    ) -> list[tuple[Handler, int]] | None:
+        return super().turn(can, last, min(due, self._world.until), leave, period)
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
