@@ -1,6 +1,6 @@
 """What the gateway knows of itself: its state, that of the CAN controller, counters of frames."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 
@@ -38,3 +38,7 @@ class GatewayStatus:
     """Frames to be sent in order that were lost: too many waited, or the interface was down."""
     id_conflicts: int = 0
     """Frames of others with ids that only this gateway may send with."""
+
+    def frozen(self) -> "GatewayStatus":
+        """What is known now, as a copy that nobody changes: any thread may read it."""
+        return replace(self)

@@ -116,7 +116,9 @@ class IdConflicts:
 
     def next_deadline(self) -> int:
         """When ``advance`` has something to do at the earliest."""
-        return min((each.last + _OVER_NS + 1 for each in self._present.values()), default=NEVER)
+        if not self._present:
+            return NEVER
+        return min(each.last + _OVER_NS + 1 for each in self._present.values())
 
     def take(self) -> list[Conflict]:
         """Conflicts that have begun, or are over, since the last call."""

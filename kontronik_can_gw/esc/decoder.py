@@ -130,6 +130,8 @@ class ErrorBit(IntEnum):
 
 def bit_texts(word: int, names: type[ErrorBit] | Sequence[ErrorBit]) -> list[str]:
     """Names of the bits set in a 32-bit error word, lowest first; a bit without a name is ``bit24`` and the like."""
+    if not word:
+        return []
     known = {int(bit): bit.text for bit in names}
     return [known.get(bit, f"bit{bit}") for bit in range(32) if word >> bit & 1]
 

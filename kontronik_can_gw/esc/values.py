@@ -101,6 +101,10 @@ class Value:
         return self.shift if self.kind is Kind.BITS and self.mask == 1 else None
 
 
+_ONE, _POLE_PAIRS, _OUTPUT = Divisor.ONE, Divisor.POLE_PAIRS, Divisor.OUTPUT
+_PRODUCT = Kind.PRODUCT  # an enumeration's members are slow to look up
+
+
 def steps(value: Value, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int | None:
     """The value now, in steps before the divisor; None: not available."""
     if value.read is not None:
@@ -115,7 +119,7 @@ def steps_of(value: Value, esc: EscTelemetry, reading: Sequence[int] | None) -> 
     if reading is None or not value.words:
         return None
     found = reading[value.words[0]]
-    if value.kind is Kind.PRODUCT:
+    if value.kind is _PRODUCT:
         return found * reading[value.words[1]]
     found = found >> value.shift & value.mask
     return found if not value.not_on or esc.supplies(value.not_on, found) else None
@@ -123,11 +127,11 @@ def steps_of(value: Value, esc: EscTelemetry, reading: Sequence[int] | None) -> 
 
 def divisor(value: Value, esc: EscTelemetry) -> tuple[int, int] | None:
     """Numerator and denominator of what the value's steps are divided by; None where it is not known."""
-    if value.divisor is Divisor.ONE:
+    if value.divisor is _ONE:
         return 1, 1
-    if value.divisor is Divisor.POLE_PAIRS:
+    if value.divisor is _POLE_PAIRS:
         return esc.pole_pairs, 1
-    if value.divisor is Divisor.OUTPUT:
+    if value.divisor is _OUTPUT:
         return esc.output_divisor, esc.gear_denominator
     cells = esc.last_cells
     return (cells, 1) if cells else None
@@ -157,7 +161,7 @@ def physical(value: Value, esc: EscTelemetry, found: int | None) -> float | None
     parts = divisor(value, esc)
     if found is None or parts is None:
         return None
-    if value.per_unit == 1 and value.divisor is Divisor.ONE:
+    if value.per_unit == 1 and value.divisor is _ONE:
         return found
     return round(found * parts[1] / (value.per_unit * parts[0]), 6)
 

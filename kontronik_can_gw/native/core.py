@@ -105,7 +105,7 @@ class NativeCore(Handle):
 
     @property
     def is_pending(self) -> bool:
-        return super().is_pending or self._slots.is_pending
+        return bool(self.state.pendings) or self._slots.is_pending
 
     def take(self, now: int) -> list[CanFrame]:
         return self._slots.take(now) + super().take(now)

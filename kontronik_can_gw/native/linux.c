@@ -6,6 +6,7 @@
 #include <poll.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
@@ -15,6 +16,7 @@
 #define MS INT64_C(1000000)
 #define MAX_FULL (250 * MS) /* how long the bus may take nothing */
 #define ASK_ALL (10 * MS) /* by how much values may seem older, where others come meanwhile, for the sake of fewer questions */
+#define LOOK (100 * MS) /* how often ports are looked at: with echo on, what an ESC sends goes back to it */
 enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72 };
 
 static int64_t now_ns(void)
@@ -195,6 +197,18 @@ static void note_answer(const struct pollfd *p, kcg_input *in, int64_t asked)
         in->undrained_ns = in->asked_ns;
 }
 
+/* See to it that the ports still are as they were set: another program, as stty, can change them at any time. */
+static void hold_settings(kcg_turns *t)
+{
+    t->looked = t->asked;
+    for (uint32_t i = 0; i < t->count; i++) {
+        uint8_t found[KCG_SETTINGS] = {0};
+        kcg_input *in = t->input_of[i] < 0 ? NULL : &t->inputs[t->input_of[i]];
+        if (in && !ioctl(t->fds[i].fd, TCGETS, found) && memcmp(found, in->settings, sizeof found))
+            in->restored |= !ioctl(t->fds[i].fd, TCSETS, in->settings);
+    }
+}
+
 /* Ask which of all descriptors are ready. */
 static void ask_all(kcg_turns *t)
 {
@@ -208,6 +222,8 @@ static void ask_all(kcg_turns *t)
     for (uint32_t i = 0; i < t->count; i++)
         if (t->input_of[i] >= 0)
             note_answer(&t->fds[i], &t->inputs[t->input_of[i]], t->asked);
+    if (t->asked - t->looked >= LOOK)
+        hold_settings(t);
 }
 
 /* Ask what the reads of this turn have left: what the kernel has further back it passes on when poll, not epoll, asks. */

@@ -5,7 +5,7 @@
 
 #include "core.h"
 
-enum { KCG_OUT = 512, KCG_MADE = 256, KCG_READ = 4096, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64 };
+enum { KCG_OUT = 512, KCG_MADE = 256, KCG_READ = 4096, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64, KCG_SETTINGS = 64 };
 enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 };     /* kinds of entries of a capture */
 
 #define KCG_OUTPUTS (1 << 29)          /* found: time is to pass for the outputs */
@@ -15,7 +15,8 @@ typedef struct {        /* of an ESC's port: as poller.PortInput */
     int64_t empty_ns;     /* nothing had come by then */
     int64_t asked_ns;     /* nothing had come by then, either: asked last */
     int64_t undrained_ns; /* the last read left something, which came after this; KCG_DRAINED: it left nothing */
-    uint8_t is_plain, served, esc, reserved[5];
+    uint8_t is_plain, served, esc, restored, reserved[4]; /* restored: another program had changed the settings */
+    uint8_t settings[KCG_SETTINGS]; /* struct termios, as the port was set, and zeros */
 } kcg_input;
 
 typedef struct { int64_t now, came; uint32_t size; uint8_t kind, esc, reserved[2]; } kcg_entry; /* then the data, to a multiple of 8 */
@@ -28,6 +29,7 @@ typedef struct {
     int64_t leave, period, max_late, max_turn; /* when to come back; how often all are to be asked; limits of lateness */
     int64_t full_since;                  /* the bus takes nothing */
     int64_t since;                       /* nothing of `data` had come by then */
+    int64_t looked;                      /* when the ports' settings were looked at */
     int32_t epoll, bus, found;           /* descriptors; an event to be followed, or KCG_OUTPUTS; below 0: none */
     int32_t happened;                    /* how many of `fds` are ready */
     uint32_t count, ready, unsent, taken, turns, records, recorded, bus_place, is_full;

@@ -121,6 +121,9 @@ for _name, _property in _WRITABLE.items():
     setattr(NativeEsc, _name, _property)
 
 
+_GATEWAY_STATES, _CAN_STATES = tuple(GatewayState), tuple(CanState)
+
+
 class NativeStatus(c.Structure):
     """As GatewayStatus, in the core's memory: kcg.gateway."""
 
@@ -130,7 +133,7 @@ class NativeStatus(c.Structure):
 
     @property
     def state(self) -> GatewayState:
-        return GatewayState(self.gateway_state)
+        return _GATEWAY_STATES[self.gateway_state]
 
     @state.setter
     def state(self, state: GatewayState) -> None:
@@ -138,11 +141,11 @@ class NativeStatus(c.Structure):
 
     @property
     def can_state(self) -> CanState:
-        return CanState(self.can_state_number)
+        return _CAN_STATES[self.can_state_number]
 
     @can_state.setter
     def can_state(self, state: CanState) -> None:
         self.can_state_number = state
 
-    def __copy__(self) -> "NativeStatus":
+    def frozen(self) -> "NativeStatus":
         return NativeStatus.from_buffer_copy(self)

@@ -88,8 +88,8 @@ class Turns:
 
     def ready(self) -> list[tuple[int, int]]:
         """The descriptors that are ready, with what happened."""
-        fds, count = self.state.fds, self.state.count if self.state.happened else 0
-        return [(fds[n].fd, fds[n].revents) for n in range(count) if fds[n].revents]
+        ready = [each for each in self.state.fds[: self.state.count] if each.revents]
+        return [(each.fd, each.revents) for each in ready]
 
     def unsent(self) -> list[CanFrame]:
         """The frames that the bus did not take, in their order."""

@@ -14,8 +14,12 @@ def write_all(fd: int, data: bytes) -> None:
 
 def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> None:
     """Write a new file with these permissions, in place of a left-over one; ``is_synced``: its content is on disk then. Or OSError."""
-    path.unlink(missing_ok=True)
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    try:
+        fd = os.open(path, flags, mode)
+    except FileExistsError:
+        path.unlink()
+        fd = os.open(path, flags, mode)
     try:
         os.fchmod(fd, mode)  # whatever the umask
         write_all(fd, data)

@@ -96,6 +96,7 @@ class EscPort:
             return
         noted = self._noted
         noted.empty_ns, noted.undrained_ns, noted.is_plain = self._clock(), NEVER, False
+        noted.settings[:] = port.settings
         port.discard()  # what came before we listened has no time
         self.port = port
         self.identity = port.identity()
@@ -169,13 +170,14 @@ class EscPort:
         """True if the loop does not serve this port."""
         return self._stuck.is_stuck(self.port)
 
-    def report(self, now: int) -> None:
-        """Count line errors, look at the port's settings; say why nothing comes."""
+    def report(self, now: int, looks_too: bool = True) -> None:
+        """Count line errors, look at the port's settings (``looks_too`` False: C does); say why nothing comes."""
         if self.port is None:
             return
         if (counts := self.port.line_errors()) is not self._counted:
             self._count(counts)
-        if not self.port.settings_hold():
+        if self._noted.restored or (looks_too and not self.port.settings_hold()):
+            self._noted.restored = False
             text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
             self._conditions.event(f"{self.name}: settings", text, now)
         self.log.diagnose(self.line_errors, now)

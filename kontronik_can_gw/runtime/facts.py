@@ -3,8 +3,7 @@
 import os
 import time
 from collections.abc import Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,12 +36,11 @@ def gateway_facts(gateway: Gateway) -> GatewayFacts:
     core = gateway.core.language, gateway.core_note
     outputs = {output.name: found for output in gateway.outputs if (found := output.facts())}
     return GatewayFacts(
-        escs, copy(gateway.status), gateway.node_states(), outputs, gateway.layout, *core
+        escs, gateway.status.frozen(), gateway.node_states(), outputs, gateway.layout, *core
     )
 
 
-@dataclass(frozen=True)
-class PortFacts:
+class PortFacts(NamedTuple):
     """What the loop knows of one ESC's port. ``lost_since_ns``: monotonic, None while it is open."""
 
     name: str
@@ -50,14 +48,13 @@ class PortFacts:
     open: bool
     complaint: str = ""
     reopened: int = 0
-    line_errors: Mapping[str, int] = field(default_factory=dict)
+    line_errors: Mapping[str, int] = {}
     lost_since_ns: int | None = None
     diagnosis: str | None = None
     """Why no frame comes."""
 
 
-@dataclass(frozen=True)
-class CanFacts:
+class CanFacts(NamedTuple):
     """What the loop knows of the CAN interface; its state and its counters are in GatewayStatus."""
 
     interface: str
@@ -71,8 +68,7 @@ class CanFacts:
     """Transmit and receive error counter of the controller, where known."""
 
 
-@dataclass(frozen=True)
-class StoreFacts:
+class StoreFacts(NamedTuple):
     """Parameters that wait for the disk, and why the last saving failed ('' where it did not)."""
 
     waiting: int = 0

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("kontronik_can_gw")
 
-PERIOD_NS = SECOND // 2
-"""How often there is a round: while another program has echo on, what an ESC sends goes back to it.
+LOOK_NS = SECOND // 2
+"""How often there is a round while nobody else looks at the ports' settings: with echo on, what an ESC sends goes back to it.
 
 The loop is woken for a round only when it is late by as much: mostly it comes round before.
 """
@@ -68,17 +68,17 @@ class Housekeeping:
         self._process, self._process_due = ProcessFacts(), 0
         self._node_states: list[tuple[int, NmtState]] = []
 
-    def run(self, now: int) -> None:
-        """One round."""
-        self.due = now + PERIOD_NS
+    def run(self, now: int, looks_too: bool = True) -> None:
+        """One round. ``looks_too`` False: the core in C looks at the ports' settings more often."""
+        self.due = now + (LOOK_NS if looks_too else SECOND)
         for esc in self._escs:
-            esc.report(now)
+            esc.report(now, looks_too)
         self._log_conflicts(now)
         self._conditions.advance(now)
         self.follow_recorder(now)
         self.publish(now)
         self._notify(now)
-        self.wake_due = self.due + PERIOD_NS
+        self.wake_due = self.due + LOOK_NS
         if (due := self._alive_due) is not None and due > now:  # else something is stuck
             self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
 

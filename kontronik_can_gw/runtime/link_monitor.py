@@ -54,6 +54,9 @@ class LinkMonitor:
 
     def __init__(self, name: str) -> None:
         self._name = name.encode()
+        body = _INTERFACE.pack(0, 0, 0, 0, 0) + _attribute(_NAME, self._name + b"\0")
+        body += _attribute(_EXT_MASK, _WITHOUT_STATISTICS)
+        self._question = _HEADER.pack(_HEADER.size + len(body), _GET_LINK, _REQUEST, 0, 0) + body
         self._heard: tuple[bytes, list[LinkFacts]] = b"", []
         """The last datagram and what it says."""
         self._socket = socket.socket(
@@ -70,12 +73,8 @@ class LinkMonitor:
 
     def ask(self) -> None:
         """Let the kernel report how the interface is now: ``take`` gives the answer, at once."""
-        name = _attribute(_NAME, self._name + b"\0")
-        body = _INTERFACE.pack(0, 0, 0, 0, 0) + name + _attribute(_EXT_MASK, _WITHOUT_STATISTICS)
         with contextlib.suppress(OSError):
-            self._socket.send(
-                _HEADER.pack(_HEADER.size + len(body), _GET_LINK, _REQUEST, 0, 0) + body
-            )
+            self._socket.send(self._question)
 
     def take(self) -> list[LinkFacts]:
         """What was reported of the interface since the last call, oldest first."""

@@ -20,7 +20,7 @@ from kontronik_can_gw.runtime.facts import ProgramFacts
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
-from kontronik_can_gw.runtime.poller import Bounds, Handler, Poller
+from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import Recorder
     from kontronik_can_gw.runtime.store import ParameterStore
 
-MIN_HELD_UP_NS = 20 * MS
-"""A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
 _WAKES_PER_TIMEOUT = 4
 """The loop wakes at least this often within the shortest telemetry time-out: by how much of it a value may go early.
 
@@ -138,8 +136,11 @@ class Loop:
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
         period = self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
-        ready = self._turn_in_c(period) if self._poller.is_native else None
-        if ready is None:
+        ready = None
+        if self._poller.is_native:
+            leave = self._housekeeping.due  # what the controller says is asked for with it
+            ready = self._poller.turn(self.can, self._now, self._own_deadline(), leave, period)
+        if in_python := ready is None:
             if self._due is None:
                 self._due = self._next_deadline()
             ready = self._poller.wait(self._now, min(self._now + period, self._due))
@@ -157,16 +158,8 @@ class Loop:
             self._due = None
         self._now = now
         if now >= self._housekeeping.due:
-            self._housekeeping.run(now)
+            self._housekeeping.run(now, in_python)
             self._due = None
-
-    def _turn_in_c(self, period: int) -> list[tuple[Handler, int]] | None:
-        """Let turns be made in C, as long as these are plain; what is ready then. None where it is not the time for that."""
-        max_turn = self.can.transmitter.max_turn_ns()
-        max_late = max(MIN_HELD_UP_NS, max_turn)
-        leave = self._housekeeping.due  # what the controller says is asked for with it
-        bounds = Bounds(self._now, self._own_deadline(), leave, period, max_late, max_turn)
-        return self._poller.turn(self.can, bounds)
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
         """Take what has come, do what is due, send what is made of it. Returns the time."""
@@ -227,7 +220,10 @@ class Loop:
 
     def _own_deadline(self) -> int:
         """Of what is to be done apart from the gateway."""
-        return min([self.can.due, self._housekeeping.wake_due, *(esc.due for esc in self._lost)])
+        due = min(self.can.due, self._housekeeping.wake_due)
+        for esc in self._lost:
+            due = min(due, esc.due)
+        return due
 
     def _others(self, esc: EscPort) -> tuple[Identity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)

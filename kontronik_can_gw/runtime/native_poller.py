@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native.turns import OUTPUTS
-from kontronik_can_gw.runtime.poller import Bounds, Handler, Poller, PortInput
+from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller, PortInput
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.core import NativeCore
@@ -34,6 +34,7 @@ class NativePoller(Poller):
         self._gateway = gateway
         self._core = cast("NativeCore", gateway.core)
         self._turns = self._core.turns()
+        self._turns.state.records = gateway.is_recorded
         self._seen_changes = -1
         self._fits = True
         self._signals: tuple[int, int] | None = None
@@ -63,10 +64,13 @@ class NativePoller(Poller):
         with contextlib.suppress(BlockingIOError):
             os.read(self._signals[0], 4096)
 
-    def turn(self, can: "CanLink", bounds: Bounds) -> list[tuple[Handler, int]] | None:
+    def turn(
+        self, can: "CanLink", last: int, due: int, leave: int, period: int
+    ) -> list[tuple[Handler, int]] | None:
         """Turn until something is to be done that is the loop's; the handlers of what is ready then.
 
-        None where it is not the time for that.
+        ``last``: the last turn; ``due``: what the loop has to do apart from the gateway; ``leave``: when to come back in any case;
+        ``period``: how long a wait is at most. All in ns. None where it is not the time for that.
         """
         gateway = self._gateway
         if self._core.reports_live or gateway.frames_wait:
@@ -76,13 +80,14 @@ class NativePoller(Poller):
         turns = self._turns
         state = turns.state
         state.asked, state.before, state.bus = self.now, self.before, bus
-        state.now, due, state.leave, state.period, state.max_late, state.max_turn = bounds
+        state.now, state.leave, state.period = last, leave, period
+        state.max_turn = max_turn = can.transmitter.max_turn_ns()
+        state.max_late = max(MIN_HELD_UP_NS, max_turn)
         state.due = min(due, self._core.deadline_in_python())
         state.outputs_due = gateway.next_deadline(with_core=False)
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
-            recorded.prepare_turns(bounds.last)
-        state.records = recorded is not None
+            recorded.prepare_turns(last)
         turns.begin()
         while turns.run():
             if not self._follow():
@@ -102,7 +107,7 @@ class NativePoller(Poller):
             self._core.advance_in_python(state.now)
             gateway.advance(state.now, with_core=False)
             can.transmit(state.now)
-        return self.handlers(turns.ready())
+        return self.handlers(turns.ready()) if state.happened else []
 
     def _follow(self) -> bool:
         """Follow the event that C has come back with, or let time pass for the outputs; False where the rest of the turn is the loop's.

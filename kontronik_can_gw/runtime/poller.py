@@ -9,9 +9,9 @@ import contextlib
 import select
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.output import NEVER
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ Handler = Callable[[int, int], None]
 """Called with the time and what has happened (select.POLLIN, POLLOUT)."""
 
 
+MIN_HELD_UP_NS = 20 * MS
+"""A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
 _IN = select.POLLIN
 
 
@@ -31,12 +33,15 @@ class PortInput:
 
     ``empty_ns``: the port was empty then. ``undrained_ns``: the last read left something, which came after this; NEVER: it left
     nothing. ``is_plain``: what comes is to be read and nothing else. ``served``: it was read since this was set to False.
+    ``settings``: as the port was set; ``restored``: C has set it so again, since this was set to False.
     """
 
     def __init__(self) -> None:
         self.empty_ns, self.undrained_ns = 0, NEVER
         self.is_plain = False
         self.served = True
+        self.settings = bytearray()
+        self.restored = False
 
 
 class StuckCheck:
@@ -53,21 +58,6 @@ class StuckCheck:
         stuck = waiting and self._seen_waiting
         self._noted.served, self._seen_waiting = False, waiting
         return stuck
-
-
-class Bounds(NamedTuple):
-    """Of turns that are made in C, in ns.
-
-    ``last``: the last turn; ``due``: what the loop has to do apart from the gateway; ``leave``: when to come back in any case; ``period``:
-    how long a wait is at most; ``max_late``, ``max_turn``: how late a turn, and the sending of its frames, may be.
-    """
-
-    last: int
-    due: int
-    leave: int
-    period: int
-    max_late: int
-    max_turn: int
 
 
 class Poller:
@@ -143,7 +133,9 @@ class Poller:
     def begin(self) -> None:
         """The loop begins."""
 
-    def turn(self, can: "CanLink", bounds: Bounds) -> list[tuple[Handler, int]] | None:
+    def turn(
+        self, can: "CanLink", last: int, due: int, leave: int, period: int
+    ) -> list[tuple[Handler, int]] | None:
         """Nothing: turns are made in C by native_poller.py."""
 
     def watched(self) -> list[tuple[int, int, int | None]]:

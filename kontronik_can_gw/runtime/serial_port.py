@@ -75,7 +75,7 @@ class SerialPort:
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(self._fd, termios.TCSANOW, mode)
             self._mode = termios.tcgetattr(self._fd)
-            self._settings = self._settings_now()
+            self.settings = self._settings_now()
         except (OSError, termios.error) as error:  # pulled out at this instant
             self._serial.close()
             raise _explained(path, error.args[0], str(error)) from None
@@ -110,7 +110,7 @@ class SerialPort:
     def settings_hold(self) -> bool:
         """Whether the port still is as it was set; if not it is set again. (Another program, as stty, can change it at any time.)"""
         try:
-            if self._settings_now() == self._settings:
+            if self._settings_now() == self.settings:
                 return True
             termios.tcsetattr(self._fd, termios.TCSANOW, self._mode)
         except (OSError, termios.error):

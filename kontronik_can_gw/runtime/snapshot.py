@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 """Of the document; another number for a change that readers must know of. New keys may come without one."""
 PROGRAM = "kontronik-can-gw"
+_encoded = json.JSONEncoder(ensure_ascii=False, check_circular=False, separators=(",", ":")).encode
 STALE_NS = 3 * SECOND
 """A document older than this says nothing of now."""
 LOG_LINES = 20
@@ -96,7 +97,6 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
             "core_reason": gateway.core_note or None,
         },
         "can": _can(moment.can, status),
-        "units": _UNITS,
         "escs": [
             _esc(esc, port, status, now)
             for esc, port in zip(gateway.escs, moment.ports, strict=True)
@@ -108,7 +108,7 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
         "log": moment.log_lines[-LOG_LINES:],
         "rates": _rates(moment, before),
     }
-    return json.dumps(document, ensure_ascii=False, separators=(",", ":"))
+    return f'{{"units":{_UNITS},{_encoded(document)[1:]}'
 
 
 def _node(esc: str, node_id: int, state: Enum, pdos_sent: int) -> Document:
@@ -169,7 +169,7 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
     ):
         info = None
     protocol, rate = esc.protocol, esc.frame_rate
-    alarms = _alarms(protocol, protocol.value("operating_errors", live))
+    errors, warnings, statuses = _alarms(protocol, protocol.value("operating_errors", live))
     selftest = protocol.value("selftest_errors", info)
     return {
         "name": esc.settings.name,
@@ -189,9 +189,9 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         "counters": esc.counters.as_dict()
         | {name: getattr(esc, name) for name in _FURTHER_COUNTERS},
         "operating_state": protocol.state_text(live),
-        "errors": alarms.get(Severity.ERROR),
-        "warnings": alarms.get(Severity.WARNING),
-        "statuses": alarms.get(Severity.STATUS),
+        "errors": errors,
+        "warnings": warnings,
+        "statuses": statuses,
         "selftest_errors": None
         if selftest is None
         else bit_texts(selftest, protocol.errors.get("selftest_errors", ())),
@@ -213,50 +213,52 @@ def _port(port: PortFacts, now: int) -> Document:
 def _values(
     esc: EscTelemetry, live: Data | None, info: Data | None, status: GatewayStatus, now: int
 ) -> dict[str, float | None]:
-    found: dict[str, float | None] = {}
+    found: dict[str, float | None] = dict.fromkeys(_NAMES)
     for names, reading in ((_LIVE, live), (_INFO, info)):
-        if reading is None:
-            found |= dict.fromkeys(names)
-            continue
-        for name, value, word, per_unit in _rows(esc.protocol, names):
-            found[name] = (
-                physical(value, esc, steps_of(value, esc, reading))
-                if word is None
-                else reading[word]  # as ``physical`` has it
-                if per_unit == 1
-                else reading[word] / per_unit
-            )
-    for name, value, *_ in _rows(esc.protocol, _LINK):
-        found[name] = physical(value, esc, steps(value, esc, status, now))
+        if reading is not None:
+            whole, parts, derived = _rows(esc.protocol, names)
+            for name, word in whole:  # as ``physical`` has them
+                found[name] = reading[word]
+            for name, word, per_unit in parts:
+                found[name] = reading[word] / per_unit
+            for value in derived:
+                found[value.name] = physical(value, esc, steps_of(value, esc, reading))
+    for value in _rows(esc.protocol, _LINK)[2]:
+        found[value.name] = physical(value, esc, steps(value, esc, status, now))
     return found
 
 
 @cache
 def _rows(
     protocol: EscProtocol, names: tuple[str, ...]
-) -> list[tuple[str, Value, int | None, int]]:
-    """Name, value, the place of its word where that is all of it, and steps of a unit."""
-    found = [(name, values_of(protocol)[name]) for name in names]
-    return [(name, value, _whole(value), value.per_unit) for name, value in found]
+) -> tuple[list[tuple[str, int]], list[tuple[str, int, int]], list[Value]]:
+    """Values that are a word of the reading, by name; those that are parts of a unit, and how many make one; the others."""
+    values = [values_of(protocol)[name] for name in names]
+    plain = [value for value in values if _is_plain(value)]
+    return (
+        [(value.name, value.words[0]) for value in plain if value.per_unit == 1],
+        [(value.name, value.words[0], value.per_unit) for value in plain if value.per_unit != 1],
+        [value for value in values if value not in plain],
+    )
 
 
-def _whole(value: Value) -> int | None:
+def _is_plain(value: Value) -> bool:
     is_whole = value.kind is Kind.WIRE and value.supplied and not value.not_on
     is_exact = 10**6 % value.per_unit == 0  # of six decimals
-    return value.words[0] if is_whole and is_exact and value.divisor is Divisor.ONE else None
+    return is_whole and is_exact and value.divisor is Divisor.ONE
 
 
 @lru_cache(maxsize=256)
-def _alarms(protocol: EscProtocol, word: int | None) -> dict[Severity, list[str]]:
-    """The bits of the error word by their class, one without a name is an error; empty without a word."""
+def _alarms(protocol: EscProtocol, word: int | None) -> Sequence[list[str] | None]:
+    """The bits of the error word that are errors, warnings, statuses; one without a name is an error. None without a word."""
     if word is None:
-        return {}
+        return None, None, None
     bits = protocol.errors.get("operating_errors", ())
     severities = {bit.text: bit.severity for bit in bits}
     found: dict[Severity, list[str]] = {severity: [] for severity in Severity}
     for text in bit_texts(word, bits):
         found[severities.get(text, Severity.ERROR)].append(text)
-    return found
+    return tuple(found.values())
 
 
 def _numbers(*groups: Group) -> tuple[Value, ...]:
@@ -275,7 +277,11 @@ def _numbers(*groups: Group) -> tuple[Value, ...]:
 _LIVE, _INFO, _LINK = (
     tuple(value.name for value in _numbers(group)) for group in (Group.LIVE, Group.INFO, Group.LINK)
 )
-_UNITS = {value.name: value.unit for value in _numbers(Group.LIVE, Group.INFO, Group.LINK)}
+_NAMES = _LIVE + _INFO + _LINK
+_UNITS = json.dumps(
+    {value.name: value.unit for value in _numbers(Group.LIVE, Group.INFO, Group.LINK)}
+)
+"""As text, in ASCII: a document without any other character is bytes without further ado."""
 _FURTHER_COUNTERS = ("suspect_frames", "late_frames", "line_errors")
 _STATUS_COUNTERS = tuple(
     f.name

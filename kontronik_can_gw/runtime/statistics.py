@@ -32,6 +32,7 @@ class Statistics:
     def __init__(self, file: Path) -> None:
         self.due = 0
         self._path, self._what = file, f"statistics file {file}"
+        self._temporary = file.with_name(f".{file.name}.tmp")
         self._newest: Moment | None = None
         self._written: Moment | None = None
         """What the last document was made of; of the worker's thread."""
@@ -75,13 +76,12 @@ class Statistics:
 
     def _write(self, data: bytes) -> None:
         """Replace the file: a reader sees the old content or the new one, whole. After a loss of power nobody wants it."""
-        path, name = self._path, "statistics: file"
-        temporary = path.with_name(f".{path.name}.tmp")
+        path, temporary, name = self._path, self._temporary, "statistics: file"
         try:
-            if path.exists() and not path.is_file():  # /dev/null would be gone, for everybody
-                raise OSError(errno.EINVAL, "what is there is no plain file")
+            if not os.path.isfile(path) and path.exists():  # noqa: PTH113  each second: as cheaply as it can be
+                raise OSError(errno.EINVAL, "what is there is no plain file")  # as /dev/null
             write_new(temporary, data, 0o644)
-            temporary.replace(path)
+            os.replace(temporary, path)  # noqa: PTH105
         except OSError as error:
             with contextlib.suppress(OSError):
                 temporary.unlink()

@@ -2,9 +2,11 @@
 #define _GNU_SOURCE
 #include <errno.h>
 #include <poll.h>
+#include <stdarg.h>
 #include <stdint.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
@@ -16,6 +18,7 @@ typedef struct {
     int (*ready)(int fd);                 /* for what */
     int (*size)(int fd, int most);        /* how many bytes a read gives: `data` then has them */
     int (*send)(const uint8_t *frame, int size); /* 0: it is not taken */
+    void (*settings)(int fd, uint8_t *at, int is_set); /* of a port: they are set, or asked for */
 } kernel;
 static kernel k;
 uint8_t fake_data[1 << 16];
@@ -86,6 +89,15 @@ int fake_poll(struct pollfd *fds, nfds_t n, int ms)
         found += fds[i].revents != 0;
     }
     return found;
+}
+
+int fake_ioctl(int fd, unsigned long what, ...)
+{
+    va_list more;
+    va_start(more, what);
+    k.settings(fd, va_arg(more, uint8_t *), what == TCSETS);
+    va_end(more);
+    return 0;
 }
 
 ssize_t fake_read(int fd, void *data, size_t most)

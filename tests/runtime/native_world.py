@@ -14,13 +14,22 @@ from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.native_poller import NativePoller
-from kontronik_can_gw.runtime.poller import Bounds, Handler
+from kontronik_can_gw.runtime.poller import Handler
 from kontronik_can_gw.transmit_queue import Sent
 
 if TYPE_CHECKING:
     from wire_world import World
 
-_CALLS = ("clock_gettime", "epoll_create1", "epoll_ctl", "epoll_wait", "close", "poll", "read")
+_CALLS = (
+    "clock_gettime",
+    "epoll_create1",
+    "epoll_ctl",
+    "epoll_wait",
+    "close",
+    "poll",
+    "read",
+    "ioctl",
+)
 _KERNEL = Path(__file__).parents[1] / "native" / "fake_kernel.c"
 _HEAD = struct.Struct("=IB3x")
 
@@ -33,6 +42,7 @@ class _Kernel(c.Structure):
         ("ready", c.CFUNCTYPE(c.c_int, c.c_int)),
         ("size", c.CFUNCTYPE(c.c_int, c.c_int, c.c_int)),
         ("send", c.CFUNCTYPE(c.c_int, c.POINTER(c.c_uint8), c.c_int)),
+        ("settings", c.CFUNCTYPE(None, c.c_int, c.POINTER(c.c_uint8), c.c_int)),
     )
 
 
@@ -54,7 +64,8 @@ class FakeNativePoller(NativePoller):
         self._world = world
         self._data = (c.c_uint8 * (1 << 16)).in_dll(library(), "fake_data")
         kinds: list[Any] = [kind for _, kind in _Kernel._fields_]
-        calls = (world.clock, world.pass_until, world.look, world.ready, self._read, self._send)
+        of_world = (world.clock, world.pass_until, world.look, world.ready)
+        calls = (*of_world, self._read, self._send, self._settings)
         self._kernel = _Kernel(*(kind(call) for kind, call in zip(kinds, calls, strict=True)))
         library().fake_use(c.byref(self._kernel))
 
@@ -69,8 +80,10 @@ class FakeNativePoller(NativePoller):
         self._world.unregister(fd)
         self.changes += 1
 
-    def turn(self, can: CanLink, bounds: Bounds) -> list[tuple[Handler, int]] | None:
-        return super().turn(can, bounds._replace(due=min(bounds.due, self._world.until)))
+    def turn(
+        self, can: CanLink, last: int, due: int, leave: int, period: int
+    ) -> list[tuple[Handler, int]] | None:
+        return super().turn(can, last, min(due, self._world.until), leave, period)
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
@@ -82,6 +95,14 @@ class FakeNativePoller(NativePoller):
         data = self._world.wires[fd - 1000].read(most)
         c.memmove(self._data, data, len(data))
         return len(data)
+
+    def _settings(self, fd: int, at: Any, is_set: int) -> None:
+        wire = self._world.wires[fd - 1000]
+        wire.looks.append(self._world.now)
+        if is_set:
+            wire.now_set = bytes(at[: len(wire.settings)])
+        else:
+            c.memmove(at, wire.now_set, len(wire.settings))
 
     def _send(self, frame: Any, size: int) -> int:
         raw = bytes(frame[:size])

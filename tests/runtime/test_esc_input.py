@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import select
 import termios
 from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
@@ -11,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from wire_world import Wire, World, loop_in, run
+from wire_world import World, loop_in, run
 
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
@@ -62,6 +63,8 @@ class Port:
 
     def line_errors(self) -> dict[str, int]:
         return dict(self.counts)
+
+    settings = b""
 
     def settings_hold(self) -> bool:
         return True
@@ -261,17 +264,28 @@ def test_a_usb_adapter_is_known_by_its_numbers_or_its_place(
     }
 
 
-def test_settings_that_another_program_changes_are_set_again() -> None:
+def test_settings_that_another_program_changes_are_set_again(core_language: str) -> None:
     with PtyEsc() as esc:
         port = serial_port.SerialPort(esc.path, KONTRONIK)
+
+        def hold() -> bool:
+            if core_language == "Python":
+                return port.settings_hold()
+            turns = Gateway([EscSettings()], Layout("", "", ()), 0).core.turns()  # type: ignore[attr-defined]
+            turns.inputs[0].settings[:] = port.settings
+            assert turns.watch([(port.fileno(), select.POLLIN, 0)])
+            turns.leave()
+            turns.close()
+            return not turns.inputs[0].restored
+
         try:
-            assert port.settings_hold()
+            assert hold()
             changed = termios.tcgetattr(port.fileno())
             changed[3] |= termios.ECHO
             changed[4] = changed[5] = termios.B9600
             termios.tcsetattr(port.fileno(), termios.TCSANOW, changed)
-            assert not port.settings_hold()
-            assert port.settings_hold()
+            assert not hold()
+            assert hold()
             after = termios.tcgetattr(port.fileno())
             assert not after[3] & termios.ECHO
             assert after[4] == termios.B115200
@@ -279,26 +293,33 @@ def test_settings_that_another_program_changes_are_set_again() -> None:
             port.close()
 
 
-def test_settings_are_looked_at_twice_a_second(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("speaks", [True, False])
+def test_settings_are_looked_at_twice_a_second_in_c_more_often(
+    speaks: bool,
+    core_language: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """While another program has echo on, an ESC hears what it sends."""
-    world, looks = World(), list[int]()
+    world = World()
+    wire, limit = world.wires[0], 530 * MS if speaks else SECOND
     loop = loop_in(world, monkeypatch)
     loop.open()
     loop.begin()
     begin = world.now
-
-    def settings_hold(_wire: Wire) -> bool:
-        looks.append(world.now)
-        return len(looks) != 3
-
-    monkeypatch.setattr(Wire, "settings_hold", settings_hold)
-    world.wires[0].stream(begin, begin + 3 * SECOND, 20 * MS)
+    if speaks:
+        wire.stream(begin, begin + 3 * SECOND, 20 * MS)
+    run(loop, world, begin + 1300 * MS)
+    changed, wire.now_set = world.now, bytes(64)
     run(loop, world, begin + 3 * SECOND)
     loop.close()
-    assert all(late - early <= 530 * MS for early, late in pairwise([begin, *looks, world.now]))
-    assert len(looks) == 7, "and no more often"
+    assert wire.now_set == wire.settings
+    if core_language == "C":
+        limit = 170 * MS
+    looks = [begin, *wire.looks, world.now]
+    assert all(late - early <= limit for early, late in pairwise(looks))
+    assert len(looks) <= (40 if core_language == "C" else 9), "and no more often"
+    assert next(at for at in wire.looks if at > changed) - changed <= limit
     assert sum("changed the settings of /fake/0" in message for message in caplog.messages) == 1
 
 

@@ -65,8 +65,8 @@ class FakeSocket:
 
 
 def monitor_of(*datagrams: bytes | int, name: str = "can0") -> tuple[LinkMonitor, FakeSocket]:
-    monitor, fake = LinkMonitor.__new__(LinkMonitor), FakeSocket(*datagrams)
-    monitor._name, monitor._heard = name.encode(), (b"", [])
+    monitor, fake = LinkMonitor(name), FakeSocket(*datagrams)
+    monitor.close()
     monitor._socket = fake  # type: ignore[assignment]
     return monitor, fake
 

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +120,7 @@ LOST = PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (hung up).", lost_
         (CanState.BUS_OFF, {"can": OPEN}, ["CAN can0 is bus-off"]),
         (CanState.DOWN, {"can": OPEN}, ["CAN can0 is down"]),
         (UNKNOWN, {"can": CLOSED}, ["can0: gone"]),
-        (ACTIVE, {"can": replace(OPEN, stalled=True)}, ["CAN can0: no frame can be sent"]),
+        (ACTIVE, {"can": OPEN._replace(stalled=True)}, ["CAN can0: no frame can be sent"]),
         (ACTIVE, {"store": StoreFacts(0, "full")}, ["parameters cannot be stored: full"]),
         (ACTIVE, {"ports": [LOST]}, ["esc1: port not open for 70.0 s: /dev/a: lost (hung up)."]),
     ],
@@ -131,7 +130,7 @@ def test_each_fault_is_a_sentence(state: CanState, facts: dict[str, Any], said: 
     bench.gateway.set_can_state(state, bench.now)
     if "ports" in facts:
         bench.gateway.port(0, False, bench.now)
-        facts = {"ports": [replace(LOST, lost_since_ns=bench.now - 70 * SECOND)]}
+        facts = {"ports": [LOST._replace(lost_since_ns=bench.now - 70 * SECOND)]}
     seen = judged(bench.document(**facts))
     assert (seen.code, list(seen.troubles)) == (TROUBLE if said else HEALTHY, said)
 

@@ -66,6 +66,7 @@ class Wire:
     """A serial port: what comes, and when the kernel has it. Frames have their number as speed."""
 
     drained = True
+    settings = bytes(range(64))
 
     def __init__(self, world: "World", number: int) -> None:
         self.path = f"/fake/{number}"
@@ -73,6 +74,9 @@ class Wire:
         """When each byte was in the kernel's buffer."""
         self.frames: list[int] = []
         """When each frame was there whole."""
+        self.now_set = self.settings
+        self.looks: list[int] = []
+        """When the settings were looked at, or set."""
         self._world = world
         self._number = number
         self._bytes = bytearray()
@@ -129,7 +133,9 @@ class Wire:
         return {}
 
     def settings_hold(self) -> bool:
-        return True
+        self.looks.append(self._world.now)
+        held, self.now_set = self.now_set == self.settings, self.settings
+        return held
 
     def close(self) -> None:
         pass
