@@ -11,8 +11,8 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -55,8 +55,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         _prepare_streams()
         refuse_removed_options(command, words)
         args = make_parser([] if command is None else [command]).parse_args(words)
-        with _interruptible():
-            code: int = args.main(args)
+        # before, while modules are loaded, Ctrl-C ends the process (see __main__)
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        code: int = args.main(args)
         sys.stdout.flush()
         return code
     except UserError as error:
@@ -94,19 +96,6 @@ def say(text: str, command: str | None = None) -> None:
 def show(text: str = "") -> None:
     """Print one line on standard output, made printable."""
     print(printable(text))
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Make Ctrl-C raise KeyboardInterrupt; before, while modules are loaded, and after, it ends the process (see __main__)."""
-    ended_us = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-    if ended_us:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        if ended_us:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:

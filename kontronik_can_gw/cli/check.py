@@ -43,7 +43,13 @@ def main(args: argparse.Namespace) -> int:
             raise
         print(printable_json({"file": str(path), "mistakes": list(error.problems)}, indent=2))
         return error.exit_code
-    warnings = [*loaded.layout.warnings, *loaded.warnings, *_examples(loaded)]
+    examples = [
+        f"{loaded.config.file}: port of {esc.name}: {esc.port} is the example's. "
+        "Write the name of yours: ls /dev/serial/by-id"
+        for esc in loaded.config.esc
+        if _EXAMPLE_PORT in esc.port
+    ]
+    warnings = [*loaded.layout.warnings, *loaded.warnings, *examples]
     nodes = None if loaded.canopen is None else loaded.canopen.nodes(loaded.escs)
     shown = document(path, loaded, nodes, warnings)
     if args.json:
@@ -56,16 +62,6 @@ def main(args: argparse.Namespace) -> int:
     for line in details(shown, loaded) if args.verbose else ():
         show(line)
     return 0
-
-
-def _examples(loaded: Loaded) -> Iterator[str]:
-    """A warning for each port that is still the example's."""
-    for esc in loaded.config.esc:
-        if _EXAMPLE_PORT in esc.port:
-            yield (
-                f"{loaded.config.file}: port of {esc.name}: {esc.port} is the example's. "
-                "Write the name of yours: ls /dev/serial/by-id"
-            )
 
 
 def summary(shown: dict[str, Any], loaded: Loaded, nodes: Nodes | None) -> Iterator[str]:
@@ -102,34 +98,24 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def _traffic(loaded: Loaded, nodes: Nodes | None) -> tuple[float, float]:
-    """Share of the bus and frames a second. What is sent on change is counted by its cycle."""
-    can, layout = loaded.config.can, loaded.layout
-    load = layout.bus_load(can.bitrate, can.data_bitrate)
-    frames = sum(message.rate_hz for message in layout.messages)
-    others = [] if nodes is None else [nodes.traffic()]
-    for more, bits in (*others, *(output.traffic() for output in loaded.outputs)):
-        load += bits / can.bitrate
-        frames += more
-    return load, frames
-
-
 def document(
     path: Path, loaded: Loaded, nodes: Nodes | None, warnings: list[str]
 ) -> dict[str, Any]:
-    """What ``--json`` prints, and text is made of: every message and signal too."""
+    """What ``--json`` prints, and text is made of: every message and signal too. What is sent on change is counted by its cycle."""
     config, layout = loaded.config, loaded.layout
-    load, frames = _traffic(loaded, nodes)
+    can = config.can
+    load = layout.bus_load(can.bitrate, can.data_bitrate)
+    frames = sum(message.rate_hz for message in layout.messages)
+    traffic = [output.traffic() for output in loaded.outputs]
+    for more, bits in traffic if nodes is None else [*traffic, nodes.traffic()]:
+        load += bits / can.bitrate
+        frames += more
     return {
         "file": str(path),
         "mistakes": [],
         "warnings": warnings,
         "escs": [{"name": e.name, "port": e.port, "protocol": e.protocol} for e in config.esc],
-        "can": {
-            "interface": config.can.interface,
-            "channel": config.can.channel,
-            "bitrate": config.can.bitrate,
-        },
+        "can": {"interface": can.interface, "channel": can.channel, "bitrate": can.bitrate},
         "bus_load": load,
         "frames_per_second": frames,
         "dbc": layout.file,
@@ -146,12 +132,13 @@ def document(
 def messages(layout: Layout, esc_names: list[str]) -> Iterator[dict[str, Any]]:
     """Each message with its id, when it is sent, and of each signal the source and what is lost."""
     for message in layout.messages:
-        signals = {
-            signal.name: {"source": _source(signal, esc_names), "lost": _lost(message, signal)}
-            for signal in message.signals
-        }
-        digits = 8 if message.extended else 3
-        can_id = f"{message.can_id:0{digits}X}h"
+        signals = {}
+        for signal in message.signals:
+            lost = list(signal.notes)
+            if is_mute(signal) and (found := reporter(message, signal)) is not None:
+                lost.append(f"{found.name} reports the loss")
+            signals[signal.name] = {"source": _source(signal, esc_names), "lost": "; ".join(lost)}
+        can_id = f"{message.can_id:0{8 if message.extended else 3}X}h"
         yield {"name": message.name, "id": can_id, "sent": _timing(message), "signals": signals}
 
 
@@ -195,26 +182,15 @@ def _held(signal: SignalPlan, raw: int) -> str:
     )
 
 
-def _lost(message: MessagePlan, signal: SignalPlan) -> str:
-    """What is lost in a signal: resolution, range, or the report of lost telemetry."""
-    notes = list(signal.notes)
-    if is_mute(signal) and (found := reporter(message, signal)) is not None:
-        notes.append(f"{found.name} reports the loss")
-    return "; ".join(notes)
-
-
 def _timing(message: MessagePlan) -> str:
     """Send type, cycle and minimum distance of a message, in words."""
-    words = []
-    if message.cycle_ns:
-        words.append(f"every {message.cycle_ns // MS} ms")
-    if SendType.EVENT in message.send_type:
-        words.append("with each frame")
-    if SendType.ON_CHANGE in message.send_type:
-        words.append("on change")
-    if message.delay_ns:
-        words.append(f">= {message.delay_ns // MS} ms")
-    return ", ".join(words)
+    words = {
+        f"every {message.cycle_ns // MS} ms": message.cycle_ns,
+        "with each frame": SendType.EVENT in message.send_type,
+        "on change": SendType.ON_CHANGE in message.send_type,
+        f">= {message.delay_ns // MS} ms": message.delay_ns,
+    }
+    return ", ".join(text for text, applies in words.items() if applies)
 
 
 def _source(signal: SignalPlan, esc_names: list[str]) -> str:

@@ -3,6 +3,7 @@
 import argparse
 import re
 import sys
+from argparse import ArgumentTypeError
 from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
@@ -39,23 +40,15 @@ def _time_ns(text: str) -> int:
     """A TIME in nanoseconds."""
     match = re.fullmatch(r"([0-9]{1,6}(?:\.[0-9]*)?)\s*(ms|s|min|h|)", text.strip())
     if not match:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a time. Give for example 5s, 200ms or 2min"
-        )
+        raise ArgumentTypeError(f"{text!r} is not a time. Give for example 5s, 200ms or 2min")
     return round(float(match[1]) * _UNITS[match[2]])
 
 
 def _dropout(text: str) -> Dropout:
     duration, _, interval = text.partition("/")
-    if not interval:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: the interval is missing. Give for example 2s/10s"
-        )
-    dropout = Dropout(_time_ns(duration), _time_ns(interval))
+    dropout = Dropout(_time_ns(duration), _time_ns(interval or "0"))
     if dropout.duration_ns >= dropout.interval_ns:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: the silence must be shorter than the interval, as 2s/10s"
-        )
+        raise ArgumentTypeError(f"{text!r} is not a silence and a longer interval, as 2s/10s")
     return dropout
 
 
@@ -65,11 +58,9 @@ def _error(text: str) -> ErrorWindow:
     key = name.lower().replace("-", "_")
     if key not in _BITS:
         near = did_you_mean(key, _BITS, or_known=True)
-        raise argparse.ArgumentTypeError(f"{name!r} is not an error bit.{near}")
+        raise ArgumentTypeError(f"{name!r} is not an error bit.{near}")
     if not start:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: the time is missing. Give for example undervoltage@5s+2s"
-        )
+        raise ArgumentTypeError(f"{text!r}: has no time. Give for example undervoltage@5s+2s")
     return ErrorWindow(_BITS[key], _time_ns(start), _time_ns(duration) if plus else None)
 
 

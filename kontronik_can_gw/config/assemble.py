@@ -178,8 +178,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             layout = prepare(database, file, escs, config.dbc_settings, config.can.fd, taken)
     if problems:
         raise UserError(*problems)
-    bitrate = config.can.bitrate
-    rates = bitrate, config.can.data_bitrate
+    rates = config.can.bitrate, config.can.data_bitrate
     load = check_load(layout, *rates, bits)
     if plain is not None:
         foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
@@ -189,7 +188,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             _, bits[_NODES] = nodes.needs(canopen, escs)
             with collecting(warnings):  # more than the bus has is no reason not to start
                 load = check_load(layout, *rates, bits)
-    warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(bitrate)]
+    warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(rates[0])]
     mute = [*unreported(layout, config.dbc.on_loss == "silent"), *unsupplied(layout, escs)]
     said = (*config.warnings, *ignored, *mute, *filter(None, [load]), *warnings)
     return Loaded(

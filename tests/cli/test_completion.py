@@ -35,9 +35,7 @@ ASKED = r"""
     ("typed", "offered"),
     [
         ("des", {"describe"}),
-        ("service in", {"install"}),
         ("service install --r", {"--root"}),
-        ("describe --dbc car.dbc --format j", {"json"}),
         ("describe --dbc car", {"car.dbc"}),
         ("run -c car", {"car.toml"}),
         ("decode car", {"car.toml", "car.dbc", "car.bin"}),

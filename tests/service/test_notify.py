@@ -116,19 +116,14 @@ def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None
 
 def test_a_manager_that_comes_back_is_reported_again(tmp_path: Path) -> None:
     path = tmp_path / "notify"
-    first = Manager(str(path))
-    notifier = Notifier(first.environment)
-    notifier.status("one")
-    assert first.told() == [["STATUS=one"]]
-    first.socket.close()
-    path.unlink()
-    notifier.status("two")
-    second = Manager(str(path))
-    with second.socket:
-        notifier.status("two")
-        assert second.told() == []
-        notifier.status("three")
-        assert second.told() == [["STATUS=three"]]
+    notifier = Notifier({"NOTIFY_SOCKET": str(path)})
+    for text in ("one", "three"):
+        manager = Manager(str(path))
+        with manager.socket:
+            notifier.status(text)
+            assert manager.told() == [[f"STATUS={text}"]]
+        path.unlink()
+        notifier.status(f"{text}, to nobody")
     notifier.close()
 
 
@@ -143,38 +138,25 @@ def test_a_manager_that_comes_back_is_reported_again(tmp_path: Path) -> None:
     ],
 )
 def test_the_watchdog_is_for_the_process_that_is_meant(
-    variables: dict[str, str], half: int | None, tmp_path: Path
+    variables: dict[str, str], half: int | None
 ) -> None:
-    manager = Manager(str(tmp_path / "notify"))
-    with manager.socket:
-        notifier = Notifier(manager.environment | variables)
-        assert notifier.watchdog_ns == half
-        notifier.watchdog()
-        assert manager.told() == ([["WATCHDOG=1"]] if half else [])
+    assert Notifier({"NOTIFY_SOCKET": "/none"} | variables).watchdog_ns == half
 
 
 # --- the log
 
 
-def record(level: int, text: str) -> logging.LogRecord:
-    return logging.LogRecord("kontronik_can_gw", level, __file__, 1, text, (), None)
-
-
-def test_standard_error_is_the_journal_only_where_its_inode_is_named(tmp_path: Path) -> None:
+def test_each_line_carries_its_priority_where_the_journal_reads(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     with (tmp_path / "log").open("w") as stream:
         status = os.fstat(stream.fileno())
         named = f"{status.st_dev}:{status.st_ino}"
-        for value, is_so in ((named, True), (f"{named}1", False), ("rubbish", False), ("", False)):
-            assert is_journal(stream, {"JOURNAL_STREAM": value}) == is_so
-    assert not is_journal(stream, {"JOURNAL_STREAM": named}), "a closed one"
-
-
-def test_each_line_carries_its_priority(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with (tmp_path / "log").open("w") as stream:
-        assert log_formatter(stream) is None
-        status = os.fstat(stream.fileno())
-        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
+        for value in (f"{named}1", "rubbish", ""):
+            assert not is_journal(stream, {"JOURNAL_STREAM": value})
+        monkeypatch.setenv("JOURNAL_STREAM", named)
         formatter = log_formatter(stream)
+    assert not is_journal(stream, {"JOURNAL_STREAM": named}), "a closed one"
     assert formatter is not None
-    assert formatter.format(record(logging.ERROR, "lost\nfor good")) == "<3>lost\n<3>for good"
-    assert formatter.format(record(logging.INFO, "back")) == "<6>back"
+    lost = logging.LogRecord("x", logging.ERROR, __file__, 1, "lost\nfor good", (), None)
+    assert formatter.format(lost) == "<3>lost\n<3>for good"
