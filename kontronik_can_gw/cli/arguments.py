@@ -1,7 +1,6 @@
 """Options of commands as rows of a table, and what several commands share of them."""
 
 import argparse
-import os
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -114,8 +113,16 @@ def config_file(given: Path | None) -> Path:
 
 
 def default_config() -> Path | None:
-    """The first of CONFIG_PLACES that is there, be it a link that leads nowhere."""
-    return next((place for place in CONFIG_PLACES if os.path.lexists(place)), None)
+    """The first of CONFIG_PLACES that is there: a link that leads nowhere, and what a closed folder hides, too."""
+    for place in CONFIG_PLACES:
+        try:
+            place.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError:
+            pass  # reading it says why it cannot be
+        return place
+    return None
 
 
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:

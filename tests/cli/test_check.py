@@ -1,6 +1,7 @@
 """What ``check`` says in short and as JSON, and where commands find a configuration that is not named."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -107,3 +108,23 @@ def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another
     assert run("dbc", "-c", own).out == text
     written(own.with_name("sent.dbc"), text.replace("(0.01,", "(0.02,", 1))
     assert fingerprint() != first
+
+
+def test_a_configuration_in_a_closed_folder_is_there(tmp_path: Path) -> None:
+    """Within this process, so that root can lay its rights down for the moment: root may look everywhere."""
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    file = written(closed / "gateway.toml", LEAST)
+    run("check", file)  # imports what it needs, while that can be read
+    closed.chmod(0)
+    user = os.geteuid()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(arguments, "CONFIG_PLACES", (file, tmp_path / "etc.toml"))
+        if user == 0:
+            os.seteuid(65534)
+        try:
+            said = refused(2, "check")
+        finally:
+            os.seteuid(user)
+            closed.chmod(0o700)
+    assert said == f"{file}: cannot be read: Permission denied."
