@@ -182,8 +182,11 @@ def test_words_of_errors_and_states_become_events() -> None:
     """Of an ESC that has a word instead of a flag for each bit, as in captures."""
     events = Events()
     fields = [
-        Field(source, "", Kind.WHOLE, source=source, esc=0)
-        for source in ("operating_errors", "operating_state", "battery_voltage", "bec_voltage")
+        Field(source, "", kind, source=source, esc=0, signal=source)
+        for source, kind in (
+            *(("operating_errors", Kind.WHOLE), ("operating_state", Kind.TEXT)),
+            *(("battery_voltage", Kind.FLOAT), ("bec_voltage", Kind.FLOAT)),
+        )
     ]
     esc = EscFlight(0, shipped_bus().escs[0], fields, events)
     programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30
