@@ -1,14 +1,9 @@
 """README.md and docs/ are true: tables are those of the sources, commands exist, links lead somewhere, examples are valid."""
 
 import re
-import shutil
-import subprocess
-import sys
 import tomllib
-import zipfile
 from pathlib import Path
 
-import cantools.database
 import pytest
 from pictures import SHOWN, VIEWS, main
 from reference import FOLDER, pages
@@ -17,7 +12,6 @@ from shell_blocks import PAGES as BY_HAND
 
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.config.export import schema
-from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 
 PROJECT = FOLDER.parents[1]
@@ -93,37 +87,6 @@ def test_every_make_target_that_is_named_exists() -> None:
     for target in re.findall(r"`?make ([a-z]+)", ALL):
         if target not in ("an", "no", "sure"):
             assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
-
-
-def test_a_wheel_carries_dbc_and_example_and_finds_them(tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    shutil.copytree(
-        PROJECT,
-        source,
-        ignore=shutil.ignore_patterns(".*", "__pycache__", "tests"),
-    )
-
-    def python(*words: object) -> str:
-        command = [sys.executable, *map(str, words)]
-        return subprocess.run(
-            command, cwd=source, check=True, capture_output=True, text=True
-        ).stdout
-
-    python("-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
-    installed = tmp_path / "installed"
-    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
-        wheel.extractall(installed)
-    begin = f"import sys; sys.path.insert(0, {str(installed)!r}); "
-    assert str(installed) in python(
-        "-I", "-c", f"{begin} import kontronik_can_gw as k; print(k.__file__)"
-    )
-    command = f"{begin} from kontronik_can_gw.cli import main; sys.exit(main())"
-    loaded = cantools.database.load_string(python("-I", "-c", command, "dbc"), "dbc")
-    original = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-    assert isinstance(loaded, cantools.database.Database)
-    assert isinstance(original, cantools.database.Database)
-    assert [m.name for m in loaded.messages] == [m.name for m in original.messages]
-    assert "[[esc]]" in python("-I", "-c", command, "init", "-")
 
 
 def test_pages_by_hand_are_short() -> None:

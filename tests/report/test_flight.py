@@ -137,7 +137,7 @@ def test_losses_are_gaps_in_lines_and_events(
     assert summary.gaps == 3
     assert summary.counted["losses"] == rows[-1][1][column(bus, "losses")] == 3
     assert summary.counted["crc_errors"] > 0
-    points = list(zip(flight.times, flight.lines[0, "battery_power"], strict=True))
+    points = list(zip(flight.points.times, flight.lines[0, "battery_power"], strict=True))
     for event in lost:
         inside = [v for t, v in points if event.begin_ns < t < (event.end_ns or 0)]
         assert None in inside
@@ -154,9 +154,9 @@ def test_many_events_and_states_stay_bounded() -> None:
         operating_state_raw=[OperatingState.Forward, OperatingState.Brake] * 15_000,
     )
     flight = flight_of(bus, rows, 1000)
-    assert flight.left_out == 35_000
+    assert flight.seen.left_out == 35_000
     assert len(flight.events) == 10_000
-    assert len(flight.times) <= 1000
+    assert len(flight.points.times) <= 1000
 
 
 @pytest.mark.parametrize("points", [100, 20_000])
@@ -169,7 +169,7 @@ def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(po
     line = flight.lines[0, "battery_voltage"]
     drawn = [
         (t0, t1)
-        for (t0, t1), (a, b) in zip(pairwise(flight.times), pairwise(line), strict=True)
+        for (t0, t1), (a, b) in zip(pairwise(flight.points.times), pairwise(line), strict=True)
         if a is not None and b is not None
     ]
     assert len(drawn) >= 40
@@ -182,8 +182,11 @@ def test_words_of_errors_and_states_become_events() -> None:
     """Of an ESC that has a word instead of a flag for each bit, as in captures."""
     events = Events()
     fields = [
-        Field(source, "", Kind.WHOLE, source=source, esc=0)
-        for source in ("operating_errors", "operating_state", "battery_voltage", "bec_voltage")
+        Field(source, "", kind, source=source, esc=0, signal=source)
+        for source, kind in (
+            *(("operating_errors", Kind.WHOLE), ("operating_state", Kind.TEXT)),
+            *(("battery_voltage", Kind.FLOAT), ("bec_voltage", Kind.FLOAT)),
+        )
     ]
     esc = EscFlight(0, shipped_bus().escs[0], fields, events)
     programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30

@@ -86,7 +86,7 @@ def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
 
 def test_the_data_in_the_page_are_those_of_the_lines(flight: Flight) -> None:
     found = data_of(render(flight, source="y"))
-    assert found["times"] == [round((t - flight.origin_ns) / S, 6) for t in flight.times]
+    assert found["times"] == [round((t - flight.origin_ns) / S, 6) for t in flight.points.times]
     written = [
         (plot["title"], plot["lines"][series["line"]], series["values"])
         for plot in found["plots"]

@@ -5,11 +5,11 @@ A value holds until the next row; while telemetry is lost nothing is counted.
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
-from math import inf, isfinite
+from math import isfinite
 from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.desk.report.events import Event, Events, Extreme, Number
 from kontronik_can_gw.desk.report.quantities import (
     COUNTERS,
@@ -59,6 +59,8 @@ class EscFlight:
         """Every device seen, in words; usually one."""
         self._index, self._events, self._protocol = index, events, protocol_named(settings.protocol)
         self._at = at = {f.source: i for i, f in reversed([*enumerate(fields)]) if f.esc == index}
+        self._floats = {f.source for f in fields if f.signal and f.kind is Kind.FLOAT}
+        """Values of CAN frames, which may be infinite: that is no value."""
         self._live = next((source for source in LIVE if source in at), None)
         self._words: list[tuple[str, str, Iterable[int], int]] = []
         """Error words and flags: source, word, bits in it, and by how much its value is shifted."""
@@ -90,7 +92,9 @@ class EscFlight:
         self, times: Sequence[int], chunk: Sequence[Sequence[Any]]
     ) -> list[Sequence[int | float | None]]:
         """Take rows as columns; return those to draw."""
-        columns = {source: _finite(chunk[at]) for source, at in self._at.items()}
+        columns = {source: chunk[at] for source, at in self._at.items()}
+        for source in columns.keys() & self._floats:
+            columns[source] = [v if v is None or isfinite(v) else None for v in columns[source]]
         self._derive(columns)
         nothing = (None,) * len(times)
         present = nothing if self._live is None else columns[self._live]
@@ -235,13 +239,6 @@ class EscFlight:
             elif self.load_voltage is None and abs(current) <= REST_CURRENT and voltage > 0:
                 self.rest_voltage = voltage
         self._held = since, was_there, held_power, turned
-
-
-def _finite(values: Sequence[Any]) -> Sequence[Any]:
-    """A float signal may be infinite; that is no value."""
-    if inf not in values and -inf not in values:
-        return values
-    return [value if value is None or isfinite(value) else None for value in values]
 
 
 def _state_of(columns: Columns) -> str:

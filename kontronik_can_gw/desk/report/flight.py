@@ -49,59 +49,36 @@ class Flight:
         self._gap_ns = max(500 * MS, *(settings.timeout_ns + 250 * MS for settings in escs))
         self._blank = ((None,),) * len(fields)
         self._gateway_state = column_of(fields, "gateway_state", None)
-        self._events = Events()
-        self._origin_ns: int | None = None
-        self._start_ns: int | None = None
-        self.end_ns = 0
+        self.seen = Events()
+        self._has_begun = False
+        self.origin_ns = self.start_ns = self.end_ns = 0
+        """Times of the recording's first row (time 0 of the page), and of the window's first and last."""
         self.rows = 0
         self.replayed = False
-        self.escs = [EscFlight(i, each, fields, self._events) for i, each in enumerate(escs)]
+        self.escs = [EscFlight(i, each, fields, self.seen) for i, each in enumerate(escs)]
         self._drawn = [(i, source) for i, esc in enumerate(self.escs) for source in esc.drawn]
-        self._decimator = Decimator(len(self._drawn), points)
+        self.points = Decimator(len(self._drawn), points)
+        """Times and columns of all lines."""
         self.lines: dict[tuple[int, str], list[Number]] = {}
-        """The points to draw, by ESC and source; and all events by their begin, after ``finish``."""
+        """After ``finish``: the points to draw, by ESC and source."""
         self.events: list[Event] = []
+        """After ``finish``: all events by their begin."""
 
     @property
     def has_anything(self) -> bool:
         """True if the fields have a value that can be drawn."""
         return bool(self._drawn)
 
-    @property
-    def start_ns(self) -> int:
-        """Time of the first row of the window."""
-        return self._start_ns or 0
-
-    @property
-    def origin_ns(self) -> int:
-        """Time of the recording's first row: time 0 of the page."""
-        return self.start_ns if self._origin_ns is None else self._origin_ns
-
-    @property
-    def times(self) -> list[int]:
-        """Of the points of all lines."""
-        return self._decimator.times
-
-    @property
-    def rows_in_bucket(self) -> int:
-        """Rows that two points stand for; 1: every row is drawn."""
-        return self._decimator.rows_in_bucket
-
-    @property
-    def left_out(self) -> int:
-        """Number of events that were only counted."""
-        return self._events.left_out
-
     def take(self, block: Block) -> bool:
         """Take rows; False where all that follow are after the window."""
-        if self._origin_ns is None:
-            self._origin_ns = block.times[0]
-        high = LATEST_NS if self._to_ns is None else self._origin_ns + self._to_ns
-        rows = block.between(self._origin_ns + self._from_ns, high)
+        if not self._has_begun:
+            self._has_begun, self.origin_ns = True, block.times[0]
+        high = LATEST_NS if self._to_ns is None else self.origin_ns + self._to_ns
+        rows = block.between(self.origin_ns + self._from_ns, high)
         begin = 0
         for row, time_ns in enumerate(rows.times):
-            if self._start_ns is None:
-                self._start_ns = self.end_ns = time_ns
+            if not self.rows and not row:
+                self.start_ns = time_ns
             elif time_ns - self.end_ns > self._gap_ns:
                 self._analyse(rows.part(begin, row))
                 self._analyse(Block([self.end_ns], self._blank, None))
@@ -113,7 +90,7 @@ class Flight:
 
     def finish(self) -> "Flight":
         """Have ``lines`` and ``events`` made after the last row."""
-        lines = zip(self._drawn, self._decimator.columns, strict=True)
+        lines = zip(self._drawn, self.points.columns, strict=True)
         self.lines = {key: line for key, line in lines if line.count(None) < len(line)}
         for slow, fast in pairwise(("output_speed", "motor_speed", "electrical_speed")):
             found = [esc.extremes for esc in self.escs]
@@ -124,7 +101,7 @@ class Flight:
                 for index, extremes in enumerate(found):
                     self.lines.pop((index, slow), None)
                     extremes.pop(slow, None)
-        self.events = self._events.in_order()
+        self.events = self.seen.in_order()
         return self
 
     def _analyse(self, rows: Block) -> None:
@@ -136,4 +113,4 @@ class Flight:
             for value in set(columns[self._gateway_state]):
                 self.replayed |= value == replay or normalize(str(value)) == normalize(replay.name)
         drawn = [column for esc in self.escs for column in esc.take(times, columns)]
-        self._decimator.feed(times, drawn)
+        self.points.feed(times, drawn)

@@ -76,7 +76,7 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
         "from": seconds(flight.start_ns),
         "to": seconds(flight.end_ns),
         "wall": None if wall_ns is None else wall_ns // 1_000_000,
-        "times": [seconds(time_ns) for time_ns in flight.times],
+        "times": [seconds(time_ns) for time_ns in flight.points.times],
         "phases": PHASES,
         "plots": list(_plots(flight)),
         "events": [
@@ -169,11 +169,11 @@ def _damage(damage: Sequence[str]) -> str:
 
 def _notes(flight: Flight) -> str:
     lines = []
-    if flight.rows_in_bucket > 1:
+    if flight.points.rows_in_bucket > 1:
         lines.append(
-            f"Lines are drawn from the minimum and the maximum of each {flight.rows_in_bucket} rows: no peak is lost, its time is "
+            f"Lines are drawn from the minimum and the maximum of each {flight.points.rows_in_bucket} rows: no peak is lost, its time is "
             "exact to within them. All numbers in the tables are from every row."
         )
-    if flight.left_out:
-        lines.append(f"{flight.left_out} more events are not listed.")
+    if flight.seen.left_out:
+        lines.append(f"{flight.seen.left_out} more events are not listed.")
     return "".join(f'<p class="note">{line}</p>' for line in lines)
