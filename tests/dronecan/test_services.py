@@ -95,16 +95,28 @@ def test_requests_that_never_end_are_answered_now_and_then() -> None:
     assert len(bench.of("Status")) > 70  # measurements went on
 
 
+CUT_OFF = ("", "00", "0004", "000405", "0001000000", "0005", "0007", "00040a41")
+"""Requests of GetSet."""
+
+
 @pytest.mark.parametrize(
-    "data", ["", "00", "0004", "000405", "0001000000", "0005", "0007", "00040a41"]
+    "frame",
+    [
+        CanFrame(0x601, b"\x40\x18\x10\x04\0\0\0\0"),
+        CanFrame(0x1E01AAE5, b"\xc0", True, remote=True),
+        CanFrame(0x1E01AAE5, b"\xc0", True, fd=True),
+        CanFrame(0x1E01AAE5, b"", True),
+        CanFrame(0x1E01AB65, b"\xc0", True),  # to 43
+        CanFrame(0x1E012AE5, b"\xc0", True),  # a response
+        CanFrame(0x1E01AA80, b"\xc0", True),  # of nobody
+        CanFrame(0x1E63AAE5, b"\xc0", True),  # a service that we do not have
+        *(CanFrame(0x1E0BAAE4, bytes.fromhex(data) + b"\xc0", True) for data in CUT_OFF),
+    ],
 )
-def test_a_get_set_request_that_is_cut_off_is_no_request(data: str) -> None:
+def test_what_is_no_request_to_us_is_not_answered(frame: CanFrame) -> None:
     bench = Bench().run(0.1)
-    bench.clear()
-    payload = bytes.fromhex(data)
-    bench.receive(CanFrame(0x1E0BAAE4, payload + b"\xc0", True))
-    answers = [frame for _, frame in bench.frames if frame.can_id & 0x80]
-    assert not answers
+    bench.output.receive(frame, bench.now, bench.now)
+    assert not bench.output.frames
     assert Peer(bench).ask(GetSet.Request(index=0), 42) is not None
 
 

@@ -9,7 +9,6 @@ from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
 
 HOT = OperatingError.POWER_STAGE_OVERTEMP_ERROR
@@ -215,22 +214,3 @@ def test_errors_that_began_while_nothing_reached_the_bus_are_logged_when_it_retu
         bench.gateway.can_returned(bench.now)
         assert bench.run(0.01).read[0].name == "NodeStatus"
     assert text_of(bench.run(1.1)) == f"e0: {WARM.meaning}. {WARM.remedy}"
-
-
-@pytest.mark.parametrize(
-    "frame",
-    [
-        CanFrame(0x601, b"\x40\x18\x10\x04\0\0\0\0"),
-        CanFrame(0x1E01AAE5, b"\xc0", True, remote=True),
-        CanFrame(0x1E01AAE5, b"\xc0", True, fd=True),
-        CanFrame(0x1E01AAE5, b"", True),
-        CanFrame(0x1E01AB65, b"\xc0", True),  # to 43
-        CanFrame(0x1E012AE5, b"\xc0", True),  # a response
-        CanFrame(0x1E01AA80, b"\xc0", True),  # of nobody
-        CanFrame(0x1E63AAE5, b"\xc0", True),  # a service that we do not have
-    ],
-)
-def test_what_is_no_request_to_us_is_nothing_to_it(frame: CanFrame) -> None:
-    bench = Bench().run(0.1)
-    bench.output.receive(frame, bench.now, bench.now)
-    assert not bench.output.frames
