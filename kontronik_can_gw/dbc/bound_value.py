@@ -8,24 +8,22 @@ from fractions import Fraction
 from kontronik_can_gw.dbc import raw_values
 from kontronik_can_gw.dbc.raw_values import ValueTable
 from kontronik_can_gw.dbc.settings import UnfitSignal
-from kontronik_can_gw.esc.values import Divisor, Value
+from kontronik_can_gw.esc.values import Value
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import Role, SignalPlan
 
 
 def bound_plan(
-    plan: SignalPlan, table: ValueTable, value: Value, divisor: Fraction, on_loss: int | None
+    plan: SignalPlan, table: ValueTable, value: Value, on_loss: int | None
 ) -> SignalPlan:
     """The plan of a signal with the value as its source. UnfitSignal where it cannot show the value.
 
-    ``divisor``: of the value's steps, as configured. ``on_loss``: what a flag holds without telemetry, 0 or 1; None: its code.
+    ``on_loss``: what a flag holds without telemetry, 0 or 1; None: its code.
     """
     slope, intercept = _scale(plan, value)
     plan = replace(plan, role=Role.SOURCE, source=value, slope=slope, intercept=intercept)
     numbers = table.numbers(value)
     notes = [*_notes_on_names(value, numbers)]
-    if not numbers and not plan.is_float:
-        notes += _notes_on_scale(plan, value, slope / divisor)
     low, high = plan.low, plan.high
     if value.bit is not None and plan.length == 1:
         plan = _flag(plan, on_loss)
@@ -62,21 +60,6 @@ def _notes_on_names(value: Value, numbers: Mapping[int, int]) -> Iterator[str]:
         yield "the value table has no name of it: sent as the ESC's number"
     elif missing:
         yield f"sent as Error, not in the value table: {', '.join(missing)}"
-
-
-def _notes_on_scale(plan: SignalPlan, value: Value, slope: Fraction) -> Iterator[str]:
-    """Resolution and range that are lost. ``slope``: of the value after its divisor."""
-    unit = plan.unit or value.unit
-    if abs(slope) < 1 and value.divisor is not Divisor.CELLS:
-        yield f"resolution {raw_values.text(abs(plan.factor))} {unit}".rstrip()
-    ends = [end * slope + plan.intercept for end in (value.low, value.high) if end is not None]
-    if value.rolls or not ends:
-        return
-    # more is lost than the codes NotAvailable and Error take
-    if min(ends) < plan.low - 2 or max(ends) > plan.high + 2:
-        limits = sorted(end * plan.factor + plan.offset for end in (plan.low, plan.high))
-        first, last = map(raw_values.text, limits)
-        yield f"{f'range {first} to {last} {unit}'.rstrip()}, beyond it Error"
 
 
 def _flag(plan: SignalPlan, on_loss: int | None) -> SignalPlan:

@@ -11,7 +11,7 @@ from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.settings import Compilation, UnfitSignal
-from kontronik_can_gw.esc.values import Group, Value, divisor_of_settings
+from kontronik_can_gw.esc.values import Group, Value
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.packer import float_bits
 from kontronik_can_gw.signals.plan import Role, SignalPlan
@@ -172,8 +172,7 @@ class SignalCompiler:
         if esc is None and value.group is not Group.GATEWAY:
             examples = " or ".join(f"{e.name}.{value.name}" for e in escs[:2])
             raise UnfitSignal(f"does not say of which ESC. Prefix it or bind it: {examples}.")
-        divisor = Fraction(1) if esc is None else divisor_of_settings(value, escs[esc])
-        plan = bound_plan(plan, self.table, value, divisor, self._flag_on_loss())
+        plan = bound_plan(plan, self.table, value, self._flag_on_loss())
         if value.unit and not plan.unit:
             self.job.warnings.append(f"{self._where}: has no unit; {value.unit} is taken.")
         return replace(plan, esc=esc)
