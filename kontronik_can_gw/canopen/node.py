@@ -19,10 +19,9 @@ from kontronik_can_gw.canopen.identity import Identity
 from kontronik_can_gw.canopen.lss import LssSlave
 from kontronik_can_gw.canopen.nmt import Nmt
 from kontronik_can_gw.canopen.parameters import Parameters
-from kontronik_can_gw.canopen.pdo import Tpdos
+from kontronik_can_gw.canopen.pdo import SyncConsumer, Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.canopen.sync import SyncConsumer
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus

@@ -63,9 +63,9 @@ def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
     for copy in ours:
         key: object = None
         if copy.esc is not None:
-            esc = job.binder.escs[copy.esc]
+            protocol = job.binder.escs[copy.esc].protocol
             bound = (job.binder.bound(copy, signal.name) for signal in copy.message.signals)
-            key = (id(copy.message), esc.protocol, esc.pole_pairs, esc.gear, *bound)
+            key = (id(copy.message), protocol, *bound)
         if copy.esc is not None and key in made:
             of, plan = made[key]
             yield replace(

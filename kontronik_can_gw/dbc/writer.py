@@ -27,6 +27,7 @@ def dbc_text(
     """
     dbc: Any = database.dbc
     sent = [Copy(message) for message in database.messages] if copies is None else copies
+    signals = [(c.key, s, name) for c in sent for s, name in _sorted(c)]
     definitions = [("", d) for d in dbc.attribute_definitions.values()]
     definitions += [("REL_", d) for d in dbc.relation_attribute_definitions.values()]
     sections = (
@@ -50,12 +51,7 @@ def dbc_text(
             if d.default_value is not None
         ],
         [*_attributes(database, sent), *_relations(dbc.relation_attributes, sent)],
-        [
-            f"VAL_ {c.key} {name} {_texts(s.choices)} ;"
-            for c in sent
-            for s, name in _sorted(c)
-            if s.choices
-        ],
+        [f"VAL_ {key} {name} {_texts(s.choices)} ;" for key, s, name in signals if s.choices],
         [
             f"SIG_GROUP_ {c.key} {group.name} {group.repetitions} : "
             f"{' '.join(c.prefix + name for name in group.signal_names)};"
@@ -63,9 +59,8 @@ def dbc_text(
             for group in c.message.signal_groups or ()
         ],
         [
-            f"SIG_VALTYPE_ {c.key} {name} : {1 if s.length == 32 else 2};"
-            for c in sent
-            for s, name in _sorted(c)
+            f"SIG_VALTYPE_ {key} {name} : {1 if s.length == 32 else 2};"
+            for key, s, name in signals
             if s.is_float
         ],
         [line for c in sent for line in _multiplexing(c)],

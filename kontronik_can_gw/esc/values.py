@@ -137,15 +137,6 @@ def divisor(value: Value, esc: EscTelemetry) -> tuple[int, int] | None:
     return (cells, 1) if cells else None
 
 
-def divisor_of_settings(value: Value, settings: EscSettings) -> Fraction:
-    """The divisor as far as it is configured: 1 for the number of cells."""
-    if value.divisor is Divisor.POLE_PAIRS:
-        return Fraction(settings.pole_pairs)
-    if value.divisor is Divisor.OUTPUT:
-        return settings.pole_pairs * settings.gear
-    return Fraction(1)
-
-
 def scaled(value: Value, esc: EscTelemetry, found: int | None, slope: Fraction) -> int | None:
     """Steps x ``slope`` / divisor as a whole number, rounded once, halves up; None: not available."""
     parts = divisor(value, esc)

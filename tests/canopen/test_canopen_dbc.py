@@ -17,7 +17,6 @@ from packer_oracle import ERROR_BITS, KNOWN, pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc.names import esc_prefix
@@ -205,32 +204,6 @@ def test_every_frame_of_running_nodes_decodes_to_the_telemetry() -> None:
 
 
 # --- other mappings ------------------------------------------------------------------------------------------------------
-
-
-def test_what_a_master_mapped_and_stored_is_described_from_the_configuration() -> None:
-    first = dialogue.Bench(escs=PAIR)
-    # 2001h:1 motor speed, 2001h:3 battery power; 2011h:2, 2011h:7, 2011h:9, 2011h:B, 2011h:3
-    remap(first, 4, 0x1A2, [0x20010120, 0x20010320], node=2)
-    remap(first, 1, 0x282, [0x20110210, 0x20110710, 0x20110908, 0x20110B08, 0x20110310], node=2)
-    remap(first, 0, 0x182, [0x606C0020, 0x60790020], node=2)
-    for index, sub, value in ((0x1801, 5, 400), (0x1017, 0, 250)):
-        assert first.write(index, sub, value, size=2, node=2) is None
-    assert first.write(0x1010, 1, b"save", node=2) is None
-
-    bench = Bench(PAIR, [EscOptions()] * 2, stored=[Stored(), first.on_disk[1]])
-    messages = {m.name: m for m in bench.database.messages}
-    signals = {name: {s.name for s in m.signals} for name, m in messages.items()}
-    assert signals["RightRTpdo5"] == {"RightRMotorSpeed", "RightRBatteryPower"}
-    assert signals["RightRTpdo1"] == {"RightRVelocityActualValue", "RightRDcLinkCircuitVoltage"}
-    assert "LeftTpdo5" not in signals
-    extremes = messages["RightRTpdo2"]
-    assert (extremes.cycle_time, extremes.send_type) == (400, "CyclicAndEvent")
-    assert messages["RightRHeartbeat"].cycle_time == 250
-    bench.start()
-    bench.run(7 * SECOND)
-    assert max(values["RightRMotorSpeed"] for values in bench.seen["RightRTpdo5"][1:]) > 100
-    assert bench.seen["RightRTpdo2"][0]["RightRMaxThrottlePercent"] == NA
-    assert bench.seen["RightRTpdo2"][-1]["RightRMaxBatteryVoltage"] > 10
 
 
 def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:

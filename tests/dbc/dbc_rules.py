@@ -12,9 +12,6 @@ import cantools.database
 from esc import sheet
 from packer_oracle import CAN_STATES, GATEWAY_STATES, LAYOUTS, LINKS
 
-LONGEST_NAME = 32
-LONGEST_SIGNAL_NAME = 28
-"""Leaves four characters for the prefix of further ESCs, as `Esc2`."""
 CODES = {"Error", "NotAvailable"}
 ENUMS = {
     "OperatingState": {
@@ -100,9 +97,6 @@ class Database:
             if s.choices
         }
         """Texts of values, by id of the message and name of the signal."""
-        self.plain = not any(
-            m.is_multiplexed() or s.is_float for m in read.messages for s in m.signals
-        )
         self._owners = owners | {("",): read}
 
     def named(self, signal: Signal) -> dict[int, str]:
@@ -139,24 +133,6 @@ def parse(data: bytes) -> Database:
 # --- the rules ----------------------------------------------------------------------------------------------------------
 
 
-def it_is_plain(db: Database) -> Iterator[str]:
-    if not db.plain:
-        yield "has floats or multiplexers"
-
-
-def names_are_pascal_case(db: Database) -> Iterator[str]:
-    others = [*db.nodes, *(message.name for message in db.messages)]
-    texts = [text for table in db.tables.values() for text in table.values()]
-    for names, longest in (
-        (others, LONGEST_NAME),
-        ([signal.name for signal in db.signals], LONGEST_SIGNAL_NAME),
-        (texts, LONGEST_NAME),
-    ):
-        for name in names:
-            if not re.fullmatch(r"[A-Z][A-Za-z0-9]*", name) or len(name) > longest:
-                yield f"{name} is not PascalCase, or too long"
-
-
 def limits_leave_out_the_codes(db: Database) -> Iterator[str]:
     """[min|max] is the whole type less the two codes, of an enum 0 to its greatest name. It always contains 0: canmatrix
     checks the default start value against it."""
@@ -190,8 +166,9 @@ def everything_has_a_comment(db: Database) -> Iterator[str]:
 RULES: dict[str, Callable[[Database], Iterator[str]]] = {
     rule.__name__: rule
     for rule in (
-        *(it_is_plain, names_are_pascal_case, limits_leave_out_the_codes),
-        *(enums_are_closed, everything_has_a_comment),
+        limits_leave_out_the_codes,
+        enums_are_closed,
+        everything_has_a_comment,
     )
 }
 

@@ -20,7 +20,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals import e2e
-from kontronik_can_gw.signals.plan import Layout, Role
+from kontronik_can_gw.signals.plan import Layout
 
 LIVE = LiveData(
     electrical_speed=70_000,
@@ -128,16 +128,6 @@ def test_the_codes_are_known_by_their_usual_names() -> None:
 
 
 # --- alive counter and E2E profile 1 ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "alive", ["Alive", "alive_counter", "PowerRollingCounter", "MessageCounter", "SequenceCounter"]
-)
-@pytest.mark.parametrize("crc", ["Crc", "CRC8", "Power_Crc", "Checksum"])
-def test_an_alive_counter_and_a_crc_are_known_by_their_names(alive: str, crc: str) -> None:
-    text = dbc_text([Msg("M", 1, 8, [Sig(crc, 0, 8), Sig(alive, 8, 4)])])
-    roles = [signal.role for signal in compiled(text).messages[0].signals]
-    assert roles == [Role.CRC, Role.ALIVE]
 
 
 def theirs(data: bytes, at: int, data_id: int) -> bytes:

@@ -162,13 +162,6 @@ def test_dbc_units_says_what_a_text_means_whatever_it_means_elsewhere() -> None:
     ]
 
 
-def test_a_degree_is_read_in_either_encoding_of_a_file() -> None:
-    text = MESSAGE + signal("BecTemperature", "0|8@1-", "°C")
-    for encoding in ("utf-8", "cp1252"):
-        (message,) = parse_database(text.encode(encoding), "my.dbc").messages
-        assert message.signals[0].unit == "°C"
-
-
 # --- which messages, and signals bound to nothing ----------------------------------------------------------------------
 
 OURS = ("Motor_11", "Motor_12", "Brake_1")
@@ -192,20 +185,6 @@ ECU = (
     + 'VAL_ 5 Warm 15 "SNA" 0 "Cold" ;\nSIG_VALTYPE_ 6 Ratio : 1;\n'
 )
 GATEWAYS: dict[str, Any] = {"node": "Gateway", "unbound": "start_value"}
-
-
-@pytest.mark.parametrize(
-    ("patterns", "chosen"),
-    [
-        (["Brake_1", "Motor_?1"], ["Motor_11", "Brake_1", "Motor_21"]),
-        ([], ["Motor_11", "Motor_12", "Brake_1", "Motor_20", "Motor_21"]),
-    ],
-)
-def test_messages_are_chosen_by_patterns_of_their_names(
-    patterns: list[str], chosen: list[str]
-) -> None:
-    layout = compiled(ECU, messages=patterns, **GATEWAYS)
-    assert [plan.name for plan in layout.messages] == chosen
 
 
 def test_a_pattern_that_names_no_message_of_ours_is_refused() -> None:
@@ -466,6 +445,14 @@ def test_of_two_escs_each_flag_needs_a_signal_of_its_own_esc() -> None:
     assert "RightUndervoltage" in line and "LeftUndervoltage" not in line
 
 
+@pytest.mark.parametrize("bits", [8, 16, 24, 63])
+def test_a_float_of_another_length_is_refused_whatever_it_begins_with(bits: int) -> None:
+    text = HEAD + "BO_ 256 Message: 8 Gateway\n" + signal("Throttle", f"0|{bits}@1-", "%")
+    more = "SIG_VALTYPE_ 256 Throttle : 1;\n" + START + start_of("Throttle", 5)
+    (line,) = refused(text + more)
+    assert f"a float of {bits} bits cannot be sent" in line
+
+
 def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
     old = DbcSettings({"A.B": 1}, base_id=5, data_ids={"M": 7})
     later: dict[str, Any] = {"units": {"x": "V"}, "send_types": {"y": "Event"}}
@@ -477,20 +464,3 @@ def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
     for key in later:
         del header["dbc"][key]
     assert CaptureSetup.of(header).dbc_settings == old
-
-
-def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_that_advice() -> (
-    None
-):
-    layout = compiled(FLAG + signal("CrcErrors", "8|8@1+"))
-    for silent in (False, True):
-        (line,) = unreported(layout, silent)
-        assert "on_loss" not in line and "link_state" in line
-
-
-@pytest.mark.parametrize("bits", [8, 16, 24, 63])
-def test_a_float_of_another_length_is_refused_whatever_it_begins_with(bits: int) -> None:
-    text = HEAD + "BO_ 256 Message: 8 Gateway\n" + signal("Throttle", f"0|{bits}@1-", "%")
-    more = "SIG_VALTYPE_ 256 Throttle : 1;\n" + START + start_of("Throttle", 5)
-    (line,) = refused(text + more)
-    assert f"a float of {bits} bits cannot be sent" in line
