@@ -64,7 +64,7 @@ class CanConfig:
     data_bitrate: int = key(integer(10_000, 8_000_000), 2_000_000,
         "bit rate of the CAN FD data phase in bit/s")
     options: Mapping[str, str | float] = key(options("can", _OF_CAN), {},
-        "further options of the python-can interface, as host or ttyBaudrate")
+        "further options of the python-can interface, as host or ttyBaudrate; SocketCAN takes none")
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,13 @@ import logging
 import os
 import select
 import termios
-from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from wire_world import World, loop_in, run
+from wire_world import Wire, World, loop_in, run
 
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
@@ -25,7 +24,6 @@ from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime import serial_port, usb_adapters
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.serial_port import PortLost, is_mini_uart
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
@@ -34,7 +32,7 @@ LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2"
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)
 
 
-class Port:
+class Port(Wire):
     """A serial port that is told what to read. ``there``: path to adapter."""
 
     there: dict[str, Identity | None]
@@ -42,20 +40,15 @@ class Port:
     def __init__(self, path: str, _protocol: object) -> None:
         if path not in self.there:
             raise RunError(f"{path}: no such serial port.")
+        super().__init__(World(), int(path[-1]) if path[-1].isdigit() else 9)
         self.path = path
         self.reads: list[bytes | Exception] = []
         self.counts: dict[str, int] = {"parity": 5}
-        self.waits_to_be_read = False
-        self.drained = True
-        self.pipe = PtyEsc()
-
-    def fileno(self) -> int:
-        return self.pipe.fileno()
 
     def identity(self) -> Identity | None:
         return self.there[self.path]
 
-    def read(self) -> bytes:
+    def read(self, most: int = 0) -> bytes:
         found = self.reads.pop(0)
         if isinstance(found, Exception):
             raise found
@@ -63,17 +56,6 @@ class Port:
 
     def line_errors(self) -> dict[str, int]:
         return dict(self.counts)
-
-    settings = b""
-
-    def settings_hold(self) -> bool:
-        return True
-
-    def discard(self) -> None:
-        pass
-
-    def close(self) -> None:
-        self.pipe.close()
 
 
 class Bench:
@@ -83,10 +65,10 @@ class Bench:
         escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
         self.gateway = Gateway(escs, Layout("x", "Gw", ()), 0)
         self.conditions = FaultLog()
-        self.selector = Poller(lambda: 0)
+        self.poller = World().poller
         self.lost: set[EscPort] = set()
         self.escs = [
-            EscPort(n, path, self.gateway, self.selector, self.conditions, self.lost)
+            EscPort(n, path, self.gateway, self.poller, self.conditions, self.lost)
             for n, path in enumerate(paths)
         ]
         for esc in self.escs:
@@ -105,11 +87,6 @@ class Bench:
         for esc in self.escs:
             esc.reopen(now, tuple(other.identity for other in self.escs if other is not esc))
 
-    def close(self) -> None:
-        for esc in self.escs:
-            esc.close()
-        self.selector.close()
-
 
 @pytest.fixture
 def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
@@ -123,26 +100,10 @@ def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
 
 
 @pytest.fixture
-def opened(
-    there: dict[str, Identity | None],
-) -> Iterator[Callable[[Mapping[str, Identity | None]], Bench]]:
-    """Plugs adapters in, and makes a bench with an ESC on each."""
-    made: list[Bench] = []
-
-    def make(adapters: Mapping[str, Identity | None]) -> Bench:
-        there.update(adapters)
-        made.append(Bench(*adapters))
-        return made[-1]
-
-    yield make
-    for bench in made:
-        bench.close()
-
-
-@pytest.fixture
-def bench(opened: Callable[[Mapping[str, Identity | None]], Bench]) -> Bench:
+def bench(there: dict[str, Identity | None]) -> Bench:
     """One ESC on /dev/ttyUSB0."""
-    return opened({USB0: LEFT})
+    there[USB0] = LEFT
+    return Bench(USB0)
 
 
 USB0, USB1, USB2, USB3 = (f"/dev/ttyUSB{n}" for n in range(4))
@@ -163,14 +124,14 @@ REPLUGGED: dict[str, tuple[dict[str, Identity], dict[str, Identity], list[str | 
 @pytest.mark.parametrize(("before", "after", "found"), REPLUGGED.values(), ids=REPLUGGED.keys())
 def test_after_plugging_in_again_each_esc_has_its_own_adapter(
     there: dict[str, Identity | None],
-    opened: Callable[[Mapping[str, Identity | None]], Bench],
     before: dict[str, Identity],
     after: dict[str, Identity],
     found: list[str | None],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
-    bench = opened(before)
+    there |= before
+    bench = Bench(*before)
     there.clear()
     for number in range(len(before)):
         bench.lose(number, SECOND)

@@ -33,6 +33,14 @@ def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
     return len(taken)
 
 
+def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
+    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue.put_all([queued(n) for n in range(6)] + [slot(0x181 + n) for n in range(6)])
+    while len(queue):
+        assert send(queue, sent, 1) == 1
+    assert [frame.queued for frame in sent] == [True, False] * 6
+
+
 def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     queue, sent = TransmitQueue(), list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
