@@ -2,7 +2,7 @@
 
 import ctypes as c
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.header import KCG, functions, structure
 from kontronik_can_gw.native.objects import source_number
-from kontronik_can_gw.native.rows import NotInCore, Settings
+from kontronik_can_gw.native.rows import NotInCore, Rows, Settings
 from kontronik_can_gw.native.settings import held_settings
 from kontronik_can_gw.native.tables import END_OF_TIME, Tables
 
@@ -83,10 +83,10 @@ class Handle:
         self._raw = memoryview(self._frames).cast("B")
 
     @staticmethod
-    def _array(kind: Any, rows: Sequence[Any]) -> Any:
-        if not rows or isinstance(rows[0], int):
-            return (kind * max(1, len(rows)))(*rows)
-        return (kind * len(rows)).from_buffer_copy(b"".join(rows))  # of rows it would keep them all
+    def _array(kind: Any, rows: Any) -> Any:
+        if isinstance(rows, Rows) and rows:
+            return (kind * len(rows)).from_buffer(rows.data)
+        return (kind * max(1, len(rows)))(*rows)
 
     def follow_all(self, found: int, now: int) -> None:
         """Give ``on_event`` what a call of the core returned, and what else there is."""

@@ -54,8 +54,9 @@ def _add(tables: Tables, esc: int) -> Place:
             escs=1,
         )
     )
-    tables.signals += [Signal() for _ in range(MAX_SIGNALS)]
-    tables.pieces += [Piece() for _ in range(MAX_SIGNALS)]
+    for _ in range(MAX_SIGNALS):
+        tables.signals.append(Signal())
+        tables.pieces.append(Piece())
     tables.constants += [0, 0]
     tables.pages += 1
     tables.esc_of.append(esc)

@@ -9,7 +9,6 @@ import struct
 from collections.abc import Sequence
 from ctypes import c_uint16, c_uint64
 from fractions import Fraction
-from functools import lru_cache
 from itertools import accumulate
 from typing import Any
 
@@ -28,6 +27,7 @@ from kontronik_can_gw.native.rows import (
     NotInCore,
     Pair,
     Piece,
+    Rows,
     Signal,
 )
 from kontronik_can_gw.native.settings import MAX_GEAR, MAX_POLES, settings_of
@@ -58,8 +58,6 @@ _M64 = (1 << 64) - 1
 END_OF_TIME = 1 << 61
 """ns: sums of times stay within int64."""
 _LIMIT = 1 << 63
-_piece = lru_cache(1024)(Piece)
-"""For signals at the same place one and the same row: with many ESCs they are garbage that nobody gives back."""
 
 
 class Tables:
@@ -67,10 +65,8 @@ class Tables:
 
     def __init__(self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False) -> None:
         self._plans = layout.messages
-        self.signals: list[Any] = []
-        self.messages: list[Any] = []
-        self.pieces: list[Any] = []
-        self.pairs: list[Any] = []
+        self.signals, self.messages = Rows(Signal), Rows(Message)
+        self.pieces, self.pairs = Rows(Piece), Rows(Pair)
         self.constants: list[int] = []
         self.esc_of: list[int] = []
         self.pages = 0
@@ -124,7 +120,7 @@ class Tables:
         return [*accumulate(map(len, self.listeners_of), initial=0)]
 
     @property
-    def arrays(self) -> dict[str, tuple[Any, list[Any]]]:
+    def arrays(self) -> dict[str, tuple[Any, Any]]:
         """The tables of kcg_plan in its order: their type and rows."""
         return {
             "message": (Message, self.messages),
@@ -140,10 +136,9 @@ class Tables:
     @property
     def counts(self) -> dict[str, int]:
         """The numbers of kcg_plan in its order."""
-        tables = self.constants, self.messages, self.settings, self.watched
-        words, messages, escs, slots = map(len, tables)
-        counts = {"words": words, "messages": messages - slots, "escs": escs, "pages": self.pages}
-        return counts | {"slots": slots}
+        words, escs, slots = len(self.constants), len(self.settings), len(self.watched)
+        counts = {"words": words, "messages": len(self.messages) - slots, "escs": escs}
+        return counts | {"pages": self.pages, "slots": slots}
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
@@ -182,10 +177,10 @@ class Tables:
         first_piece = len(self.pieces)
         for piece in signal.pieces:  # never across 64 bits
             width = min(piece.width, 64 - piece.at % 64)
-            self.pieces.append(_piece(piece.shift, width, piece.at))
+            self.pieces.append(Piece(piece.shift, width, piece.at))
             if width < piece.width:
                 self.pieces.append(
-                    _piece(piece.shift + width, piece.width - width, piece.at + width)
+                    Piece(piece.shift + width, piece.width - width, piece.at + width)
                 )
         row = Signal(first_piece=first_piece, pieces=len(self.pieces) - first_piece)
         row.page = KCG.PAGES if signal.page is None else plan.pages.index(signal.page)
@@ -211,7 +206,8 @@ class Tables:
         flags = row.flags
         if signal.numbers is not None:
             row.first_pair, row.pairs = len(self.pairs), len(signal.numbers)
-            self.pairs += [Pair(int(number), raw & _M64) for number, raw in signal.numbers.items()]
+            for number, raw in signal.numbers.items():
+                self.pairs.append(Pair(int(number), raw & _M64))
             flags |= KCG.TABLE
         if signal.is_float:
             row.flags = flags | KCG.REAL

@@ -160,8 +160,9 @@ class Layout:
     @cached_property
     def fingerprint(self) -> str:
         """Eight hexadecimal digits that differ where a receiver would read frames otherwise: ids, bits, scaling, units, texts, names."""
-        found = [
-            (
+        crc, comma = crc32(b"["), ""
+        for message in self.messages:  # of all of them at once the memory would not come back
+            found = (
                 *(message.name, message.can_id, message.extended, message.fd, message.length),
                 [
                     (
@@ -172,9 +173,8 @@ class Layout:
                     for s in message.signals
                 ],
             )
-            for message in self.messages
-        ]
-        return f"{crc32(repr(found).encode()):08X}"
+            crc, comma = crc32(f"{comma}{found!r}".encode(), crc), ", "
+        return f"{crc32(b']', crc):08X}"
 
     def bus_load(self, bitrate: int, data_bitrate: int = 2_000_000) -> float:
         """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s."""
