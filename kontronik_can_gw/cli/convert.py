@@ -23,7 +23,7 @@ from kontronik_can_gw.desk.recordings.convert import (
     to_log,
     to_table,
 )
-from kontronik_can_gw.desk.recordings.inputs import CanLogInput, Input, open_input
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -141,12 +141,11 @@ def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
     """Why there is nothing to convert."""
     if args.start is not None or args.end is not None:
         return "nothing in it is between --from and --until"
-    if not isinstance(recording, CanLogInput):
-        what = "live frame" if form in TABLES else "frame"
-        return f"nothing in it can be converted: it has no {what}."
-    if not recording.others:
-        return "nothing in it can be converted: it has no CAN frame."
-    return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
+    if recording.others:
+        return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
+    return (
+        f"nothing in it can be converted: it has no {'values' if form in TABLES else 'frames'}."
+    )
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
