@@ -143,9 +143,7 @@ def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
         return "nothing in it is between --from and --until"
     if recording.others:
         return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
-    return (
-        f"nothing in it can be converted: it has no {'values' if form in TABLES else 'frames'}."
-    )
+    return f"nothing in it can be converted: it has no {'values' if form in TABLES else 'frames'}."
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
