@@ -1,7 +1,6 @@
 """``convert``: recordings to tables, CAN logs and plain bytes."""
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
@@ -17,7 +16,6 @@ from kontronik_can_gw.desk.recordings.convert import (
     FORMATS,
     LOGS,
     ON_SCREEN,
-    STREAMS,
     SUFFIXES,
     TABLES,
     Output,
@@ -25,7 +23,7 @@ from kontronik_can_gw.desk.recordings.convert import (
     to_log,
     to_table,
 )
-from kontronik_can_gw.desk.recordings.inputs import CanLogInput, Input, open_input
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -72,7 +70,7 @@ BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is f
 
 OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
 bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .log .candump .asc .blf .trc .bin; --to where it
-does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, mf4-log needs asammdf.
+does not. - is standard output, for text. Parquet needs pyarrow, mf4-log needs asammdf.
 
 A table has a row at each telemetry frame, or at each group of CAN frames that belong together, and a column for each value by its
 name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]). What is not available is empty in CSV, null elsewhere.
@@ -143,12 +141,9 @@ def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
     """Why there is nothing to convert."""
     if args.start is not None or args.end is not None:
         return "nothing in it is between --from and --until"
-    if not isinstance(recording, CanLogInput):
-        what = "live frame" if form in TABLES else "frame"
-        return f"nothing in it can be converted: it has no {what}."
-    if not recording.others:
-        return "nothing in it can be converted: it has no CAN frame."
-    return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
+    if recording.others:
+        return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
+    return f"nothing in it can be converted: it has no {'values' if form in TABLES else 'frames'}."
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
@@ -166,9 +161,7 @@ def _format(args: argparse.Namespace) -> str:
     if args.to:
         return str(args.to)
     if args.output == "-":
-        raise UserError(
-            f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}; bin through a pipe"
-        )
+        raise UserError(f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}")
     suffix = Path(args.output).suffix.lower()
     if suffix == ".mf4":
         raise UserError(f"{args.output}: {REMOVED_OPTIONS['convert', '--to mf4']}")
@@ -185,9 +178,8 @@ def _check(args: argparse.Namespace, form: str) -> None:
     is_bytes = form == BYTES
     # fmt: off
     rules = (
-        (to_screen and form not in STREAMS,
-         f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}"),
-        (to_screen and is_bytes and sys.stdout.isatty(), "bin cannot go to a terminal. Give a file, or a pipe behind it."),
+        (to_screen and form not in ON_SCREEN,
+         f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(ON_SCREEN)}"),
         (args.signals and form not in TABLES, f"--signals is for tables ({', '.join(TABLES)}), not for {form}"),
         (args.esc is not None and not is_bytes, f"--esc is for bin, not for {form}; the columns of an ESC: --signals 'NAME.*'"),
         (is_bytes and not (start is None and end is None), "--from and --until are not for bin, which has no times"),
@@ -204,7 +196,7 @@ def _check(args: argparse.Namespace, form: str) -> None:
         raise UserError(f"{target}: is IN. Give another OUT.")
     if target.is_file() and not args.force:
         raise UserError(f"{target}: is there already. Give --force to write over it.")
-    if not target.is_file() and form not in STREAMS:
+    if not target.is_file() and form not in ON_SCREEN:
         raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
 
 

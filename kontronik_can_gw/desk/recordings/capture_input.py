@@ -23,7 +23,7 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
-from kontronik_can_gw.desk.recordings.recording import timed
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, timed
 from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ _PLAYED = frozenset({Kind.BYTES, Kind.ADVANCE, Kind.COUNTERS})
 """What a player plays, and by which frames of the turn before are certain."""
 _LOOK_FOR_HEADER = 1 << 25
 _MAX_DAMAGE = 50
-_LATEST_NS = 1 << 62
 
 
 class CaptureInput(PlayedInput):
@@ -67,6 +66,7 @@ class CaptureInput(PlayedInput):
         super().__init__(name, layout, setup)
         self.sent_layout = NO_MESSAGES if found is None else found[1]
         self.created_ns = int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
+        self._begun = _clock_of(self.header) or (0, 0)
         self._last_ns = self._impossible = 0
         self._place = ""
         """Of the block that is being read, in words."""
@@ -74,10 +74,8 @@ class CaptureInput(PlayedInput):
         self._describe()
 
     def wall_ns(self, time_ns: int) -> int | None:
-        header = self.header
-        begun = int(header.get("wall_ns") or 0) - int(header.get("monotonic_ns") or 0)
         offsets = (offset for since, offset in reversed(self._offsets) if since <= time_ns)
-        return time_ns + next(offsets, begun)
+        return time_ns + next(offsets, self._begun[1])
 
     @property
     def channel(self) -> str:
@@ -158,12 +156,14 @@ class CaptureInput(PlayedInput):
     def _checked(self, entry: Entry) -> Entry | None:
         """The entry; not before the one before. None where it has no possible time."""
         time_ns, is_clock = entry.time_ns, entry.kind == Kind.CLOCK
-        if time_ns > _LATEST_NS or (is_clock and len(entry.data) != 8):
+        wall_ns = 0
+        if is_clock and len(entry.data) == 8:
+            (wall_ns,) = read_numbers(entry.data)
+        if time_ns > LATEST_NS or (is_clock and not 0 < wall_ns <= LATEST_NS):
             self._impossible += 1
             return None
         if is_clock:
             # it stands after what was written by the clock before
-            (wall_ns,) = read_numbers(entry.data)
             self._offsets.append((time_ns + 1, wall_ns - time_ns))
         if time_ns < self._last_ns:
             return entry._replace(time_ns=self._last_ns)
@@ -263,11 +263,18 @@ class CaptureInput(PlayedInput):
             raise UserError(
                 f"{path}: is of another run than {self._paths[0]}. Convert each run by itself."
             )
-        now, wall = header.get("monotonic_ns"), header.get("wall_ns")
-        if all(isinstance(at, int) and 0 <= at <= _LATEST_NS for at in (now, wall)):
-            self._offsets.append((int(now or 0), int(wall or 0) - int(now or 0)))
+        if (clock := _clock_of(header)) is not None:
+            self._offsets.append(clock)
         missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
         if missing > 0:
             self.damage.append(
                 f"{path.name}: {missing} parts of the run in front of it are not given"
             )
+
+
+def _clock_of(header: Mapping[str, Any]) -> tuple[int, int] | None:
+    """A moment, and how much more Unix time was then; None where the header's times are none."""
+    now, wall = header.get("monotonic_ns"), header.get("wall_ns")
+    if all(isinstance(at, int) and 0 <= at <= LATEST_NS for at in (now, wall)):
+        return int(now or 0), int(wall or 0) - int(now or 0)
+    return None

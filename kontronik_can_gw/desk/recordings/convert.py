@@ -34,9 +34,7 @@ SUFFIXES = {
     ".bin": BYTES,
 }
 ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
-"""What may go to standard output: it is text, and is written from its beginning to its end."""
-STREAMS = (*ON_SCREEN, BYTES)
-"""What may go through a pipe."""
+"""What may go to standard output or through a pipe: it is text, and is written from its beginning to its end."""
 _CLOCK_SET_NS = 1_000_000_000
 """How far a clock must be set to be worth a word."""
 

@@ -10,7 +10,7 @@ from kontronik_can_gw.desk.recordings.can_logs.log import reader_of
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.recording import Input, Sample
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Input, Sample
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -85,8 +85,8 @@ class CanLogInput(Input):
 
     def wall_ns(self, time_ns: int) -> int | None:
         """0 is the start of a log whose times are Unix times; the start is known with the first frame."""
-        start: int | None = self._reader.wall_start_ns
-        return None if start is None else start + time_ns
+        start = self._reader.wall_start_ns
+        return None if start is None or start > LATEST_NS else start + time_ns
 
     def close(self) -> None:
         self._reader.close()

@@ -17,6 +17,8 @@ from kontronik_can_gw.signals.unpacker import SignalReader, Value
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames, Rows
 
+LATEST_NS = 1 << 62
+"""No time of a recording, and no Unix time (2116), is later: it is damaged."""
 ROWS = 1024
 """Rows that Python makes a block of."""
 

@@ -11,6 +11,7 @@ from datetime import datetime
 from typing import Any, BinaryIO
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
@@ -28,10 +29,11 @@ _SHOWN = 8
 
 
 def checked(item: TimedFrame) -> TimedFrame:
-    """The frame. ValueError where none with this id and number of bytes exists on a CAN bus."""
+    """The frame. ValueError where none with this id and number of bytes exists on a CAN bus, or its time is no log's."""
     frame, size = item.frame, len(item.frame.data)
     in_range = 0 <= frame.can_id <= (0x1FFFFFFF if frame.extended else 0x7FF)
-    if not in_range or not (size in FD_LENGTHS if frame.fd else size <= 8):
+    is_long = item.time_ns > LATEST_NS
+    if is_long or not in_range or not (size in FD_LENGTHS if frame.fd else size <= 8):
         raise ValueError
     return item
 

@@ -9,7 +9,7 @@ from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 
-_FAR = 1 << 63
+_MAX_INT64 = 1 << 63
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
 
@@ -75,10 +75,7 @@ class ParquetTable:
         since = compute.subtract(times, self._table.origin_ns).cast(pa.float64(), safe=False)
         arrays = [compute.divide(since, float(SECOND))]
         if self._table.has_utc:
-            if block.times[0] + wall_ns >= -_FAR and block.times[-1] + wall_ns < _FAR:
-                wall = compute.add(times, wall_ns)
-            else:  # of a damaged clock
-                wall = pa.nulls(len(block), pa.int64())
+            wall = compute.add(times, wall_ns)
             arrays.append(wall.cast(pa.timestamp("ns", tz="UTC")))
         arrays += [
             self._played(block, index, one)
@@ -124,5 +121,5 @@ class ParquetTable:
         pa = self._pa
         if one.kind is Kind.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
-        whole = pa.uint64() if _FAR <= one.high <= 2 * _FAR else pa.int64()
+        whole = pa.uint64() if _MAX_INT64 <= one.high <= 2 * _MAX_INT64 else pa.int64()
         return {Kind.FLAG: pa.int8(), Kind.WHOLE: whole, Kind.FLOAT: pa.float64()}[one.kind]

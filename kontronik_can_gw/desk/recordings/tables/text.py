@@ -16,21 +16,15 @@ from kontronik_can_gw.native import load
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Lines
 
-_END_OF_YEARS_NS = 253_402_300_800 * SECOND
-"""The year 10000."""
-
 
 def seconds_text(time_ns: int) -> str:
     """Exact decimal seconds: 6 digits where that is exact, else 9."""
-    sign = "-" if time_ns < 0 else ""
-    seconds, rest = divmod(abs(time_ns), SECOND)
-    return f"{sign}{seconds}.{rest:09d}" if rest % 1000 else f"{sign}{seconds}.{rest // 1000:06d}"
+    seconds, rest = divmod(time_ns, SECOND)
+    return f"{seconds}.{rest:09d}" if rest % 1000 else f"{seconds}.{rest // 1000:06d}"
 
 
 def utc_text(wall_ns: int) -> str:
-    """ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``; empty where it is no date."""
-    if not -_END_OF_YEARS_NS < wall_ns < _END_OF_YEARS_NS:
-        return ""
+    """ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``."""
     second, rest = divmod(wall_ns, SECOND)
     moment = datetime.fromtimestamp(second, UTC_ZONE)
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1000:06d}Z"
@@ -64,17 +58,16 @@ class TextTable:
 
     def write(self, block: Block) -> None:
         """Add rows."""
-        if isinstance(block, PlayedBlock):
-            begin, end, wall_ns = block.begin, block.end, block.wall_ns or 0
-            if 0 <= block.times[0] + wall_ns <= block.times[-1] + wall_ns < _END_OF_YEARS_NS:
-                origin_ns = self._table.origin_ns
-                for made in self._lines.of(block.made, begin, end, origin_ns, wall_ns):
-                    if isinstance(made, int):
-                        self._write(block.part(made - begin, made - begin + 1))
-                    else:
-                        self._file.write(made)
-                return
-        self._write(block)
+        wall_ns = block.wall_ns or 0
+        if not isinstance(block, PlayedBlock) or block.times[0] + wall_ns < 0:
+            self._write(block)
+            return
+        begin, end, origin_ns = block.begin, block.end, self._table.origin_ns
+        for made in self._lines.of(block.made, begin, end, origin_ns, wall_ns):
+            if isinstance(made, int):
+                self._write(block.part(made - begin, made - begin + 1))
+            else:
+                self._file.write(made)
 
     def _write(self, block: Block) -> None:
         lines = (self._line(row, block.wall_ns) for row in block.rows())
@@ -83,10 +76,7 @@ class TextTable:
     def _line(self, row: Sample, wall_ns: int | None) -> str:
         pieces = [self._start, seconds_text(row.time_ns - self._table.origin_ns)]
         if self._table.has_utc:
-            utc = utc_text(row.time_ns + (wall_ns or 0))
-            pieces += (
-                [self._utc, utc, self._utc_end] if utc else [self._utc.rstrip('"'), self._nothing]
-            )
+            pieces += (self._utc, utc_text(row.time_ns + (wall_ns or 0)), self._utc_end)
         for prefix, value in zip(self._prefixes, row.values, strict=True):
             pieces.append(prefix)
             if isinstance(value, str):
