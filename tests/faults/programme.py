@@ -52,10 +52,9 @@ def run_inside(args: argparse.Namespace) -> Report:
         if args.part == "qemu":
             qemu_bed.prepare(Path(folder))
         timeout_s = TIMEOUT_S.get(args.part, 180 * args.minutes + 300)
-        backend = ["qemu"] if args.part == "qemu" else ["uml", "--own-time"]
         words = [
             *(sys.executable, PROJECT / "tests/vm/vm_run.py", f"--timeout={timeout_s:g}"),
-            *("--backend", *backend, f"--rw={folder}", "--"),
+            *(f"--backend={'qemu' if args.part == 'qemu' else 'uml'}", f"--rw={folder}", "--"),
             *(sys.executable, "-B", __file__, args.part, f"--inside={folder}"),
             *(f"--seed={args.seed}", f"--minutes={args.minutes:g}"),
             *(f"--only={text}" for text in args.only),
