@@ -3,12 +3,12 @@
     python tests/faults/programme.py [uml|qemu|soak] [--only TEXT]... [--minutes N] [--seed N] [--junit FILE] [--page]
 
 uml     the faults that need no more than a kernel with vxcan, slcan and vcan, in User Mode Linux
-qemu    those of real drivers, on emulated hardware (tests/vm/setup.sh qemu): on a quiet machine
+qemu    those of real drivers, on emulated hardware (tests/vm/setup.sh qemu)
 soak    random ones of uml, one after the other, for minutes or hours: the same ones in the same order for the same seed
 
 They set the clock, mount and make interfaces: never on the machine itself. Exits with 1 if one was not healed in time, or a value on
 the bus was wrong, or one was lost that need not have been, or a byte was sent to an ESC. Nothing is run twice. User Mode Linux runs by
-a time of its own (tests/vm/uml_time.c): what comes of uml and soak does not depend on how fast or busy the machine is.
+a time of its own (tests/vm/uml_time.c), QEMU by its count of instructions: nothing depends on how fast or busy the machine is.
 """
 
 import argparse

@@ -11,7 +11,7 @@ uml     User Mode Linux, 2 s to boot, Python at full speed. vcan, CAN FD, vxcan,
         the machine is, and to wait takes no time. Only --timeout is the machine's.
 qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci controllers on one bus (can0, can1);
         a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1). USB devices played by the command itself can be
-        plugged in by vhci_hcd (driver ftdi_sio).
+        plugged in by vhci_hcd (driver ftdi_sio). Its time is the instructions that it has executed, 2 ns each.
 
 A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
 --rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
@@ -157,7 +157,7 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
     initrd = os.path.join(os.path.dirname(kernel), "initrd.cpio")
     command = f"""
         qemu-system-x86_64 -nodefaults -no-user-config -display none -no-reboot
-        -machine q35 -accel tcg,thread=multi,tb-size=512 -cpu max -m {QEMU_MEMORY_MIB}
+        -machine q35 -accel tcg,thread=single,tb-size=512 -icount shift=1,sleep=off -cpu max -m {QEMU_MEMORY_MIB}
         -serial file:{job}/klog -device virtio-serial-pci
         -object can-bus,id=canbus0
         -device kvaser_pci,canbus=canbus0 -device kvaser_pci,canbus=canbus0
