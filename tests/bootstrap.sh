@@ -84,7 +84,7 @@ install_project() { # $1: demo or test, $2: what pip installs
     echo "$key" >"$stamp"
 }
 
-vm_packages="user-mode-linux can-utils iproute2 busybox-static"
+vm_packages="user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
 vm_line="sudo apt-get install $vm_packages"
 
 # User Mode Linux 6.1 does not know the registers of the newest processors: there it starts with the help of uml_xstate.c.

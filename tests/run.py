@@ -68,7 +68,7 @@ TIERS = {
 }
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
 """Of one step: the two that CI runs end within its 90 minutes whatever happens."""
-ENABLE_UML = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
+ENABLE_UML = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
 ENABLE_CROSS = (
     "sudo apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi gcc-arm-linux-gnueabihf libc6-dev-armhf-cross "
     "gcc-aarch64-linux-gnu libc6-dev-arm64-cross gcc-s390x-linux-gnu libc6-dev-s390x-cross qemu-system-arm qemu-user"
@@ -80,7 +80,7 @@ WHEELS = "aarch64-linux-gnu-gcc arm-linux-gnueabihf-gcc qemu-arm"
 ENABLE_WHEELS = "gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user"
 NEEDS = {
     **dict.fromkeys(("vcan", "masters"), ("ip candump vcan", ENABLE_VCAN)),
-    **dict.fromkeys(("faults", "soak"), ("linux.uml cc", f"{ENABLE_UML} gcc libc6-dev")),
+    **dict.fromkeys(("faults", "soak"), ("linux.uml cc", ENABLE_UML)),
     "qemu": ("qemu-system-x86_64", "sudo tests/vm/setup.sh qemu"),
     "wheels": (WHEELS, f"sudo apt-get install {ENABLE_WHEELS}"),
     "machines": (

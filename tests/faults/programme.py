@@ -3,12 +3,12 @@
     python tests/faults/programme.py [uml|qemu|soak] [--only TEXT]... [--minutes N] [--seed N] [--junit FILE] [--page]
 
 uml     the faults that need no more than a kernel with vxcan, slcan and vcan, in User Mode Linux
-qemu    those of real drivers, on emulated hardware (tests/vm/setup.sh qemu): on a quiet machine
+qemu    those of real drivers, on emulated hardware (tests/vm/setup.sh qemu)
 soak    random ones of uml, one after the other, for minutes or hours: the same ones in the same order for the same seed
 
 They set the clock, mount and make interfaces: never on the machine itself. Exits with 1 if one was not healed in time, or a value on
 the bus was wrong, or one was lost that need not have been, or a byte was sent to an ESC. Nothing is run twice. User Mode Linux runs by
-a time of its own (tests/vm/uml_time.c): what comes of uml and soak does not depend on how fast or busy the machine is.
+a time of its own (tests/vm/uml_time.c), QEMU by its count of instructions: nothing depends on how fast or busy the machine is.
 """
 
 import argparse
@@ -52,10 +52,9 @@ def run_inside(args: argparse.Namespace) -> Report:
         if args.part == "qemu":
             qemu_bed.prepare(Path(folder))
         timeout_s = TIMEOUT_S.get(args.part, 180 * args.minutes + 300)
-        backend = ["qemu"] if args.part == "qemu" else ["uml", "--own-time"]
         words = [
             *(sys.executable, PROJECT / "tests/vm/vm_run.py", f"--timeout={timeout_s:g}"),
-            *("--backend", *backend, f"--rw={folder}", "--"),
+            *(f"--backend={'qemu' if args.part == 'qemu' else 'uml'}", f"--rw={folder}", "--"),
             *(sys.executable, "-B", __file__, args.part, f"--inside={folder}"),
             *(f"--seed={args.seed}", f"--minutes={args.minutes:g}"),
             *(f"--only={text}" for text in args.only),

@@ -27,6 +27,8 @@ from kontronik_can_gw.esc.kontronik.states import Device
 SLACK_NS = 400 * MS
 RATE_HZ = 10
 INFO_EVERY = 20
+TOLD_S = 0.05
+"""Until the metronome has told of the last standstill."""
 
 
 class FarPort(FedEsc):
@@ -171,7 +173,6 @@ class Metronome(LoggedProcess):
 
     def stood_still(self, begin_ns: int, end_ns: int) -> int:
         """Nanoseconds of that time in which nothing ran."""
-        time.sleep(0.02)  # until it has told of the last one
         total = 0
         for words in reversed(self.out):
             begin, end = map(int, words.split())
@@ -216,11 +217,16 @@ class MachineBench(Bench):
     def stood_still(self, begin_ns: int, end_ns: int) -> int:
         return self._metronome.stood_still(begin_ns, end_ns)
 
+    def running_s(self, begin_ns: int, end_ns: int) -> float:
+        time.sleep(TOLD_S)
+        return super().running_s(begin_ns, end_ns)
+
     def close(self) -> None:
         super().close()
         self._metronome.kill()
 
     def forgive(self, until_ns: int) -> None:
+        time.sleep(TOLD_S)
         both = SPEED | CURRENT
         for esc, accounted in zip(self.escs, self._accounted, strict=True):
             newer = 0

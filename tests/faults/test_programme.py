@@ -61,7 +61,6 @@ def test_a_machine_with_a_time_of_its_own_sleeps_an_hour_at_once_and_its_clock_g
         sys.executable,
         str(PROJECT / "tests/vm/vm_run.py"),
         "--backend=uml",
-        "--own-time",
         "--timeout=100",
     ]
     script = f"date +%s; sleep 3600; date +%s; {sys.executable} -c '{busy}'"

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Installs what tests/vm/run needs on Debian and Ubuntu:  setup.sh [uml] [xstate] [qemu]
 #   (nothing)  can-utils, iproute2: enough where the running kernel has vcan
-#   uml        User Mode Linux, 41 MB: what `make test` uses where the kernel has no vcan
+#   uml        User Mode Linux, 41 MB, and a C compiler: what `make test` uses where the kernel has no vcan
 #   xstate     what it needs to start on a processor with AMX (uml_xstate.c)
 #   qemu       QEMU and Debian's stock kernel, 90 MB: serial ports and CAN controllers besides vcan
 # Needs root or a sudo that asks nothing. The kernel for QEMU is downloaded and unpacked, not installed.
@@ -15,8 +15,8 @@ qemu=no
 xstate=no
 for part in "$@"; do
     case $part in
-        uml) packages="$packages busybox-static user-mode-linux" ;;
-        xstate) packages="$packages gcc libc6-dev" xstate=yes ;;
+        uml) packages="$packages busybox-static user-mode-linux gcc libc6-dev" ;;
+        xstate) xstate=yes ;;
         qemu) packages="$packages busybox-static qemu-system-x86 kmod cpio xz-utils zstd" qemu=yes ;;
         *) echo "usage: setup.sh [uml] [xstate] [qemu]" >&2; exit 2 ;;
     esac

@@ -1,20 +1,20 @@
 """Run a command under a Linux kernel that has vcan: this one if it has, else User Mode Linux, else QEMU.
 
-    tests/vm/run [--backend auto|native|uml|qemu] [--timeout S] [--rw DIR]... [--own-time] -- COMMAND...
+    tests/vm/run [--backend auto|native|uml|qemu] [--timeout S] [--rw DIR]... -- COMMAND...
     tests/vm/run --which            which of them `auto` takes, or none
 
 Prints what COMMAND prints, stdout and stderr apart, and exits with its exit code; 124: time-out; 125: the VM failed.
 
 native  COMMAND itself. Without the right to make interfaces: in a network namespace of its own, by `unshare` or `sudo`.
 uml     User Mode Linux, 2 s to boot, Python at full speed. vcan, CAN FD, vxcan, gateway, BCM, J1939, slcan, tbf, netem.
+        It has a time of its own (uml_time.c; needs a C compiler): what happens in there does not depend on how fast or busy
+        the machine is, and to wait takes no time. Only --timeout is the machine's.
 qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci controllers on one bus (can0, can1);
         a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1). USB devices played by the command itself can be
-        plugged in by vhci_hcd (driver ftdi_sio).
+        plugged in by vhci_hcd (driver ftdi_sio). Its time is the instructions that it has executed, 2 ns each.
 
 A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
 --rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
---own-time (uml): what happens in there does not depend on how fast or busy the machine is, and to wait takes no time
-(uml_time.c; needs a C compiler); only --timeout is the machine's.
 Of the environment it gets PATH, HOME, LANG, CI, VIRTUAL_ENV and what starts with KCG_, PYTHON, PYTEST_, HYPOTHESIS_
 or COVERAGE_. Python finds no asammdf in there, which python-can imports where it is installed, and with it numpy and pandas:
 4 s of each process in UML, a minute in QEMU.
@@ -116,14 +116,12 @@ def uml_command(job: str, out: int, err: int) -> list[str]:
     """.split()
 
 
-def uml_host_environment(job: str, own_time: bool) -> dict[str, str]:
+def uml_host_environment(job: str) -> dict[str, str]:
     """Its own, outside of the guest; uml_xstate.so is there where it does not start without."""
-    help_to_start = os.path.join(cache(), "uml_xstate.so")
-    preload = [help_to_start] if os.path.exists(help_to_start) else []
-    if own_time:
-        preload.append(os.path.join(job, "uml_time.so"))
-        compile_time = ["cc", "-O2", "-shared", "-fPIC", "-o", preload[-1]]
-        subprocess.run([*compile_time, os.path.join(HERE, "uml_time.c"), "-ldl"], check=True)
+    own_time, help_to_start = os.path.join(job, "time.so"), os.path.join(cache(), "uml_xstate.so")
+    source = os.path.join(HERE, "uml_time.c")
+    subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", own_time, source, "-ldl"], check=True)
+    preload = filter(os.path.exists, (own_time, help_to_start))
     return {"TMPDIR": uml_memory_folder(job), "LD_PRELOAD": ":".join(preload)}
 
 
@@ -159,7 +157,7 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
     initrd = os.path.join(os.path.dirname(kernel), "initrd.cpio")
     command = f"""
         qemu-system-x86_64 -nodefaults -no-user-config -display none -no-reboot
-        -machine q35 -accel tcg,thread=multi,tb-size=512 -cpu max -m {QEMU_MEMORY_MIB}
+        -machine q35 -accel tcg,thread=single,tb-size=512 -icount shift=1,sleep=off -cpu max -m {QEMU_MEMORY_MIB}
         -serial file:{job}/klog -device virtio-serial-pci
         -object can-bus,id=canbus0
         -device kvaser_pci,canbus=canbus0 -device kvaser_pci,canbus=canbus0
@@ -281,10 +279,10 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def start_vm(
-    backend: str, job: str, out: int, err: int, log: BinaryIO, own_time: bool
+    backend: str, job: str, out: int, err: int, log: BinaryIO
 ) -> "subprocess.Popen[bytes]":
     if backend == "uml":
-        command, environment = uml_command(job, out, err), uml_host_environment(job, own_time)
+        command, environment = uml_command(job, out, err), uml_host_environment(job)
     else:
         command, environment = qemu_command(job, out, err), {"TMPDIR": job}
     environment |= {"PATH": with_sbin(os.environ.get("PATH", ""))}
@@ -329,7 +327,7 @@ def read(job: str, name: str) -> str:
 
 
 def run_in_vm(
-    backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float, own_time: bool
+    backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
 ) -> tuple[int, bool]:
     """Returns the exit code, and whether the command was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
@@ -338,7 +336,7 @@ def run_in_vm(
         pipes = [os.pipe() for _ in range(2)]
         try:
             with open(os.path.join(job, "log"), "wb") as log:
-                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log, own_time)
+                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log)
         finally:
             for _, end in pipes:
                 os.close(end)
@@ -381,7 +379,7 @@ def installed() -> list[str]:
     path = with_sbin(os.environ.get("PATH", ""))
     if not os.path.exists("/usr/bin/busybox"):
         return []
-    vms = ["uml"] if shutil.which("linux.uml", path=path) else []
+    vms = ["uml"] if all(shutil.which(each, path=path) for each in ("linux.uml", "cc")) else []
     return vms + (
         ["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64", path=path) else []
     )
@@ -394,7 +392,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")
-    parser.add_argument("--own-time", action="store_true")
     parser.add_argument("command", nargs="*")
     args = parser.parse_args()
     args.rw = [os.path.realpath(folder) for folder in args.rw]
@@ -403,8 +400,6 @@ def arguments() -> argparse.Namespace:
             parser.error(f"--rw {folder}: no such folder")
     if not args.command and not args.which:
         parser.error("COMMAND is missing")
-    if args.own_time and args.backend != "uml":
-        parser.error("--own-time: only with --backend uml")
     return args
 
 
@@ -427,7 +422,7 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, leave)
     for vm in vms:
-        code, started = run_in_vm(vm, args.command, args.rw, args.timeout, args.own_time)
+        code, started = run_in_vm(vm, args.command, args.rw, args.timeout)
         if code != VM_FAILED or started:
             return code
     if not vms:
