@@ -22,8 +22,10 @@ HERE = Path(__file__).resolve().parent
 FIVE = HERE / "five.dbc"
 PROGRAMS = ("c", "ours", "obvious")
 CANOPEN = '[canopen]\nenabled = true\nself_start = true\nstore = "store"\n'
-EVERYTHING = f'{CANOPEN}[record]\ndirectory = "captures"\n[statistics]\nfile = "status.json"\n'
-"""Nodes, recorder, status file."""
+EVERYTHING = f'{CANOPEN}[record]\ndirectory = "captures"\n'
+"""Nodes and recorder, beside the status file that every run has."""
+STATUS_FOLDER = Path("/dev/shm")
+"""In memory, as a service's /run is: another file system may begin to write out what replaces a file."""
 _PRIORITY = 80
 """Of the feeder, where we may: what it measures is not to be its own delay."""
 # what is compiled at the first run is there from then on
@@ -117,9 +119,8 @@ def new_bus() -> str:
 def write_config(folder: Path, ports: Sequence[str], dbc: Path, further: str = "") -> Path:
     """Our configuration; the 1 Mbit/s are what its bus load is compared with. ``further``: lines, tables at their end."""
     lines = ['[can]\ninterface = "socketcan"\nchannel = "lo"\nbitrate = 1000000']
-    lines += [f'[dbc]\nfile = "{dbc}"', further]
-    if "[statistics]" not in further:
-        lines.append(f'[statistics]\nfile = "{folder / "status.json"}"')
+    status = (STATUS_FOLDER if STATUS_FOLDER.is_dir() else folder) / f"{folder.name}.json"
+    lines += [f'[dbc]\nfile = "{dbc}"', further, f'[statistics]\nfile = "{status}"']
     for index, port in enumerate(ports, 1):
         lines.append(f'[[esc]]\nport = "{port}"\nname = "e{index}"\npole_pairs = 7')
     file = folder / "gateway.toml"
