@@ -36,6 +36,8 @@ _PLAIN = frozenset({0x1000, 0x1008, 0x1009})
 """Objects that no service knows."""
 _FREE = frozenset({0x1022, at.UNITS})
 """Likewise, and of any type: copies of CiA's table differ."""
+_LISTS = {0x1003: 0xFE, 0x1016: 0x7F, 0x1029: 0xFE, MAPPING: 0x40}
+"""Lists that may be longer than those of the shipped EDS, and their last possible sub-index; all other services know theirs."""
 _SERVER = {(0x1200, 1): SDO_REQUEST, (0x1200, 2): SDO_ANSWER}
 _MANDATORY = {(0x1000, 0), (0x1001, 0), (0x1018, 1)}
 
@@ -80,8 +82,8 @@ def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
     for (index, sub), entry in entries.items():
         like = COMMUNICATION if index in _PDOS else MAPPING if index in _MAPPINGS else index
         reference = known.get((like, sub))
-        if reference is None and sub and like != COMMUNICATION:
-            reference = known.get((like, 1))  # a list may be longer than that of the shipped EDS
+        if reference is None and 0 < sub <= (0xFE if like >= 0x2000 else _LISTS.get(like, 0)):
+            reference = known.get((like, 1))
         if reference is not None:
             yield from ((entry, what) for what in _unlike(entry, reference))
         elif index < 0x2000:

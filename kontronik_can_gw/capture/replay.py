@@ -111,7 +111,9 @@ class Replay:
             gateway.stop(now)
             self._take(now)
         elif kind == Kind.COUNTERS:
-            for name, value in zip(COUNTERS, read_numbers(data), strict=True):
+            if len(counters := read_numbers(data)) != len(COUNTERS):
+                raise ValueError("has other counters")
+            for name, value in zip(COUNTERS, counters, strict=True):
                 setattr(gateway.status, name, value)
         elif kind == Kind.LINE_ERRORS:
             (gateway.escs[esc].line_errors,) = read_numbers(data)

@@ -71,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.errno == errno.ENOSPC:
             discard_output()
             say(f"standard output: cannot be written: {error.strerror}", command)
+        elif error.errno in (errno.EMFILE, errno.ENFILE):
+            say("too few files may be open: raise ulimit -n (of a service LimitNOFILE)", command)
         elif error.filename is not None and command != "run":
             say(f"{error.filename}: {error.strerror}", command)
         else:

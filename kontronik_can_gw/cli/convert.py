@@ -181,7 +181,7 @@ def _check(args: argparse.Namespace, form: str) -> None:
         (to_screen and form not in ON_SCREEN,
          f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(ON_SCREEN)}"),
         (args.signals and form not in TABLES, f"--signals is for tables ({', '.join(TABLES)}), not for {form}"),
-        (args.esc is not None and not is_bytes, f"--esc is for bin, not for {form}; the columns of an ESC: --signals 'NAME.*'"),
+        (args.esc is not None and not is_bytes, f"--esc is for bin, not for {form}; leave it out, or --signals 'NAME.*' of several ESCs"),
         (is_bytes and not (start is None and end is None), "--from and --until are not for bin, which has no times"),
         (start is not None and end is not None and end < start, "--until is before --from"),
     )

@@ -94,7 +94,7 @@ Error names are those that decode prints, such as undervoltage or test_short_to_
 examples:
   kontronik-can-gw simulate --esc 2 --link /tmp/esc{n}
   kontronik-can-gw simulate --device jivepro --error undervoltage@5s+2s --dropout 2s/10s
-  kontronik-can-gw simulate --seconds 60 --out - | kontronik-can-gw decode - --csv > flight.csv
+  kontronik-can-gw simulate --seconds 60 --out flight.bytes
 
 exit codes: 0 done, 1 failed while running or a gateway transmitted, 2 wrong usage
 """

@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
     config = args.config or (None if args.file or files else default_config())
     if args.file or config:
         files = [args.file or status_file(config)]
-    seen = [look_at(file, now) for file in files]
+    seen = [look_at(file, now, None if args.file else config) for file in files]
     if args.json:
         print(printable_json({"gateways": [each.as_json() for each in seen]}))
     if not seen:

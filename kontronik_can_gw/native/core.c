@@ -609,7 +609,7 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
     }
 }
 
-/* --- when (twin: schedule.py) ---------------------------------------------------------------------------------------- */
+/* --- when (twin: dbc/messages.py) ---------------------------------------------------------------------------------------- */
 
 static int64_t due_of(const kcg *g, uint32_t i)
 {

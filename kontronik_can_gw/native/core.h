@@ -2,7 +2,7 @@
 
    C99; no allocation, no operating system, no floating point but for float signals (KCG_FLOATS). Which messages there are is in tables
    (kcg_plan), made from a DBC by tables.py; state lives in memory that the caller gives. Time is nanoseconds of one monotonic clock.
-   The Python modules core.py, esc/telemetry.py, esc/kontronik/deframer.py, dbc/messages.py and dbc/schedule.py are its twin: the same
+   The Python modules core.py, esc/telemetry.py, esc/kontronik/deframer.py and dbc/messages.py are its twin: the same
    calls give the same frames, counters and deadlines, and they say in words what is done here. */
 #ifndef KCG_CORE_H
 #define KCG_CORE_H

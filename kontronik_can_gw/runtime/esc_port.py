@@ -96,7 +96,7 @@ class EscPort:
             return
         noted = self._noted
         noted.empty_ns, noted.undrained_ns, noted.is_plain = self._clock(), NEVER, False
-        noted.settings[:] = port.settings
+        noted.settings[:], noted.restored = port.settings, False
         port.discard()  # what came before we listened has no time
         self.port = port
         self.identity = port.identity()

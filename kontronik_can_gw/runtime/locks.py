@@ -1,4 +1,4 @@
-"""What only one gateway on this machine may have: a node-ID, the DBC's messages, a file that is written, an MQTT topic.
+"""What only one gateway on this machine may have: a node-ID, the DBC's messages, a file that is written.
 
 A lock is a file with flock(2) on it, in a folder where only gateways write: it ends with the process whatever ends it, and nobody who may
 not write there can have one. Its name holds the network namespace, for interfaces of the same name in two of them are two interfaces.
@@ -61,9 +61,12 @@ def lock_file(path: Path) -> int:
             with contextlib.suppress(OSError):
                 os.fchown(fd, -1, path.parent.stat().st_gid)
                 os.fchmod(fd, 0o660)
-    except BaseException as error:
+    except BlockingIOError:
         os.close(fd)
-        raise Taken from None if isinstance(error, BlockingIOError) else error
+        raise Taken from None
+    except BaseException:
+        os.close(fd)
+        raise
     if os.fstat(fd).st_nlink:
         return fd
     os.close(fd)  # its holder removed it just now: the name stands for another file

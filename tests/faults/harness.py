@@ -172,6 +172,9 @@ class Bench:
     ``dbc``: another layout than the shipped one.
     """
 
+    said_instead: str | None = None
+    """What the log may say in place of a line that is waited for."""
+
     def __init__(
         self,
         interface: str,
@@ -279,9 +282,11 @@ class Bench:
 
     def wait_log(self, text: str, since: int = 0, seconds: float = 10) -> None:
         """Wait for a line with this text in the gateway's log, from that line on."""
-        lines = self.gateway.lines
+        lines, texts = self.gateway.lines, [each for each in (text, self.said_instead) if each]
         self.wait_until(
-            lambda: any(text in line for line in lines[since:]), seconds, f"the log says {text!r}"
+            lambda: any(each in line for line in lines[since:] for each in texts),
+            seconds,
+            f"the log says {text!r}",
         )
 
     def expect(self, holds: object, what: str) -> None:

@@ -129,6 +129,7 @@ def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> 
         if fault.bed is beds.two and not any(text in fault.name for text in NEW_PROCESS)
     ]
     escs, row = range(len(bench.escs)), report.of(SOAK)
+    bench.said_instead = "comes and goes"  # as a port does here: it has no line each time
     before = bench.gateway.figures()
 
     def longest_silence(name: str, begin_ns: int) -> None:

@@ -1,5 +1,6 @@
 """Node-IDs and messages belong to one gateway on a machine; nobody but a gateway can take one."""
 
+import errno
 import fcntl
 import os
 from pathlib import Path
@@ -91,11 +92,16 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(
             side.close()
 
 
-@pytest.mark.parametrize("kind", ["folder", "link"])
+@pytest.mark.parametrize("kind", ["folder", "link", "no locks there"])
 def test_what_cannot_be_locked_is_reported_once_and_done_without(
-    kind: str, folder: Path, tmp_path: Path
+    kind: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if kind == "link":
+    def no_locks(_fd: int, _kind: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    if kind == "no locks there":
+        monkeypatch.setattr("fcntl.flock", no_locks)
+    elif kind == "link":
         folder.mkdir(parents=True)
         for name in NODES:
             (folder / file_name(name)).symlink_to(tmp_path / "other")

@@ -173,12 +173,16 @@ def test_a_configuration_names_its_file_or_the_service_of_its_name(
         toml = tmp_path / f"{name}.toml"
         toml.write_text(esc, encoding="utf-8")
         assert shell("-c", toml)[0] == NOT_RUNNING
-        written(run_folder / f"kontronik-can-gw{folder}" / "status.json", heard())
+        file = run_folder / f"kontronik-can-gw{folder}" / "status.json"
+        written(file, heard(), program_facts(tmp_path / "other.toml"))
+        code, _, talk = shell("-c", toml)
+        assert code == NOT_RUNNING and "other.toml, not of" in talk
+        written(file, heard(), program_facts(toml))
         code, out, _ = shell("-c", toml)
         assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
     elsewhere = tmp_path / "elsewhere.toml"
     elsewhere.write_text(f'[statistics]\nfile = "s/status.json"\n{esc}')
-    written(tmp_path / "s" / "status.json", heard())
+    written(tmp_path / "s" / "status.json", heard(), program_facts(elsewhere))
     assert shell("-c", elsewhere)[0] == HEALTHY
 
 

@@ -70,8 +70,8 @@ def status_file(config: Path | None) -> Path:
     return own or RUN_FOLDER / folder / "status.json"
 
 
-def look_at(file: Path, now: int) -> Seen:
-    """The result of a statistics file at ``now`` (monotonic)."""
+def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
+    """The result of a statistics file at ``now`` (monotonic). ``config``: of its gateway, where the file may be another one's."""
     try:
         if file.exists() and not file.is_file():  # reading a pipe would block
             text = "is no plain file. Look at statistics.file."
@@ -85,7 +85,13 @@ def look_at(file: Path, now: int) -> Seen:
     except (ValueError, RecursionError):
         text = FOREIGN
     else:
-        return judge(file, document, now)
+        seen = judge(file, document, now)
+        if config is None or seen.document is None:
+            return seen
+        other = Path(seen.document["configuration"])
+        if other.resolve() == config.resolve():
+            return seen
+        text = f"is of the gateway with {printable(str(other))}, not of {config}."
     return Seen(file, NOT_RUNNING, f"{file}: {text}")
 
 

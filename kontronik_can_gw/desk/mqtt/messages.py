@@ -71,8 +71,10 @@ class Published(Member):
 
     def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
         super().__init__(view, settings, index)
+        self.signs = self.of_group[Group.LIVE] or [*self.no_flags.values()]
+        """Columns that show that it is heard: of live values, where the DBC has any."""
         self.heard_ns: int | None = None
-        """Time of the newest live value."""
+        """Time of the newest value of these."""
         self.identity: tuple[str | None, str | None] | None = None
         """Device and firmware of the published discovery."""
         self._kinds = {normalize(each.text): each.kind for each in self.protocol.states.values()}
@@ -81,11 +83,11 @@ class Published(Member):
         self._published_ns = 0
 
     def is_available(self, now: int) -> bool:
-        """True while frames of the gateway, or live values of the ESC, come."""
+        """True while frames of the gateway, or values of the ESC, come."""
         if self.index is None:
             last = self.view.last_ns
             return last is not None and now - last <= SILENCE_NS
-        return self.is_known(Group.LIVE)
+        return any(self.view.values[at] is not None for at in self.signs)
 
     def is_due(self, now: int, period: int) -> bool:
         """True if the state is to be published now: it is time, or something notable has changed."""
@@ -152,7 +154,7 @@ class Publisher:
         indices = sorted({column.esc for column in columns if column.esc is not None})
         self._members = [Published(self._view, None, None)]
         self._members += [Published(self._view, bus.escs[index], index) for index in indices]
-        self._live = {at: m for m in self._members for at in m.of_group[Group.LIVE]}
+        self._signs = {at: m for m in self._members for at in m.signs}
         self._lasting: dict[str, bytes] = {}
         """Lasting messages as published, by topic."""
 
@@ -165,8 +167,8 @@ class Publisher:
         """Take a frame."""
         for first, values in self._view.take(frame.key, frame.data, now) or ():
             for at, value in enumerate(values, first):
-                if value is not None and at in self._live:
-                    self._live[at].heard_ns = now
+                if value is not None and at in self._signs:
+                    self._signs[at].heard_ns = now
 
     def messages(self, now: int, wall_ns: int) -> list[Message]:
         """The messages to publish now."""
