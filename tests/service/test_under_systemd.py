@@ -28,8 +28,8 @@ Facts = dict[str, Any]
 def obstacle() -> str | None:
     """Why it cannot be run here, and the remedy."""
     search = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
-    if shutil.which("linux.uml", path=search) is None:
-        return "no User Mode Linux: sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
+    if not all(shutil.which(each, path=search) for each in ("linux.uml", "cc")):
+        return "no User Mode Linux: sudo apt-get install user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
     if not Path("/lib/systemd/systemd").exists() or shutil.which("systemd-sysusers") is None:
         return "no systemd on this machine: sudo apt-get install systemd"
     if not INSTALLED.exists():
