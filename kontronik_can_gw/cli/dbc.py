@@ -5,8 +5,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.canopen.dbc import dbc_text as canopen_text
-from kontronik_can_gw.canopen.dbc import waiting_for_lss
+from kontronik_can_gw.canopen.dbc import pdo_text, waiting_for_lss
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
 from kontronik_can_gw.cli.output import write_output
@@ -16,7 +15,7 @@ from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.dbc.writer import dbc_text
+from kontronik_can_gw.dbc.writer import copies_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -74,7 +73,7 @@ def _canopen(config: Path | None, escs: list[EscSettings]) -> str:
         say(
             f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to describe"
         )
-    return canopen_text(nodes, escs)
+    return pdo_text(nodes, escs)
 
 
 def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> str:
@@ -96,4 +95,4 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> s
             say(f"warning: {line}")
     version = re.sub(" ?layout [0-9A-F]{8}$", "", plain.version or "")
     copies = copies_of(plain, layout.file, escs, settings)
-    return dbc_text(plain, copies, f"{version} layout {layout.fingerprint}".strip())
+    return copies_text(plain, copies, f"{version} layout {layout.fingerprint}".strip())

@@ -1,10 +1,12 @@
-"""Writes a database as DBC text that every tool reads, without loss: cantools reads back the same database. Messages are written as sent.
+"""Writes DBC text that every tool reads, without loss: cantools reads back the same database. Messages are written as sent.
 
 cantools' own writer leaves out attributes that equal their default, rewrites start values as floats, and does not escape the quotes
 of database comments and text attributes.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc.copies import Copy
@@ -18,16 +20,65 @@ _LONG_NAMES = frozenset(
 """Attributes not written: cantools has already replaced the short names by these long ones."""
 
 
-def dbc_text(
+@dataclass
+class SignalRow:
+    """A signal as the file has it: numbers in the units of the file, ``start`` as DBC counts bits, attributes by name."""
+
+    name: str
+    start: int
+    length: int
+    comment: str | None = None
+    is_little_endian: bool = True
+    is_signed: bool = False
+    is_float: bool = False
+    factor: float | Fraction = 1
+    offset: float | Fraction = 0
+    limits: tuple[float | Fraction, float | Fraction] = (0, 0)
+    unit: str = ""
+    receivers: Sequence[str] = ()
+    multiplexing: str = ""
+    """``M`` for a multiplexer, ``m1`` for a signal of page 1, ``m1M`` for both."""
+    pages: str = ""
+    """Its line of SG_MUL_VAL_ from the multiplexer's name on; empty where ``multiplexing`` says all."""
+    texts: Mapping[int, object] = field(default_factory=dict)
+    attributes: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass
+class MessageRow:
+    """A message as the file has it; ``key``: its id, with EXTENDED for 29 bits. ``groups``: lines of SIG_GROUP_ from the name on."""
+
+    key: int
+    name: str
+    length: int
+    senders: Sequence[str]
+    comment: str | None
+    attributes: Mapping[str, object]
+    signals: Sequence[SignalRow]
+    groups: Sequence[str] = ()
+
+
+def copies_text(
     database: "Database", copies: Sequence[Copy] | None = None, version: str | None = None
+) -> str:
+    """A database as text. ``copies``: its messages as they are sent; None: as they stand."""
+    sent = [Copy(message) for message in database.messages] if copies is None else copies
+    relations = [*_relations(database, sent)]
+    return dbc_text(database, [_message(each) for each in sent], version, relations)
+
+
+def dbc_text(
+    database: "Database",
+    messages: Sequence[MessageRow],
+    version: str | None = None,
+    relations: Sequence[str] = (),
 ) -> str:
     """The DBC text: sections in the usual order, signals in bit order, one line for each entry, LF line ends.
 
-    ``copies``: its messages as they are sent; None: as they stand.
+    All but the messages is taken from ``database``, and the lines BA_REL_ are those of ``relations``.
     """
     dbc: Any = database.dbc
-    sent = [Copy(message) for message in database.messages] if copies is None else copies
-    signals = [(c.key, s, name) for c in sent for s, name in _sorted(c)]
+    signals = [(m.key, s) for m in messages for s in _sorted(m)]
     definitions = [("", d) for d in dbc.attribute_definitions.values()]
     definitions += [("REL_", d) for d in dbc.relation_attribute_definitions.values()]
     sections = (
@@ -36,41 +87,86 @@ def dbc_text(
         ["BS_:"],
         [" ".join(["BU_:", *(node.name for node in database.nodes)])],
         [f"VAL_TABLE_ {name} {_texts(table)} ;" for name, table in dbc.value_tables.items()],
-        *([_head(c), *(_signal(s, name) for s, name in _sorted(c))] for c in sent),
-        [
-            f"BO_TX_BU_ {c.key} : {','.join(c.message.senders)};"
-            for c in sent
-            if len(c.message.senders) > 1
-        ],
+        *([_head(m), *map(_line, _sorted(m))] for m in messages),
+        [f"BO_TX_BU_ {m.key} : {','.join(m.senders)};" for m in messages if len(m.senders) > 1],
         [*_environment(dbc.environment_variables.values())],
-        [*_comments(database, sent)],
+        [*_comments(database, messages)],
         [f"BA_DEF_{rel} {_definition(d)};" for rel, d in definitions],
         [
             f'BA_DEF_DEF_{rel} "{d.name}" {_default(d)};'
             for rel, d in definitions
             if d.default_value is not None
         ],
-        [*_attributes(database, sent), *_relations(dbc.relation_attributes, sent)],
-        [f"VAL_ {key} {name} {_texts(s.choices)} ;" for key, s, name in signals if s.choices],
+        [*_attributes(database, messages), *relations],
+        [f"VAL_ {key} {s.name} {_texts(s.texts)} ;" for key, s in signals if s.texts],
+        [f"SIG_GROUP_ {m.key} {group};" for m in messages for group in m.groups],
         [
-            f"SIG_GROUP_ {c.key} {group.name} {group.repetitions} : "
-            f"{' '.join(c.prefix + name for name in group.signal_names)};"
-            for c in sent
-            for group in c.message.signal_groups or ()
-        ],
-        [
-            f"SIG_VALTYPE_ {key} {name} : {1 if s.length == 32 else 2};"
-            for key, s, name in signals
+            f"SIG_VALTYPE_ {key} {s.name} : {1 if s.length == 32 else 2};"
+            for key, s in signals
             if s.is_float
         ],
-        [line for c in sent for line in _multiplexing(c)],
+        [f"SG_MUL_VAL_ {key} {s.name} {s.pages};" for key, s in signals if s.pages],
     )
     return "\n\n".join("\n".join(section) for section in sections if section) + "\n"
 
 
-def _sorted(sent: Copy) -> list[tuple["Signal", str]]:
-    """Signals with their names on the bus."""
-    return sorted(sent.signals(), key=lambda pair: pair[0].start)
+# --- rows of a database
+
+
+def _message(sent: Copy) -> MessageRow:
+    message = sent.message
+    several = sum(signal.is_multiplexer for signal in message.signals) > 1
+    in_pages = several or any(len(s.multiplexer_ids or ()) > 1 for s in message.signals)
+    return MessageRow(
+        sent.key,
+        sent.name,
+        message.length,
+        message.senders,
+        message.comment,
+        _own_attributes(message),
+        [_signal(signal, name, sent.prefix, in_pages) for signal, name in sent.signals()],
+        [
+            f"{g.name} {g.repetitions} : {' '.join(sent.prefix + name for name in g.signal_names)}"
+            for g in message.signal_groups or ()
+        ],
+    )
+
+
+def _signal(signal: "Signal", name: str, prefix: str, in_pages: bool) -> SignalRow:
+    """``in_pages``: several multiplexers, or several values for a signal: its message needs SG_MUL_VAL_."""
+    pages = signal.multiplexer_ids or ()
+    multiplexing = f"m{pages[0]}" if pages else ""
+    ranges = ", ".join(f"{n}-{n}" for n in pages)
+    return SignalRow(
+        name,
+        signal.start,
+        signal.length,
+        signal.comment,
+        signal.byte_order == "little_endian",
+        signal.is_signed,
+        signal.is_float,
+        signal.scale,
+        signal.offset,
+        (signal.minimum or 0, signal.maximum or 0),
+        signal.unit or "",
+        signal.receivers,
+        multiplexing + ("M" if signal.is_multiplexer else ""),
+        f"{prefix}{signal.multiplexer_signal} {ranges}" if in_pages and pages else "",
+        signal.choices or {},
+        _own_attributes(signal),
+    )
+
+
+def _own_attributes(thing: Any) -> Mapping[str, object]:
+    attributes = thing.dbc.attributes.values() if thing.dbc else ()
+    return {a.name: a.value for a in attributes if a.name not in _LONG_NAMES}
+
+
+# --- lines
+
+
+def _sorted(message: MessageRow) -> list[SignalRow]:
+    return sorted(message.signals, key=lambda signal: signal.start)
 
 
 def _escaped(text: str) -> str:
@@ -78,6 +174,9 @@ def _escaped(text: str) -> str:
 
 
 def _number(value: Any) -> str:
+    """The nearest float where it is not whole."""
+    if isinstance(value, Fraction):
+        value = float(value)
     if isinstance(value, float) and value.is_integer() and abs(value) < 1 << 63:
         value = int(value)
     return str(value)
@@ -87,21 +186,18 @@ def _texts(table: Any) -> str:
     return " ".join(f'{number} "{_escaped(str(text))}"' for number, text in sorted(table.items()))
 
 
-def _head(sent: Copy) -> str:
-    senders = sent.message.senders
-    return f"BO_ {sent.key} {sent.name}: {sent.message.length} {senders[0] if senders else 'Vector__XXX'}"
+def _head(message: MessageRow) -> str:
+    sender = message.senders[0] if message.senders else "Vector__XXX"
+    return f"BO_ {message.key} {message.name}: {message.length} {sender}"
 
 
-def _signal(signal: "Signal", name: str) -> str:
-    mux = f" m{signal.multiplexer_ids[0]}" if signal.multiplexer_ids else ""
-    if signal.is_multiplexer:
-        mux = f"{mux}M" if mux else " M"
-    order, sign = int(signal.byte_order == "little_endian"), "-" if signal.is_signed else "+"
-    limits = "|".join(_number(end or 0) for end in (signal.minimum, signal.maximum))
+def _line(s: SignalRow) -> str:
+    multiplexing = f" {s.multiplexing}" if s.multiplexing else ""
+    place = f"{s.start}|{s.length}@{int(s.is_little_endian)}{'-' if s.is_signed else '+'}"
+    limits = "|".join(map(_number, s.limits))
     return (
-        f" SG_ {name}{mux} : {signal.start}|{signal.length}@{order}{sign} "
-        f'({_number(signal.scale)},{_number(signal.offset)}) [{limits}] "{_escaped(signal.unit or "")}" '
-        f"{','.join(signal.receivers) or 'Vector__XXX'}"
+        f" SG_ {s.name}{multiplexing} : {place} ({_number(s.factor)},{_number(s.offset)}) "
+        f'[{limits}] "{_escaped(s.unit)}" {",".join(s.receivers) or "Vector__XXX"}'
     )
 
 
@@ -116,22 +212,15 @@ def _environment(variables: Any) -> Iterator[str]:
             yield f"ENVVAR_DATA_ {v.name}: {v.data_size};"
 
 
-def _owners(database: "Database", sent: Sequence[Copy]) -> Iterator[tuple[str, Any]]:
-    """Owners of comments and attributes, by their names in DBC files."""
-    for node in database.nodes:
-        yield f"BU_ {node.name} ", node
-    for each in sent:
-        yield f"BO_ {each.key} ", each.message
-        yield from ((f"SG_ {each.key} {name} ", signal) for signal, name in _sorted(each))
+def _comments(database: "Database", messages: Sequence[MessageRow]) -> Iterator[str]:
     dbc: Any = database.dbc
-    for variable in dbc.environment_variables.values():
-        yield f"EV_ {variable.name} ", variable
-
-
-def _comments(database: "Database", sent: Sequence[Copy]) -> Iterator[str]:
-    for owner, thing in (*(("", bus) for bus in database.buses), *_owners(database, sent)):
-        if thing.comment is not None:
-            yield f'CM_ {owner}"{_escaped(thing.comment)}";'
+    found = [("", bus.comment) for bus in database.buses]
+    found += [(f"BU_ {node.name} ", node.comment) for node in database.nodes]
+    for m in messages:
+        found.append((f"BO_ {m.key} ", m.comment))
+        found += [(f"SG_ {m.key} {s.name} ", s.comment) for s in _sorted(m)]
+    found += [(f"EV_ {v.name} ", v.comment) for v in dbc.environment_variables.values()]
+    return (f'CM_ {owner}"{_escaped(text)}";' for owner, text in found if text is not None)
 
 
 def _definition(definition: Any) -> str:
@@ -150,8 +239,7 @@ def _default(definition: Any) -> str:
     return f'"{_escaped(str(value))}"' if is_text else _number(value)
 
 
-def _value(attribute: Any) -> str:
-    value, definition = attribute.value, attribute.definition
+def _value(value: Any, definition: Any) -> str:
     if definition.type_name == "STRING":
         return f'"{_escaped(value)}"'
     if definition.type_name == "ENUM" and value in (definition.choices or ()):
@@ -159,16 +247,23 @@ def _value(attribute: Any) -> str:
     return _number(value)
 
 
-def _attributes(database: "Database", sent: Sequence[Copy]) -> Iterator[str]:
-    order = {"": 0, "BU_": 1, "BO_": 2, "SG_": 3, "EV_": 4}
-    owners = sorted([("", database), *_owners(database, sent)], key=lambda pair: order[pair[0][:3]])
-    for owner, thing in owners:
-        for attribute in thing.dbc.attributes.values() if thing.dbc else ():
-            if attribute.name not in _LONG_NAMES:
-                yield f'BA_ "{attribute.name}" {owner}{_value(attribute)};'
+def _attributes(database: "Database", messages: Sequence[MessageRow]) -> Iterator[str]:
+    dbc: Any = database.dbc
+    owners = [("", _own_attributes(database))]
+    owners += [(f"BU_ {node.name} ", _own_attributes(node)) for node in database.nodes]
+    owners += [(f"BO_ {m.key} ", m.attributes) for m in messages]
+    owners += [(f"SG_ {m.key} {s.name} ", s.attributes) for m in messages for s in _sorted(m)]
+    variables = dbc.environment_variables.values()
+    owners += [(f"EV_ {variable.name} ", _own_attributes(variable)) for variable in variables]
+    for owner, attributes in owners:
+        for name, value in attributes.items():
+            text = _value(value, dbc.attribute_definitions[name])
+            yield f'BA_ "{name}" {owner}{text};'
 
 
-def _relations(relations: Any, sent: Sequence[Copy]) -> Iterator[str]:
+def _relations(database: "Database", sent: Sequence[Copy]) -> Iterator[str]:
+    dbc: Any = database.dbc
+    relations = dbc.relation_attributes
     if relations is None:
         return
     found: list[tuple[str, Any]] = []
@@ -189,16 +284,5 @@ def _relations(relations: Any, sent: Sequence[Copy]) -> Iterator[str]:
             for node, attributes in by_node.items()
         ]
     for owner, attributes in found:
-        yield from (f'BA_REL_ "{a.name}" {owner} {_value(a)};' for a in attributes.values())
-
-
-def _multiplexing(sent: Copy) -> Iterator[str]:
-    """SG_MUL_VAL_, only for messages that need it: several multiplexers or several values for a signal."""
-    signals = sent.message.signals
-    several = sum(signal.is_multiplexer for signal in signals) > 1
-    if several or any(len(signal.multiplexer_ids or ()) > 1 for signal in signals):
-        for signal, name in _sorted(sent):
-            if signal.multiplexer_ids:
-                ranges = ", ".join(f"{n}-{n}" for n in signal.multiplexer_ids)
-                selector = f"{sent.prefix}{signal.multiplexer_signal}"
-                yield f"SG_MUL_VAL_ {sent.key} {name} {selector} {ranges};"
+        for a in attributes.values():
+            yield f'BA_REL_ "{a.name}" {owner} {_value(a.value, a.definition)};'

@@ -20,7 +20,7 @@ from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc.names import esc_prefix
-from kontronik_can_gw.dbc.writer import dbc_text
+from kontronik_can_gw.dbc.writer import copies_text
 from kontronik_can_gw.esc.kontronik.simulator import (
     BYTE_NS,
     Dropout,
@@ -43,7 +43,7 @@ def described(bench: dialogue.Bench) -> str:
     """The DBC of the nodes as they are at this moment."""
     assert bench.gateway.nodes is not None
     settings = [esc.settings for esc in bench.gateway.escs]
-    text = canopen_dbc.dbc_text(bench.gateway.nodes, settings)
+    text = canopen_dbc.pdo_text(bench.gateway.nodes, settings)
     assert text.isascii()
     return text
 
@@ -148,7 +148,7 @@ class Bench(dialogue.Bench):
 def test_the_shipped_file_is_what_the_command_writes(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["dbc", "--canopen"]) == 0
     assert capsys.readouterr().out == SHIPPED.read_text()
-    assert dbc_text(read(SHIPPED.read_text())) == SHIPPED.read_text(), "it can be written again"
+    assert copies_text(read(SHIPPED.read_text())) == SHIPPED.read_text(), "it can be written again"
 
 
 OF_THE_OTHER_FILE = {"limits_leave_out_the_codes", "enums_are_closed"}

@@ -37,7 +37,7 @@ def multiplied(
 ) -> tuple[Database, str]:
     plain = read(text)
     copies = expand.copies_of(plain, "my.dbc", escs, DbcSettings(node=node, **more))
-    out = writer.dbc_text(plain, copies)
+    out = writer.copies_text(plain, copies)
     return read(out), out
 
 
@@ -87,7 +87,7 @@ def relations(text: str) -> list[str]:
 
 
 def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
-    assert writer.dbc_text(parse_database(SHIPPED.encode(), "x")) == SHIPPED
+    assert writer.copies_text(parse_database(SHIPPED.encode(), "x")) == SHIPPED
 
 
 def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
@@ -111,7 +111,7 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
         'BA_REL_ "Timeout" BU_SG_REL_ Logger SG_ 256 LeftConsumedCharge 250;',
         'BA_REL_ "Timeout" BU_SG_REL_ Logger SG_ 257 RightConsumedCharge 250;',
     ]
-    assert writer.dbc_text(after) == text
+    assert writer.copies_text(after) == text
     assert text.endswith(";\n") and "\r" not in text and "\n\nBO_ 256 LeftFlow" in text
     assert '"NS_DESC' not in text and "\nNS_ :\n" in text
 
@@ -211,7 +211,7 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     maker = LayoutMaker(random.Random(seed), PAIR)
     messages = [maker.message() for _ in range(5)]
     before = read(dbc_text(messages))
-    after = read(writer.dbc_text(before))
+    after = read(writer.copies_text(before))
     assert all_facts(after) == all_facts(before)
     bind = DbcSettings(bindings(messages))
     old, new = (prepare(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after))

@@ -15,7 +15,7 @@ from packer_oracle import read
 from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.config.keys import MqttConfig
-from kontronik_can_gw.dbc.writer import dbc_text
+from kontronik_can_gw.dbc.writer import copies_text
 from kontronik_can_gw.desk.mqtt.messages import MIN_PAUSE_NS, Message, Publisher, Topics
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
@@ -87,7 +87,7 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
 @pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
 def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str, ...]) -> None:
     bus = layout_of(names)
-    database = read(dbc_text(bus.database, [*bus.copies().values()]))
+    database = read(copies_text(bus.database, [*bus.copies().values()]))
     frames = flight(bus, 12)
     made = publisher(*names)
     last = run(made, frames, 12)
