@@ -175,7 +175,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         with collecting(problems):
             dbc = read_dbc(config.dbc_path)
             database = parse_database(dbc, file, ignored)
-            layout = prepare(database, file, escs, config.dbc_settings, config.can.fd, taken)
+            layout = prepare(database, file, escs, config.dbc, config.can.fd, taken)
     if problems:
         raise UserError(*problems)
     rates = config.can.bitrate, config.can.data_bitrate
@@ -189,7 +189,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             with collecting(warnings):  # more than the bus has is no reason not to start
                 load = check_load(layout, *rates, bits)
     warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(rates[0])]
-    mute = [*unreported(layout, config.dbc.on_loss == "silent"), *unsupplied(layout, escs)]
+    mute = [*unreported(layout, config.dbc.silent_on_loss), *unsupplied(layout, escs)]
     said = (*config.warnings, *ignored, *mute, *filter(None, [load]), *warnings)
     return Loaded(
         *(config, escs, database, layout, canopen, tuple(damaged), store, said, dbc, outputs)

@@ -9,12 +9,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.binding import Binder
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.message_compiler import compile_message
 from kontronik_can_gw.dbc.reader import choose_node, listed
-from kontronik_can_gw.dbc.settings import Compilation, DbcSettings
+from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import block_of
@@ -31,7 +32,7 @@ def prepare(
     database: "Database",
     file: str,
     escs: Sequence[EscSettings],
-    settings: DbcSettings,
+    settings: DbcConfig,
     fd_allowed: bool = False,
     taken_ids: Mapping[int, str] | None = None,
 ) -> Layout:
@@ -73,7 +74,7 @@ def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
                 name=copy.name,
                 can_id=copy.frame_id,
                 escs=frozenset((copy.esc,)),
-                data_id=job.settings.data_ids.get(copy.name, copy.frame_id & 0xFFFF),
+                data_id=job.settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
                 renamed=(of.prefix, copy.prefix),
             )
         elif (compiled := compile_message(job, copy)) is not None:
@@ -123,8 +124,8 @@ def _unused_settings(job: Compilation, ours: Sequence[Copy], node: str) -> Itera
         yield f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{near}"
     yield from _unmet("units", settings.units, job.units, f"signal of {node} has this unit", file)
     what = f"message of {node} has this GenMsgSendType"
-    yield from _unmet("send_type", settings.send_types, job.send_types, what, file)
-    for name in sorted(set(settings.data_ids) - {copy.name for copy in ours}):
+    yield from _unmet("send_type", settings.send_type, job.send_types, what, file)
+    for name in sorted(set(settings.e2e_data_ids) - {copy.name for copy in ours}):
         yield f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}."
 
 

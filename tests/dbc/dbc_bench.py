@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -22,10 +22,10 @@ FILE = "my_car.dbc"
 
 
 def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> Layout:
-    """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcSettings."""
+    """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcConfig."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
-    return prepare(database, FILE, escs, DbcSettings(**settings), fd_allowed=True)
+    return prepare(database, FILE, escs, DbcConfig(**settings), fd_allowed=True)
 
 
 def refused(text: str, **settings: Any) -> list[str]:

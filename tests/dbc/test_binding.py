@@ -158,7 +158,7 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
         Sig("Alive", counter_at, length),
         Sig("BatteryVoltage", value_at, 16, unit="V"),
     ]
-    layout = layout_of([Msg("M", 0x12345, 8, signals, extended=True)], data_ids=data_ids)
+    layout = layout_of([Msg("M", 0x12345, 8, signals, extended=True)], e2e_data_ids=data_ids)
     data_id = data_ids.get("M", 0x2345)
     gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
     gateway.start(0)

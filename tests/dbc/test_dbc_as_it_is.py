@@ -10,14 +10,13 @@ from dbc_bench import compiled, gateway_with, packed, refused
 
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.loss import unreported
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.dbc.timing import SEND_TYPES
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES
-from kontronik_can_gw.signals.plan import Role, SendType
+from kontronik_can_gw.signals.plan import SEND_TYPES, Role, SendType
 from kontronik_can_gw.signals.units import conversion
 
 
@@ -285,9 +284,9 @@ def test_another_send_type_is_refused_unless_dbc_send_type_says_what_it_means(te
     (line,) = refused(all_sent(text))
     assert f"GenMsgSendType {text!r} is not known" in line and f"dbc.send_type.{text!r}" in line
     for name, meaning in ((text, "CyclicAndEvent"), ("OnChange", "Event")):
-        (plan,) = compiled(all_sent(name), send_types={name: meaning}).messages
+        (plan,) = compiled(all_sent(name), send_type={name: meaning}).messages
         assert plan.send_type == SEND_TYPES[meaning]
-    assert refused(all_sent("Event"), send_types={"Evnt": "Cyclic"}) == [
+    assert refused(all_sent("Event"), send_type={"Evnt": "Cyclic"}) == [
         "dbc.send_type.Evnt: no message of Gateway has this GenMsgSendType in my_car.dbc. Did you mean 'Event'?"
     ]
 
@@ -333,7 +332,7 @@ def test_a_checksum_of_unknown_making_is_refused_until_somebody_says_what_it_is(
         assert f"Power.{crc}: " in line
         assert "dbc.e2e_data_ids.Power = 0x100" in line and "dbc.messages" in line
     bind: dict[str, str | float] = {counter: "alive"}
-    for said in ({"data_ids": {"Power": 7}, "bind": bind}, {"bind": {crc: "crc"} | bind}):
+    for said in ({"e2e_data_ids": {"Power": 7}, "bind": bind}, {"bind": {crc: "crc"} | bind}):
         layout = compiled(text, **said)
         assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
         assert not layout.warnings[:-1]
@@ -344,7 +343,7 @@ def test_what_0_5_0_sent_as_e2e_profile_1_by_its_names_goes_on_with_a_warning() 
     text = MESSAGE + signal("Crc") + signal("Alive", "8|4@1+")
     warned = "".join(compiled(text).warnings)
     assert "AUTOSAR E2E profile 1" in warned and "= 0x100" in warned
-    assert "E2E" not in "".join(compiled(text, data_ids={"Power": 0x100}).warnings)
+    assert "E2E" not in "".join(compiled(text, e2e_data_ids={"Power": 0x100}).warnings)
     # a counter by its binding is one by its name
     other = compiled(text.replace("Alive", "MsgNo"), bind={"MsgNo": "alive"})
     assert [signal.role for signal in other.messages[0].signals] == [Role.CRC, Role.ALIVE]
@@ -454,13 +453,12 @@ def test_a_float_of_another_length_is_refused_whatever_it_begins_with(bits: int)
 
 
 def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
-    old = DbcSettings({"A.B": 1}, base_id=5, data_ids={"M": 7})
-    later: dict[str, Any] = {"units": {"x": "V"}, "send_types": {"y": "Event"}}
-    later |= {"messages": ("Motor_*",), "unbound": "start_value", "flags_on_loss": 1}
-    new = replace(old, **later)
-    setup = CaptureSetup((EscSettings(),), ("-",), ("my.dbc", b""), new, False, False, None)
+    old = DbcConfig(bind={"A.B": 1}, base_id=5, e2e_data_ids={"M": 7}, on_loss="silent")
+    later: dict[str, Any] = {"units": {"x": "V"}, "messages": ("Motor_*",), "flags_on_loss": 1}
+    new = replace(old, send_type={"y": "Event"}, unbound="start_value", **later)
+    setup = CaptureSetup((EscSettings(),), ("-",), ("my.dbc", b""), new, False, None)
     header = json.loads(json.dumps(setup.header()))
     assert CaptureSetup.of(header).dbc_settings == new
-    for key in later:
+    for key in (*later, "send_types", "unbound"):
         del header["dbc"][key]
     assert CaptureSetup.of(header).dbc_settings == old

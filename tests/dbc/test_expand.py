@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc import expand, writer
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
@@ -36,7 +36,7 @@ def multiplied(
     text: str, escs: Sequence[EscSettings], node: str = "Gateway", **more: Any
 ) -> tuple[Database, str]:
     plain = read(text)
-    copies = expand.copies_of(plain, "my.dbc", escs, DbcSettings(node=node, **more))
+    copies = expand.copies_of(plain, "my.dbc", escs, DbcConfig(node=node, **more))
     out = writer.dbc_text(plain, copies)
     return read(out), out
 
@@ -159,7 +159,7 @@ def test_ids_are_moved_by_the_smallest_step_without_a_clash(
 
 def refused(text: str, escs: list[EscSettings] = PAIR, **more: Any) -> str:
     with pytest.raises(UserError) as caught:
-        prepare(read(text), "my.dbc", escs, DbcSettings(node="Gateway", **more))
+        prepare(read(text), "my.dbc", escs, DbcConfig(node="Gateway", **more))
     for line in caught.value.problems:
         assert line.startswith("my.dbc: ") and "\n" not in line
     return "\n".join(caught.value.problems)
@@ -213,7 +213,7 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     before = read(dbc_text(messages))
     after = read(writer.dbc_text(before))
     assert all_facts(after) == all_facts(before)
-    bind = DbcSettings(bindings(messages))
+    bind = DbcConfig(bind=bindings(messages))
     old, new = (prepare(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after))
     assert plain_plans(new) == plain_plans(old)
 
@@ -233,7 +233,7 @@ def test_what_is_sent_is_what_the_written_file_says(text: str, node: str) -> Non
     """ESCs of which two are alike: what they share is the same as if each were compiled."""
     three = [EscSettings("left", 7), EscSettings("mid", 14), EscSettings("right", 7)]
     sent, again = (
-        prepare(database, "x", three, DbcSettings(node=node), fd_allowed=True)
+        prepare(database, "x", three, DbcConfig(node=node), fd_allowed=True)
         for database in (read(text), multiplied(text, three, node)[0])
     )
     assert any(plan.renamed for plan in sent.messages)

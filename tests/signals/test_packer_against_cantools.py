@@ -23,8 +23,8 @@ from packer_oracle import (
     read,
 )
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -49,7 +49,9 @@ ROUNDS = 3
 def compiled(
     messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS
 ) -> dict[str, MessagePlan]:
-    layout = prepare(database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True)
+    layout = prepare(
+        database, "random.dbc", escs, DbcConfig(bind=bindings(messages)), fd_allowed=True
+    )
     return {plan.name: plan for plan in layout.messages}
 
 

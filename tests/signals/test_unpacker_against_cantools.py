@@ -11,8 +11,8 @@ from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text,
 from test_packer_against_cantools import ESCS, MESSAGES
 
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
@@ -43,7 +43,9 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
     database = read(dbc_text(messages))
-    layout = prepare(database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True)
+    layout = prepare(
+        database, "random.dbc", ESCS, DbcConfig(bind=bindings(messages)), fd_allowed=True
+    )
     reader = SignalReader(layout)
     compared = 0
     for message, plan in zip(messages, layout.messages, strict=True):
