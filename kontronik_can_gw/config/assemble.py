@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw import __version__
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
-from kontronik_can_gw.dbc.loss import unreported, unsupplied
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.dbc.prepare import check_load, prepare
+from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupplied
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings

@@ -5,9 +5,8 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc.binding import Binder
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.names import MAX_NAME, esc_prefix
+from kontronik_can_gw.dbc.names import MAX_NAME, Binder, esc_prefix
 from kontronik_can_gw.dbc.reader import choose_node, listed
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings

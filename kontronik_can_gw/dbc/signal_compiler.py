@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc import names, raw_values
-from kontronik_can_gw.dbc.binding import Binder
 from kontronik_can_gw.dbc.copies import Copy
+from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.esc.values import Group, Value

@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get
 
-from kontronik_can_gw.dbc.binding import Binder
+from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.signals import e2e
+from kontronik_can_gw.signals.packer import e2e_crc
 from kontronik_can_gw.signals.plan import Layout
 
 LIVE = LiveData(
@@ -142,7 +142,7 @@ def test_the_crc_is_that_of_the_autosar_package_at_every_place(
     data: bytes, data_id: int, draw: st.DataObject
 ) -> None:
     at = draw.draw(st.integers(0, len(data) - 2))
-    assert e2e.crc(data, at, data_id) == theirs(data, at, data_id)[at]
+    assert e2e_crc(data, at, data_id) == theirs(data, at, data_id)[at]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from dbc_bench import compiled, gateway_with, packed, refused
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc.loss import unreported
+from kontronik_can_gw.dbc.prepare import unreported
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
