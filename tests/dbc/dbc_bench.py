@@ -1,9 +1,11 @@
 """A DBC as people write it: compiled, refused, and what its messages hold."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import pytest
+from cantools.database.can import Database
 
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
@@ -16,6 +18,16 @@ from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
+
+
+def check_comments(database: Database) -> None:
+    """Everything has a sentence as comment, without what a parser may take for syntax."""
+    owners: list[Any] = [database.buses[0], *database.nodes, *database.messages]
+    owners += [signal for message in database.messages for signal in message.signals]
+    for text in (str(owner.comment) for owner in owners):
+        assert len(text) >= 10 and text.endswith("."), text
+        assert not re.search(r"[;\\]|\b[A-Z]+_\B", text), text
+
 
 NOW = 50 * MS
 FILE = "my_car.dbc"
