@@ -13,6 +13,7 @@ from packer_oracle import UNITS
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.prepare import unreported
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -174,24 +175,14 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
     ]
 
 
-@pytest.mark.parametrize(
-    ("place", "fits", "beyond"),
-    [
-        ("0|8@1+", (0, 255), (-1, 256, 0.5)),
-        ("0|1@1-", (-1, 0), (-2, 1)),
-        ("7|12@0-", (-2048, 2047), (-2049, 2048)),
-    ],
-)
-def test_a_start_value_may_be_every_number_that_the_signal_holds(
-    place: str, fits: tuple[int, int], beyond: tuple[float, ...]
-) -> None:
-    text = MESSAGE + signal("Foo", place) + START
+def test_a_start_value_may_be_every_number_that_the_signal_holds() -> None:
+    text = MESSAGE + signal("Foo", "7|12@0-") + START
     (theirs,) = parse_database(text.encode(), "my.dbc").messages
-    for value in fits:
+    for value in (-2048, 2047):
         layout = compiled(text + start_of("Foo", value), unbound="start_value")
         data = packed(layout.messages[0], gateway_with(layout))
         assert theirs.decode_simple(data) == {"Foo": value}
-    for number in beyond:
+    for number in (-2049, 2048, 0.5):
         (line,) = refused(text + start_of("Foo", number), unbound="start_value")
         assert "Power.Foo" in line and f"GenSigStartValue {number}" in line
 
@@ -220,15 +211,13 @@ def all_sent(text: str, cycle: int = 20) -> str:
     )
 
 
-@pytest.mark.parametrize(
-    ("meant", "text"),
-    [(meant, text) for meant, texts in SPELLINGS.items() for text in texts.split()],
-)
-def test_a_send_type_is_known_by_its_names_in_use(meant: str, text: str) -> None:
-    layout = compiled(all_sent(text))
-    assert layout.messages[0].send_type == (SEND_TYPES[meant] if meant else SendType.CYCLIC)
-    if not meant:
-        assert compiled(all_sent(text, 0)).messages[0].send_type == SendType.EVENT
+@pytest.mark.parametrize("meant", SPELLINGS)
+def test_a_send_type_is_known_by_its_names_in_use(meant: str) -> None:
+    for text in SPELLINGS[meant].split():
+        (plan,) = compiled(all_sent(text)).messages
+        assert plan.send_type == (SEND_TYPES[meant] if meant else SendType.CYCLIC), text
+        if not meant:
+            assert compiled(all_sent(text, 0)).messages[0].send_type == SendType.EVENT
 
 
 @pytest.mark.parametrize("text", ["No", "Wrong", "OnRequest", "cyclically"])
@@ -246,49 +235,48 @@ def test_another_send_type_is_refused_unless_dbc_send_type_says_what_it_means(te
 # --- counters and checksums ---------------------------------------------------------------------------------------------
 
 
-def role(name: str, **bind: str | float) -> Role:
-    """What becomes of a signal of this name."""
-    text = MESSAGE + signal(name) + signal("Beside", "8|4@1+")
-    (plan,) = compiled(text, bind={"Beside": 0} | bind).messages
-    return plan.signals[0].role
+NAMES = {
+    Role.ALIVE: "MsgCntr AliveCnt COUNTER Counter CTR Motor_11_BZ SQC Gear_SQC XMsgCnt LWI_Botschaftszaehler AliveCtr",
+    Role.CRC: "CHKSM CRC8 Checksum Motor_11_CRC Chksum EPS_CKS Mdps_CS",
+    None: "ErrorCounter AliveCnt2 COUNTER_PEDAL Alive_1 ABZ Brebz Gas_CSX",
+}
 
 
-COUNTERS = "MsgCntr AliveCnt COUNTER Counter CTR Motor_11_BZ SQC Gear_SQC XMsgCnt LWI_Botschaftszaehler AliveCtr"
+def test_a_counter_of_frames_and_a_checksum_are_known_by_their_names() -> None:
+    for role, names in NAMES.items():
+        assert {name: protection(name) for name in names.split()} == dict.fromkeys(
+            names.split(), role
+        )
 
 
-@pytest.mark.parametrize("name", COUNTERS.split())
-def test_a_counter_of_frames_is_known_by_its_name(name: str) -> None:
-    assert role(name) is Role.ALIVE
-    assert role(name, **{name: 1}) is Role.CONSTANT
-
-
-@pytest.mark.parametrize(
-    "name", ["ErrorCounter", "AliveCnt2", "COUNTER_PEDAL", "Alive_1", "ABZ", "Brebz", "Gas_CSX"]
-)
-def test_what_may_count_something_else_is_refused_unless_it_is_bound(name: str) -> None:
-    (line,) = refused(MESSAGE + signal(name))
+def test_a_counter_is_sent_and_what_may_count_something_else_is_refused_unless_bound() -> None:
+    text, other = MESSAGE + signal("COUNTER"), MESSAGE + signal("ErrorCounter")
+    (line,) = refused(other)
     assert "no such source" in line
-    assert role(name, **{name: "alive"}) is Role.ALIVE
+    found = [
+        compiled(text),
+        compiled(other, bind={"ErrorCounter": "alive"}),
+        compiled(text, bind={"COUNTER": 1}),
+    ]
+    roles = [layout.messages[0].signals[0].role for layout in found]
+    assert roles == [Role.ALIVE, Role.ALIVE, Role.CONSTANT]
 
 
-@pytest.mark.parametrize(
-    "crc", ["CHKSM", "CRC8", "Checksum", "Motor_11_CRC", "Chksum", "EPS_CKS", "Mdps_CS"]
-)
-@pytest.mark.parametrize("counter", ["COUNTER", "Motor_11_BZ", "AliveCnt", "Nothing"])
+@pytest.mark.parametrize("counter", ["COUNTER", "Nothing"])
 def test_a_checksum_of_unknown_making_is_refused_until_somebody_says_what_it_is(
-    crc: str, counter: str
+    counter: str,
 ) -> None:
-    text = MESSAGE + signal(crc) + signal(counter, "8|4@1+")
+    text = MESSAGE + signal("CHKSM") + signal(counter, "8|4@1+")
     for settings in ({}, {"unbound": "start_value"}):
         (line,) = refused(text, bind={"Nothing": 0} if counter == "Nothing" else {}, **settings)
-        assert f"Power.{crc}: " in line
+        assert "Power.CHKSM: " in line
         assert "dbc.e2e_data_ids.Power = 0x100" in line and "dbc.messages" in line
     bind: dict[str, str | float] = {counter: "alive"}
-    for said in ({"e2e_data_ids": {"Power": 7}, "bind": bind}, {"bind": {crc: "crc"} | bind}):
+    for said in ({"e2e_data_ids": {"Power": 7}, "bind": bind}, {"bind": {"CHKSM": "crc"} | bind}):
         layout = compiled(text, **said)
         assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
         assert not layout.warnings[:-1]
-    assert compiled(text, bind=bind | {crc: 0}).messages[0].signals[0].role is Role.CONSTANT
+    assert compiled(text, bind=bind | {"CHKSM": 0}).messages[0].signals[0].role is Role.CONSTANT
 
 
 def test_what_0_5_0_sent_as_e2e_profile_1_by_its_names_goes_on_with_a_warning() -> None:
