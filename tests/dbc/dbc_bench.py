@@ -40,10 +40,10 @@ def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> La
     return prepare(database, FILE, escs, DbcConfig(**settings), fd_allowed=True)
 
 
-def refused(text: str, **settings: Any) -> list[str]:
+def refused(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> list[str]:
     """What ``compiled`` refuses these with: plain lines, each with its place."""
     with pytest.raises(UserError) as caught:
-        compiled(text, **settings)
+        compiled(text, names, **settings)
     assert caught.value.exit_code == 2
     lines = list(caught.value.problems)
     assert lines
