@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -91,9 +91,7 @@ def load_configuration(
     with collecting(problems):
         check_interface(config.can)
     if problems:
-        with collecting(problems):
-            assemble(without_clashing_escs(config))
-        raise UserError(*problems)
+        return assemble(without_clashing_escs(config), None, problems)
     if store is None or not config.canopen.enabled:
         return assemble(config)
     from kontronik_can_gw.config.nodes import parameter_folder
@@ -143,12 +141,14 @@ def _outputs(
     return tuple(found)
 
 
-def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
-    """The objects made from a configuration. Without a store its files are only read.
+def assemble(
+    config: Config, store: "ParameterStore | None" = None, known: Sequence[str] = ()
+) -> Loaded:
+    """The objects made from a configuration. Without a store its files are only read. UserError with what is ``known``, too.
 
     A faulty configuration, DBC or EDS is refused. Stored parameters that do not fit them are ignored with a warning.
     """
-    problems: list[str] = []
+    problems = [*known]
     with collecting(problems):
         check_devices(config)
     escs, plain, canopen = config.escs, None, None
