@@ -123,7 +123,7 @@ class SignalCompiler:
             length=signal.length,
             signed=signal.is_signed,
             is_float=signal.is_float,
-            pieces=raw_values.pieces(signal),
+            pieces=raw_values.pieces(signal.start, signal.length, signal.byte_order),
             low=low,
             high=high,
             not_available=not_available,
