@@ -384,6 +384,12 @@ def test_of_two_escs_each_flag_needs_a_signal_of_its_own_esc() -> None:
     assert "RightUndervoltage" in line and "LeftUndervoltage" not in line
 
 
+def test_a_float_of_another_length_is_refused_whatever_it_begins_with() -> None:
+    float_24 = signal("Throttle", "0|24@1-", "%") + "SIG_VALTYPE_ 256 Throttle : 1;\n"
+    (line,) = refused(MESSAGE + float_24 + START + start_of("Throttle", 5))
+    assert "a float of 24 bits cannot be sent" in line
+
+
 def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
     old = DbcConfig(bind={"A.B": 1}, base_id=5, e2e_data_ids={"M": 7}, on_loss="silent")
     later: dict[str, Any] = {"units": {"x": "V"}, "messages": ("Motor_*",), "flags_on_loss": 1}
