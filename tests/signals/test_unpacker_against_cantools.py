@@ -3,10 +3,10 @@
 import math
 import random
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import pytest
+from dbc_bench import compiled
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text, get, put, read
 from test_packer_against_cantools import ESCS, MESSAGES
 
@@ -104,7 +104,7 @@ def test_an_error_code_beside_them_does_not_hide_flags() -> None:
         assert values[flag - first] == expected
 
 
-def view_of(tmp_path: Path, *messages: tuple[str, int, str]) -> View:
+def view_of(*messages: tuple[str, int, str]) -> View:
     """A view of messages with one signal each: name, cycle in ms, send type."""
     made = [
         Msg(f"M{number}", 100 + number, 8, [Sig(name, 0, 16, maximum="65533")])
@@ -115,17 +115,15 @@ def view_of(tmp_path: Path, *messages: tuple[str, int, str]) -> View:
         f'BA_ "GenMsgCycleTime" BO_ {100 + number} {cycle};\nBA_ "GenMsgSendType" BO_ {100 + number} {kinds[send]};\n'
         for number, (_, cycle, send) in enumerate(messages)
     )
-    path = tmp_path / "v.dbc"
-    path.write_text(dbc_text(made, more))
-    return View(SignalReader(layout_of_dbc(path).layout))
+    return View(SignalReader(compiled(dbc_text(made, more))))
 
 
 def value(view: View, source: str) -> Any:
     return dict(zip((c.source for c in view.reader.columns), view.values, strict=True))[source]
 
 
-def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer(tmp_path: Path) -> None:
-    view = view_of(tmp_path, ("losses", 5000, "Cyclic"), ("variant", 0, "OnChange"))
+def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer() -> None:
+    view = view_of(("losses", 5000, "Cyclic"), ("variant", 0, "OnChange"))
     for when in range(0, 60, 5):
         view.take(100, b"\1" * 8, when * SECOND)
         if not when:
@@ -139,8 +137,8 @@ def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer(tmp_path:
     assert value(view, "variant") is None
 
 
-def test_what_comes_with_telemetry_is_fresh_for_a_second(tmp_path: Path) -> None:
-    view = view_of(tmp_path, ("battery_voltage", 0, "Event"), ("losses", 100, "Cyclic"))
+def test_what_comes_with_telemetry_is_fresh_for_a_second() -> None:
+    view = view_of(("battery_voltage", 0, "Event"), ("losses", 100, "Cyclic"))
     view.take(100, b"\1" * 8, 0)
     for when in range(0, 2000, 100):
         view.take(101, b"\1" * 8, when * MS)
