@@ -7,23 +7,23 @@ JSON keys of the header (run and recorder add created_ns, run, part, monotonic_n
     configuration        the effective TOML text; file: its path
     escs                 settings of each ESC (gear as "31/4") that were in effect
     ports                their serial ports
-    dbc                  file, text (one character a byte), fd, silent_on_loss and the fields of DbcSettings; null without it
+    dbc                  file, text (one character a byte), fd, silent_on_loss and the keys of [dbc]; null without it
     canopen              eds (file, text), nodes, stored, escs (settings as configured); null without it
     outputs              further ones by their names: table (as in the configuration), identity, version, seed; not in captures of 0.5.0
 """
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
@@ -42,6 +42,12 @@ Header = Mapping[str, Any]
 _UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, UserError)
 """What a header raises that holds anything."""
 _LATEST, _SEEDS = 1 << 62, (1 << 64) - 1
+_DBC_KEYS = {
+    f.name: {"e2e_data_ids": "data_ids", "send_type": "send_types"}.get(f.name, f.name)
+    for f in fields(DbcConfig)
+    if f.name not in ("enabled", "file", "on_loss")
+}
+"""Keys of [dbc] to their names in a header."""
 _KINDS = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
 
 
@@ -52,9 +58,8 @@ class CaptureSetup:
     escs: tuple[EscSettings, ...]
     ports: tuple[str, ...]
     dbc: tuple[str, bytes] | None
-    dbc_settings: DbcSettings
+    dbc_settings: DbcConfig
     fd: bool
-    silent_on_loss: bool
     canopen: "CanopenSetup | None"
     configuration: str = ""
     file: str = ""
@@ -67,8 +72,9 @@ class CaptureSetup:
         dbc = None
         if self.dbc is not None:
             name, data = self.dbc
-            own = {"fd": self.fd, "silent_on_loss": self.silent_on_loss}
-            dbc = {"file": name, "text": data.decode("latin-1")} | own | asdict(self.dbc_settings)
+            dbc = {"file": name, "text": data.decode("latin-1"), "fd": self.fd}
+            dbc["silent_on_loss"] = self.dbc_settings.silent_on_loss
+            dbc |= {name: getattr(self.dbc_settings, key) for key, name in _DBC_KEYS.items()}
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -104,7 +110,7 @@ class CaptureSetup:
     @classmethod
     def _of(cls, header: Header) -> "CaptureSetup":
         dbc = header["dbc"]
-        settings, file = DbcSettings(), None
+        settings, file = DbcConfig(), None
         if dbc is not None:
             file = (str(dbc["file"]), dbc["text"].encode("latin-1"))
             settings = _dbc_settings(dbc)
@@ -116,7 +122,6 @@ class CaptureSetup:
             file,
             settings,
             bool(dbc and dbc["fd"]),
-            bool(dbc and dbc["silent_on_loss"]),
             None if found is None else _canopen(found),
             str(header["configuration"]),
             str(header["file"]),
@@ -135,7 +140,7 @@ class CaptureSetup:
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """The gateway in its state before the start."""
         return Gateway(
-            *(self.escs, layout, now, self.silent_on_loss, self.canopen),
+            *(self.escs, layout, now, self.dbc_settings.silent_on_loss, self.canopen),
             further=[setup.make for setup in self.outputs],
             packs_at_once=self.version == 1,
         )
@@ -179,14 +184,12 @@ def _output(name: str, found: Mapping[str, Any], escs: Sequence[EscSettings]) ->
     return setup_of(name, Given(table, identity, (major, minor), seed), escs)
 
 
-def _dbc_settings(found: Mapping[str, Any]) -> DbcSettings:
-    """Settings checked like those of a configuration."""
-    keys = {"bind": found["bind"], "e2e_data_ids": found["data_ids"]}
-    keys |= {key: found[key] for key in ("node", "base_id", "id_step") if found[key] is not None}
-    later = ("units", "messages", "unbound", "flags_on_loss")  # not in captures of 0.5.0
-    keys |= {key: found[key] for key in later if found.get(key) not in (None, {}, [])}
-    keys |= {"send_type": found["send_types"]} if found.get("send_types") else {}
-    return parse({"dbc": keys, "esc": [{"port": "-"}]}, "the capture").dbc_settings
+def _dbc_settings(found: Mapping[str, Any]) -> DbcConfig:
+    """Settings checked like those of a configuration. Captures of 0.5.0 have fewer."""
+    keys = {key: found.get(name) for key, name in _DBC_KEYS.items()}
+    given = {key: value for key, value in keys.items() if value not in (None, {}, [])}
+    given["on_loss"] = "silent" if found["silent_on_loss"] else "not_available"
+    return parse({"dbc": given, "esc": [{"port": "-"}]}, "the capture").dbc
 
 
 def _esc_json(esc: EscSettings) -> dict[str, Any]:

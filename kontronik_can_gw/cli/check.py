@@ -11,7 +11,7 @@ from kontronik_can_gw.cli.common import say, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.assemble import Loaded, load_configuration
 from kontronik_can_gw.config.export import as_toml
-from kontronik_can_gw.dbc.loss import is_mute, reporter
+from kontronik_can_gw.dbc.prepare import is_mute, reporter
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.node_state import UNCONFIGURED

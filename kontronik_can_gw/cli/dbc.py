@@ -11,10 +11,10 @@ from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, 
 from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.writer import copies_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -78,7 +78,7 @@ def _canopen(config: Path | None, escs: list[EscSettings]) -> str:
 
 def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> str:
     """The messages of a configuration, else of these ESCs by a DBC for one. UserError for mistakes that the gateway refuses."""
-    settings = DbcSettings()
+    settings = DbcConfig()
     if config is not None:
         loaded = load_all(config)
         if loaded.database is None:
@@ -86,7 +86,7 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> s
                 f"{config}: dbc.enabled is false: no messages of a DBC are sent. --canopen writes those of the nodes."
             )
         plain, layout, escs = loaded.database, loaded.layout, loaded.escs
-        settings = loaded.config.dbc_settings
+        settings = loaded.config.dbc
     else:
         ignored: list[str] = []
         plain = load_database(file, ignored)

@@ -31,7 +31,7 @@ exit codes: 0 done, 1 it cannot be written, 2 wrong usage, configuration or DBC,
 def main(args: argparse.Namespace) -> int:
     """Write the folder. UserError for faulty input files, RunError where it cannot be written."""
     bus = bus_layout(args)
-    silent = bus.config is not None and bus.config.dbc.on_loss == "silent"
+    silent = bus.config is not None and bus.config.dbc.silent_on_loss
     licence = shipped("LICENSE").read_text(encoding="utf-8")
     try:
         files = exported(bus.layout, bus.escs, silent, licence)

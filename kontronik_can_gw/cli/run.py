@@ -145,7 +145,7 @@ class _Run:
     def _gateway(self, loaded: Loaded) -> "tuple[Gateway, Recorder | None]":
         """The gateway, and what records it; what only a recorder needs is not loaded without one."""
         config, now = loaded.config, time.monotonic_ns()
-        silent = config.dbc.on_loss == "silent"
+        silent = config.dbc.silent_on_loss
         if self._args.record is not None or config.record.directory is not None:
             from kontronik_can_gw.cli.recording import recorded
 

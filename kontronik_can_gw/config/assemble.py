@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw import __version__
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
-from kontronik_can_gw.dbc.loss import unreported, unsupplied
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.dbc.prepare import check_load, prepare
+from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupplied
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -92,9 +91,7 @@ def load_configuration(
     with collecting(problems):
         check_interface(config.can)
     if problems:
-        with collecting(problems):
-            assemble(without_clashing_escs(config))
-        raise UserError(*problems)
+        return assemble(without_clashing_escs(config), None, problems)
     if store is None or not config.canopen.enabled:
         return assemble(config)
     from kontronik_can_gw.config.nodes import parameter_folder
@@ -144,12 +141,14 @@ def _outputs(
     return tuple(found)
 
 
-def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
-    """The objects made from a configuration. Without a store its files are only read.
+def assemble(
+    config: Config, store: "ParameterStore | None" = None, known: Sequence[str] = ()
+) -> Loaded:
+    """The objects made from a configuration. Without a store its files are only read. UserError with what is ``known``, too.
 
     A faulty configuration, DBC or EDS is refused. Stored parameters that do not fit them are ignored with a warning.
     """
-    problems: list[str] = []
+    problems = [*known]
     with collecting(problems):
         check_devices(config)
     escs, plain, canopen = config.escs, None, None
@@ -175,7 +174,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         with collecting(problems):
             dbc = read_dbc(config.dbc_path)
             database = parse_database(dbc, file, ignored)
-            layout = prepare(database, file, escs, config.dbc_settings, config.can.fd, taken)
+            layout = prepare(database, file, escs, config.dbc, config.can.fd, taken)
     if problems:
         raise UserError(*problems)
     rates = config.can.bitrate, config.can.data_bitrate
@@ -189,7 +188,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             with collecting(warnings):  # more than the bus has is no reason not to start
                 load = check_load(layout, *rates, bits)
     warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(rates[0])]
-    mute = [*unreported(layout, config.dbc.on_loss == "silent"), *unsupplied(layout, escs)]
+    mute = [*unreported(layout, config.dbc.silent_on_loss), *unsupplied(layout, escs)]
     said = (*config.warnings, *ignored, *mute, *filter(None, [load]), *warnings)
     return Loaded(
         *(config, escs, database, layout, canopen, tuple(damaged), store, said, dbc, outputs)

@@ -31,7 +31,6 @@ from kontronik_can_gw.config.output_keys import (
     DbcConfig,
     DronecanConfig,
 )
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.protocols import PROTOCOLS, device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
@@ -200,22 +199,6 @@ class Config:
     @cached_property
     def escs(self) -> list[EscSettings]:
         return [esc.settings for esc in self.esc]
-
-    @property
-    def dbc_settings(self) -> DbcSettings:
-        dbc = self.dbc
-        return DbcSettings(
-            bind=dict(dbc.bind),
-            node=dbc.node,
-            base_id=dbc.base_id,
-            id_step=dbc.id_step,
-            data_ids=dict(dbc.e2e_data_ids),
-            units=dict(dbc.units),
-            send_types=dict(dbc.send_type),
-            messages=tuple(dbc.messages),
-            unbound=dbc.unbound,
-            flags_on_loss=dbc.flags_on_loss,
-        )
 
     @property
     def dbc_path(self) -> Path:

@@ -15,9 +15,9 @@ from kontronik_can_gw.config.kinds import (
     meanings,
     table_of,
 )
-from kontronik_can_gw.dbc.timing import SEND_TYPES
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.plan import SEND_TYPES
 
 SHIPPED = "shipped"
 NODE_ID = integer(1, 127, also=UNCONFIGURED)
@@ -56,6 +56,10 @@ class DbcConfig:
         "unit text of the DBC = the unit that it means")
     send_type: Mapping[str, str] = key(meanings(tuple(SEND_TYPES)), {},
         "GenMsgSendType of the DBC = what it means")
+
+    @property
+    def silent_on_loss(self) -> bool:
+        return self.on_loss == "silent"
 
 
 @dataclass(frozen=True)

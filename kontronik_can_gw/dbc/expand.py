@@ -4,11 +4,10 @@ import fnmatch
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc.binding import Binder
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.names import MAX_NAME, esc_prefix
+from kontronik_can_gw.dbc.names import MAX_NAME, Binder, esc_prefix
 from kontronik_can_gw.dbc.reader import choose_node, listed
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def copies_of(
-    database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcSettings
+    database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcConfig
 ) -> list[Copy]:
     """The messages of the DBC for these ESCs: ours (those that ``settings`` choose), and those of other nodes as they stand.
 

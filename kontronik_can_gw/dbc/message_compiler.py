@@ -1,22 +1,33 @@
 """Compiles one message of a DBC: its frame, its times, its pages, its signals, its E2E protection."""
 
 from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.names import is_e2e
+from kontronik_can_gw.dbc.names import is_e2e, normalize
 from kontronik_can_gw.dbc.raw_values import raw_range
-from kontronik_can_gw.dbc.settings import Compilation
-from kontronik_can_gw.dbc.signal_compiler import SignalCompiler
-from kontronik_can_gw.dbc.timing import timing
+from kontronik_can_gw.dbc.reader import attribute
+from kontronik_can_gw.dbc.signal_compiler import Compilation, SignalCompiler
 from kontronik_can_gw.esc.telemetry import MS
-from kontronik_can_gw.signals.plan import FD_LENGTHS, MessagePlan, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import (
+    FD_LENGTHS,
+    SEND_TYPES,
+    MessagePlan,
+    Role,
+    SendType,
+    SignalPlan,
+)
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
 
 _MAX_PAGES = 1024
 """Maximum of multiplexer values in one of our messages."""
+_BY_CYCLE = ""
+"""A meaning too: cyclic with a cycle time, else sent with each new value."""
+_TABLE = Path(__file__).with_name("send_types.tsv")
 
 
 def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
@@ -27,7 +38,7 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
     job.problems += _frame_problems(job, message, where)
     if _is_empty(message) or message.length > FD_LENGTHS[-1]:
         return None
-    send_type, cycle_ms, delay_ms = timing(job, message, where)
+    send_type, cycle_ms, delay_ms = _timing(job, message, where)
     pages = sorted({page for signal in message.signals for page in signal.multiplexer_ids or ()})
     if problem := _too_many_pages(message, len(pages)):
         job.problems.append(f"{where}: {problem}")
@@ -51,7 +62,7 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
         escs=frozenset(s.esc for s in signals if s.esc is not None),
         paces=frozenset(s.source.pace or s.source.group for s in signals if s.source),
         pages=tuple(pages) or (None,),
-        data_id=job.settings.data_ids.get(copy.name, copy.frame_id & 0xFFFF),
+        data_id=job.settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
     )
 
 
@@ -138,7 +149,7 @@ def _crc_problems(
         return
     (crc,) = crcs
     own = crc.name.removeprefix(copy.prefix)
-    asked = copy.name in job.settings.data_ids or job.binder.bound(copy, own) is not None
+    asked = copy.name in job.settings.e2e_data_ids or job.binder.bound(copy, own) is not None
     fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
     has_counter = len(alive) == 1 and alive[0].high >= 14
     counter = alive[0].name.removeprefix(copy.prefix) if alive else ""
@@ -159,3 +170,53 @@ def _crc_problems(
         job.warnings.append(
             f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}"
         )
+
+
+@cache
+def _meanings() -> dict[str, str]:
+    """Meanings by normalized spellings."""
+    found = {"": _BY_CYCLE}
+    for line in _TABLE.read_text(encoding="ascii").splitlines()[1:]:
+        name, spellings = line.split("\t")
+        found |= {normalize(text): name.strip("-") for text in spellings.split()}
+    return found
+
+
+def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType, int, int]:
+    """Send type, cycle time and minimum distance in ms."""
+    cycle = 0
+    # the last two: of what is sent only while something is active; it is sent always
+    for attribute_name in ("GenMsgCycleTime", "GenMsgCycleTimeFast", "GenMsgCycleTimeActive"):
+        cycle = cycle or _time(job, message, attribute_name, where)
+    delay = _time(job, message, "GenMsgDelayTime", where)
+    text = str(attribute(message, "GenMsgSendType", job.database) or "")
+    job.send_types.add(text)
+    name = job.settings.send_type.get(text, _meanings().get(normalize(text)))
+    if name is None:
+        job.problems.append(
+            f"{where}: GenMsgSendType {text!r} is not known. Say what it means: dbc.send_type.{text!r} = "
+            f"one of {', '.join(SEND_TYPES)}."
+        )
+        return SendType.EVENT, cycle, delay
+    if name == _BY_CYCLE:
+        return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
+    send_type = SEND_TYPES[name]
+    if SendType.CYCLIC in send_type and not cycle:
+        job.problems.append(
+            f'{where}: is sent {text} but its GenMsgCycleTime is 0. Set one in ms, or dbc.send_type.{text!r} = "Event".'
+        )
+    return send_type, cycle, delay
+
+
+def _time(job: Compilation, message: "Message", name: str, where: str) -> int:
+    """An attribute in ms; 0 where it is not set or, with a line in the problems, no time."""
+    value = attribute(message, name, job.database)
+    if value is None or value == "":
+        return 0
+    try:
+        if float(value) < 0:
+            raise ValueError
+        return round(float(value))
+    except (ValueError, OverflowError):
+        job.problems.append(f"{where}: {name} is {str(value)[:40]!r}, which is no time in ms.")
+        return 0

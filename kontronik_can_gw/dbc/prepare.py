@@ -1,7 +1,9 @@
 """From a DBC and the ESCs to what will be sent: the compiled layout.
 
 A layout is the tuple of MessagePlans that the configured transmitter node sends. Ids, positions, byte order, sign, factor, offset,
-limits, value tables and timing come only from the file. All mistakes in a DBC or its bindings are found here, at start, at once.
+limits, value tables and timing come only from the file. All mistakes in a DBC or its bindings are found here, at start, at once. What is
+no mistake but hides something is a warning: a bus that is nearly full, flags without a code for "not available" where nothing reports
+lost telemetry, values that a protocol lacks.
 """
 
 from collections import Counter
@@ -9,29 +11,33 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc.binding import Binder
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.message_compiler import compile_message
+from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.dbc.reader import choose_node, listed
-from kontronik_can_gw.dbc.settings import Compilation, DbcSettings
+from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import block_of
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role
+from kontronik_can_gw.signals.packer import has_code
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
 WARN_LOAD, REFUSE_LOAD = 0.5, 1.0
 _MANY = 5
+_OF_LINK = frozenset({"link_state", "data_age"})
 
 
 def prepare(
     database: "Database",
     file: str,
     escs: Sequence[EscSettings],
-    settings: DbcSettings,
+    settings: DbcConfig,
     fd_allowed: bool = False,
     taken_ids: Mapping[int, str] | None = None,
 ) -> Layout:
@@ -73,7 +79,7 @@ def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
                 name=copy.name,
                 can_id=copy.frame_id,
                 escs=frozenset((copy.esc,)),
-                data_id=job.settings.data_ids.get(copy.name, copy.frame_id & 0xFFFF),
+                data_id=job.settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
                 renamed=(of.prefix, copy.prefix),
             )
         elif (compiled := compile_message(job, copy)) is not None:
@@ -123,8 +129,8 @@ def _unused_settings(job: Compilation, ours: Sequence[Copy], node: str) -> Itera
         yield f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{near}"
     yield from _unmet("units", settings.units, job.units, f"signal of {node} has this unit", file)
     what = f"message of {node} has this GenMsgSendType"
-    yield from _unmet("send_type", settings.send_types, job.send_types, what, file)
-    for name in sorted(set(settings.data_ids) - {copy.name for copy in ours}):
+    yield from _unmet("send_type", settings.send_type, job.send_types, what, file)
+    for name in sorted(set(settings.e2e_data_ids) - {copy.name for copy in ours}):
         yield f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}."
 
 
@@ -160,3 +166,56 @@ def check_load(
             f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime; inhibit times) or raise can.bitrate."
         )
     return f"{text}; other nodes get little" if load > WARN_LOAD else None
+
+
+def is_mute(signal: SignalPlan) -> bool:
+    """True for a flag that shows one of its two values without telemetry."""
+    source = signal.source
+    if source is None or source.bit is None or signal.is_float or not source.supplied:
+        return False
+    values = {value * signal.slope + signal.intercept for value in (0, 1)}
+    return source.group in (Group.LIVE, Group.INFO) and signal.not_available in values
+
+
+def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
+    """The signal in the same frame as the flag that reports the loss."""
+    for signal in message.signals:
+        source = signal.source
+        if source is None or signal.esc != flag.esc or signal.page not in (None, flag.page):
+            continue
+        assert flag.source is not None
+        if source.name in _OF_LINK and flag.source.group is Group.LIVE:
+            return signal
+        if source.group is flag.source.group and not source.optional and has_code(signal):
+            return signal
+    return None
+
+
+def unreported(layout: Layout, silent: bool) -> list[str]:
+    """A warning for each message whose flags hide the loss of telemetry. ``silent``: ``dbc.on_loss``."""
+    found = []
+    for message in layout.messages:
+        stops = bool(message.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in message.paces
+        flags = [s.name for s in message.signals if is_mute(s) and reporter(message, s) is None]
+        if flags and not (silent and stops):
+            remedy = ', or set dbc.on_loss = "silent"' if stops else ""
+            found.append(
+                f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent as if they were known, and no signal "
+                f"of the message reports the loss. Add one bound to link_state, or with NotAvailable in its value table{remedy}."
+            )
+    return found
+
+
+def unsupplied(layout: Layout, escs: Sequence[EscSettings]) -> list[str]:
+    """A warning for each message with values that the protocol of their ESC does not have."""
+    found = []
+    for message in layout.messages:
+        missing = [s for s in message.signals if s.source is not None and not s.source.supplied]
+        if missing:
+            names = listed((signal.name for signal in missing), 3)
+            whose = " or ".join(sorted({escs[signal.esc or 0].protocol for signal in missing}))
+            found.append(
+                f"{layout.file}: {message.name}: {names}: not supplied by the protocol {whose}, never available. "
+                "A flag, which has no code for that, is sent as 0 or its start value."
+            )
+    return found

@@ -44,33 +44,19 @@ class ValueTable:
         return next((raw for text, raw in self.codes.items() if text in texts), None)
 
 
-def bits(signal: "Signal") -> list[int]:
-    """The signal's bits from its least significant one, each as byte * 8 + bit in byte."""
-    if signal.byte_order == "little_endian":
-        return list(range(signal.start, signal.start + signal.length))
-    # big-endian: start is the most significant bit, downward within a byte, then the next byte
-    found, at = [], signal.start
-    for _ in range(signal.length):
-        found.append(at)
-        at = at + 15 if at % 8 == 0 else at - 1
-    return found[::-1]
-
-
-def pieces(signal: "Signal") -> tuple[Piece, ...]:
-    """The signal as runs of adjacent bits; of signals at the same place one and the same object."""
-    return _runs(tuple(bits(signal)))
-
-
 @lru_cache(maxsize=1024)
-def _runs(places: tuple[int, ...]) -> tuple[Piece, ...]:
-    found: list[Piece] = []
-    for shift, at in enumerate(places):
-        last = found[-1] if found else None
-        if last and at == last.at + last.width:
-            found[-1] = last._replace(width=last.width + 1)
-        else:
-            found.append(Piece(shift, 1, at))
-    return tuple(found)
+def pieces(start: int, length: int, byte_order: str) -> tuple[Piece, ...]:
+    """The bits of a signal as runs of adjacent ones; of signals at the same place one and the same object."""
+    if byte_order == "little_endian":
+        return (Piece(0, length, start),)
+    # big-endian: start is the most significant bit, downward within a byte, then the next byte
+    found = []
+    while length:
+        width = min(length, start % 8 + 1)
+        length -= width
+        found.append(Piece(length, width, start - width + 1))
+        start = start // 8 * 8 + 15
+    return tuple(reversed(found))
 
 
 def raw_range(signal: "Signal") -> tuple[int, int]:

@@ -2,22 +2,45 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc import names, raw_values
 from kontronik_can_gw.dbc.copies import Copy
+from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
-from kontronik_can_gw.dbc.settings import Compilation, UnfitSignal
 from kontronik_can_gw.esc.values import Group, Value
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.packer import float_bits
 from kontronik_can_gw.signals.plan import Role, SignalPlan
 
 if TYPE_CHECKING:
-    from cantools.database.can import Signal
+    from cantools.database.can import Database, Signal
+
+
+class UnfitSignal(Exception):
+    """Why a signal cannot be sent, as it follows the signal's place in an error."""
+
+
+@dataclass
+class Compilation:
+    """A DBC and how it is used, and what is found while it is compiled."""
+
+    database: "Database"
+    file: str
+    settings: DbcConfig
+    binder: Binder
+    fd_allowed: bool
+    problems: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    units: set[str] = field(default_factory=set)
+    """Unit texts of our signals."""
+    send_types: set[str] = field(default_factory=set)
+    unbound: set[str] = field(default_factory=set)
+    """Signals without a source."""
 
 
 class SignalCompiler:
@@ -100,7 +123,7 @@ class SignalCompiler:
             length=signal.length,
             signed=signal.is_signed,
             is_float=signal.is_float,
-            pieces=raw_values.pieces(signal),
+            pieces=raw_values.pieces(signal.start, signal.length, signal.byte_order),
             low=low,
             high=high,
             not_available=not_available,

@@ -28,16 +28,12 @@ class View:
         self._part_of = {part.first: index for index, part in enumerate(reader.parts)}
         self._life = [_life(part) for part in reader.parts]
         self._seen: list[int | None] = [None] * len(reader.parts)
-        self._next_expiry: int | None = None
+        self.next_expiry: int | None = None
+        """``expire`` has nothing to do before this time; None: for ever."""
         cycles = [
             part.plan.cycle_ns * len(part.plan.pages) for part in reader.parts if part.plan.cycle_ns
         ]
         self._silence_ns = max(_MIN_SILENCE_NS, _CYCLES * min(cycles)) if cycles else None
-
-    @property
-    def next_expiry(self) -> int | None:
-        """``expire`` has nothing to do before this time; None: for ever."""
-        return self._next_expiry
 
     def take(self, key: int, data: bytes, now: int) -> list[Chunk] | None:
         """Take a frame (``key``: its id, with EXTENDED for 29 bits); return its values, None where it is not of the layout."""
@@ -52,13 +48,13 @@ class View:
             part = self._part_of[first]
             seen[part] = now
             due = self._due(part)
-            if due is not None and (self._next_expiry is None or due < self._next_expiry):
-                self._next_expiry = due
+            if due is not None and (self.next_expiry is None or due < self.next_expiry):
+                self.next_expiry = due
         return chunks
 
     def expire(self, now: int) -> bool:
         """Drop the values of missing messages; True where something was dropped."""
-        if self._next_expiry is None or now <= self._next_expiry:
+        if self.next_expiry is None or now <= self.next_expiry:
             return False
         dues = [self._due(index) for index in range(len(self._life))]
         forgotten = False
@@ -67,7 +63,7 @@ class View:
                 self._seen[index] = None
                 self.values[part.first : part.first + part.count] = [None] * part.count
                 forgotten = True
-        self._next_expiry = min(
+        self.next_expiry = min(
             (due for due in dues if due is not None and due >= now), default=None
         )
         return forgotten
@@ -79,16 +75,9 @@ class View:
             return None
         if life is not None:
             return seen + life
-        return (
-            None
-            if self._silence_ns is None or self.last_ns is None
-            else self.last_ns + self._silence_ns
-        )
-
-    def value(self, source: str, esc: int | None = None) -> Value:
-        """The value of the signal bound to a source; None also where the layout has no such signal."""
-        index = self.reader.column_of(source, esc)
-        return None if index is None else self.values[index]
+        if self._silence_ns is None or self.last_ns is None:
+            return None
+        return self.last_ns + self._silence_ns
 
 
 def _life(part: Part) -> int | None:

@@ -13,7 +13,6 @@ from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import divisor, steps
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
@@ -72,7 +71,7 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
     ) -> CanFrame:
         data = pack(escs, gateway, now, alive, at).to_bytes(plan.length, "little")
         if crc is not None:
-            data = e2e.protected(data, crc.pieces[0].at // 8, plan.data_id)
+            data = _protected(data, crc.pieces[0].at // 8, plan.data_id)
         # from FIRST_PART on a page would be a part of a transfer
         return CanFrame(plan.can_id, data, plan.extended, plan.fd, at if at < FIRST_PART else -at)
 
@@ -170,3 +169,29 @@ def float_of(bits: int, length: int) -> float:
     number: float
     (number,) = struct.unpack(_FLOATS[length], bits.to_bytes(length // 8, "little"))
     return number
+
+
+def _crc_table() -> bytes:
+    """AUTOSAR E2E profile 1: CRC-8 SAE J1850 (polynomial 1Dh) over data id and data, start and final XOR 0 (PRS_E2EProtocol)."""
+    table = []
+    for byte in range(256):
+        for _ in range(8):
+            byte = byte << 1 ^ (0x11D if byte & 0x80 else 0)
+        table.append(byte)
+    return bytes(table)
+
+
+_CRC = _crc_table()
+
+
+def e2e_crc(data: bytes, at: int, data_id: int) -> int:
+    """The CRC of a frame whose CRC byte stands at ``at``: data id low byte, high byte, all other bytes in order."""
+    value = 0
+    for byte in bytes((data_id & 0xFF, data_id >> 8 & 0xFF)) + data[:at] + data[at + 1 :]:
+        value = _CRC[value ^ byte]
+    return value
+
+
+def _protected(data: bytes, at: int, data_id: int) -> bytes:
+    """The frame with its CRC at ``at``."""
+    return data[:at] + bytes((e2e_crc(data, at, data_id),)) + data[at + 1 :]

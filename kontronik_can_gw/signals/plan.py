@@ -21,6 +21,14 @@ class SendType(Flag):
     ON_CHANGE = 4
 
 
+SEND_TYPES = {
+    "Cyclic": SendType.CYCLIC,
+    "Event": SendType.EVENT,
+    "OnChange": SendType.ON_CHANGE,
+    "CyclicAndEvent": SendType.CYCLIC | SendType.EVENT,
+    "CyclicAndOnChange": SendType.CYCLIC | SendType.ON_CHANGE,
+}
+"""Send types by the names that a configuration has for them."""
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 EXPECTED_LIVE_HZ = 100

@@ -99,18 +99,11 @@ class SignalReader:
             page_of = None if multiplexer is None else partial(take, multiplexer.pieces)
             self._messages[key] = _Message(plan.length, page_of, unpacks)
         self.columns = tuple(columns)
-        self._by_source = {
-            (c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))
-        }
 
     @property
     def keys(self) -> frozenset[int]:
         """CAN ids of the layout's messages, with ``EXTENDED`` for 29 bits."""
         return frozenset(self._messages)
-
-    def column_of(self, source: str, esc: int | None = None) -> int | None:
-        """Index of the first column that is bound to a source; None where the layout has none."""
-        return self._by_source.get((source, esc))
 
     def read(self, key: int, data: bytes) -> list[Chunk] | None:
         """The values of a frame; None where its id is not ours, or it is shorter than its message."""

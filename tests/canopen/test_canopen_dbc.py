@@ -10,7 +10,7 @@ import dialogue
 import pytest
 from cantools.database.can import Database
 from cantools.database.namedsignalvalue import NamedSignalValue
-from dbc_rules import RULES, parse
+from dbc_bench import check_comments
 from eds_text import SHIPPED as EDS_TEXT
 from eds_text import variable, with_object
 from packer_oracle import ERROR_BITS, KNOWN, pascal, read
@@ -151,15 +151,6 @@ def test_the_shipped_file_is_what_the_command_writes(capsys: pytest.CaptureFixtu
     assert copies_text(read(SHIPPED.read_text())) == SHIPPED.read_text(), "it can be written again"
 
 
-OF_THE_OTHER_FILE = {"limits_leave_out_the_codes", "enums_are_closed"}
-"""Rules that only messages of our own layout can keep; what PDOs keep instead is in the tests that follow."""
-
-
-@pytest.mark.parametrize("rule", sorted(set(RULES) - OF_THE_OTHER_FILE))
-def test_the_shipped_file_keeps_the_rule(rule: str) -> None:
-    assert list(RULES[rule](parse(SHIPPED.read_bytes()))) == []
-
-
 # --- decoding what nodes send --------------------------------------------------------------------------------------------
 
 
@@ -206,6 +197,11 @@ def test_every_frame_of_running_nodes_decodes_to_the_telemetry() -> None:
 # --- other mappings ------------------------------------------------------------------------------------------------------
 
 
+def delay(message: Any) -> int:
+    found = message.dbc.attributes.get("GenMsgDelayTime")
+    return 0 if found is None else found.value
+
+
 def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
     bench = dialogue.Bench()
     remap(bench, 0, 0x181, [0x20000120], kind=3)
@@ -213,11 +209,8 @@ def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
     off = (0x1802, 1, 0xC0000381, 4), (0x1803, 5, 0, 2), (0x1017, 0, 0, 2), (0x1015, 0, 1230, 2)
     for index, sub, value, size in off:
         assert bench.write(index, sub, value, size=size) is None
-    db = parse(described(bench).encode())
-    sent = {
-        m.name: (db.send_type(m), *(db.number(f"GenMsg{key}Time", m) for key in ("Cycle", "Delay")))
-        for m in db.messages
-    }
+    db = read(described(bench))
+    sent = {m.name: (m.send_type, m.cycle_time or 0, delay(m)) for m in db.messages}
     assert sent == {
         "EscTpdo1": ("None", 0, 0),
         "EscTpdo2": ("None", 0, 0),
@@ -225,10 +218,10 @@ def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
         "EscHeartbeat": ("Event", 0, 0),
         "EscEmergency": ("Event", 0, 123),
     }
-    comments = dict(db.comments)
-    assert "every SYNC number 3" in comments[("BO_", 0x181)]
-    assert "at a SYNC when there is news" in comments[("BO_", 0x281)]
-    assert "only the boot-up message" in comments[("BO_", 0x701)]
+    comments = {m.frame_id: str(m.comment) for m in db.messages}
+    assert "every SYNC number 3" in comments[0x181]
+    assert "at a SYNC when there is news" in comments[0x281]
+    assert "only the boot-up message" in comments[0x701]
     assert bench.write(0x1014, 0, 0x80000081, size=4) is None
     assert "EscEmergency" not in described(bench)
 
@@ -271,12 +264,15 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
 def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
     escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
     text = described(dialogue.Bench(escs=escs))
-    db = parse(text.encode())
-    for names in ([m.name for m in db.messages], [s.name for s in db.signals]):
+    db = read(text)
+    messages, signals = (
+        [m.name for m in db.messages],
+        [s.name for m in db.messages for s in m.signals],
+    )
+    for names in (messages, signals):
         assert len({name.lower() for name in names}) == len(names)
-    assert list(RULES["everything_has_a_comment"](db)) == []
-    read(text)
-    names = [message.name for message in db.messages] + [signal.name for signal in db.signals]
+    check_comments(db)
+    names = messages + signals
     assert max(map(len, names)) == 32
     assert all(re.fullmatch("PortOuter[12][A-Z][A-Za-z0-9]*", name) for name in names)
     assert "PortOuter1LimitBatteryVoltageMin" in names
@@ -296,7 +292,7 @@ def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(
     assert main(["dbc", "--canopen", "-c", str(file)]) == 0
     text, said = capsys.readouterr()
     assert "right_r: no node-ID yet (LSS gives one), so no frames to describe" in said
-    db = parse(text.encode())
+    db = read(text)
     assert {message.name[:4] for message in db.messages} == {"Left"}
-    assert "Waiting for a node-ID by LSS, so without frames: right_r." in dict(db.comments)[("",)]
+    assert "Waiting for a node-ID by LSS, so without frames: right_r." in str(db.buses[0].comment)
     assert read(described(dialogue.Bench(node_ids=(255,)))).messages == []

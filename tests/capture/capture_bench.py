@@ -59,7 +59,14 @@ class Bench:
     def __post_init__(self) -> None:
         canopen: CanopenSetup | None = self.setup.canopen
         self.gateway = RecordedGateway(
-            *(self._put, self.setup.escs, self.layout, START, self.setup.silent_on_loss, canopen),
+            *(
+                self._put,
+                self.setup.escs,
+                self.layout,
+                START,
+                self.setup.dbc_settings.silent_on_loss,
+                canopen,
+            ),
             further=[setup.make for setup in self.setup.outputs],
         )
         self._waiting = TransmitQueue()

@@ -1,13 +1,15 @@
 """A DBC as people write it: compiled, refused, and what its messages hold."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import pytest
+from cantools.database.can import Database
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -17,21 +19,31 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
 
+
+def check_comments(database: Database) -> None:
+    """Everything has a sentence as comment, without what a parser may take for syntax."""
+    owners: list[Any] = [database.buses[0], *database.nodes, *database.messages]
+    owners += [signal for message in database.messages for signal in message.signals]
+    for text in (str(owner.comment) for owner in owners):
+        assert len(text) >= 10 and text.endswith("."), text
+        assert not re.search(r"[;\\]|\b[A-Z]+_\B", text), text
+
+
 NOW = 50 * MS
 FILE = "my_car.dbc"
 
 
 def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> Layout:
-    """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcSettings."""
+    """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcConfig."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
-    return prepare(database, FILE, escs, DbcSettings(**settings), fd_allowed=True)
+    return prepare(database, FILE, escs, DbcConfig(**settings), fd_allowed=True)
 
 
-def refused(text: str, **settings: Any) -> list[str]:
+def refused(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> list[str]:
     """What ``compiled`` refuses these with: plain lines, each with its place."""
     with pytest.raises(UserError) as caught:
-        compiled(text, **settings)
+        compiled(text, names, **settings)
     assert caught.value.exit_code == 2
     lines = list(caught.value.problems)
     assert lines

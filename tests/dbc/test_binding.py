@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get
 
-from kontronik_can_gw.dbc.binding import Binder
+from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.signals import e2e
+from kontronik_can_gw.signals.packer import e2e_crc
 from kontronik_can_gw.signals.plan import Layout
 
 LIVE = LiveData(
@@ -142,7 +142,7 @@ def test_the_crc_is_that_of_the_autosar_package_at_every_place(
     data: bytes, data_id: int, draw: st.DataObject
 ) -> None:
     at = draw.draw(st.integers(0, len(data) - 2))
-    assert e2e.crc(data, at, data_id) == theirs(data, at, data_id)[at]
+    assert e2e_crc(data, at, data_id) == theirs(data, at, data_id)[at]
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
         Sig("Alive", counter_at, length),
         Sig("BatteryVoltage", value_at, 16, unit="V"),
     ]
-    layout = layout_of([Msg("M", 0x12345, 8, signals, extended=True)], data_ids=data_ids)
+    layout = layout_of([Msg("M", 0x12345, 8, signals, extended=True)], e2e_data_ids=data_ids)
     data_id = data_ids.get("M", 0x2345)
     gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
     gateway.start(0)

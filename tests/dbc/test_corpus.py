@@ -14,9 +14,9 @@ import pytest
 from cantools.database.can import Database, Message, Signal
 from dbc_bench import gateway_with, packed
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import values
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -53,7 +53,7 @@ def by_unit(messages: Iterable[Message]) -> dict[str, str]:
 def prepared(database: Database, file: str, **settings: Any) -> tuple[Layout | None, list[str]]:
     """The layout of a gateway, or why it is refused: lines that name their place."""
     try:
-        return prepare(database, file, [EscSettings("esc1", 7)], DbcSettings(**settings), True), []
+        return prepare(database, file, [EscSettings("esc1", 7)], DbcConfig(**settings), True), []
     except UserError as error:
         for line in error.problems:
             assert line.startswith((file, "dbc.")) and "\n" not in line and len(line) < 600

@@ -69,8 +69,10 @@ class Bench:
         self.gateway.advance(when)
         self.take()
 
-    def live(self, data: LiveData | InfoData = LIVE, esc: int = 0) -> None:
-        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now, self.now)
+    def live(self, *data: LiveData | InfoData, esc: int = 0) -> None:
+        """What comes in one read."""
+        wire = b"".join(encode(each, WireLayout.V4) for each in data or (LIVE,))
+        self.gateway.receive_bytes(esc, wire, self.now, self.now)
         self.take()
 
     def feed(self, until: int, period: int = 10 * MS, data: LiveData = LIVE) -> None:
@@ -117,6 +119,9 @@ SCENES: list[tuple[str, int, int, int, str, list[tuple[int, int]]]] = [
      "10 live 1, 20 live 2, 30 live 1, 200", [(10, 1)]),
     ("on change goes only when a raw value changes", ON_CHANGE, 0, 0,
      "10 live 1, 20 live 1, 30 live 2, 40 live 2, 50 live 1, 60 live 1", [(10, 1), (30, 2), (50, 1)]),
+    ("of several frames in one read the newest goes", EVENT, 0, 0, "10 live 10 11 12, 20 live 20 21 22", [(10, 12), (20, 22)]),
+    ("a late call sends one frame and the grid stays", CYCLIC, 100, 0,
+     "0, =101 look, =101 look, =150 look, =1010 look, =1010 look, 1200", [(at, NONE) for at in (0, 101, 1010, 1100, 1200)]),
     ("cyclic and event does both", CYCLIC_AND_EVENT, 100, 0,
      "50 live 1, 120 live 2, 210", [(0, NONE), (50, 1), (100, 1), (120, 2), (200, 2)]),
     ("cyclic and on change does both", CYCLIC_AND_ON_CHANGE, 100, 10,
@@ -134,8 +139,8 @@ SCENES: list[tuple[str, int, int, int, str, list[tuple[int, int]]]] = [
     [pytest.param(*row[1:], id=row[0]) for row in SCENES],
 )
 def test_scene(kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[int, int]]) -> None:
-    """``=`` in front of a time: nobody looks at the clock until then."""
-    bench = lone(kind, cycle, delay)
+    """``=`` in front of a time: nobody looks at the clock until then. Numbers are what one read brings."""
+    bench = lone(kind, cycle, delay, Sig("AliveCounter", 16, 4))
     for step in steps.split(", "):
         at, *what = step.split()
         if at.startswith("="):
@@ -143,30 +148,20 @@ def test_scene(kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[i
         else:
             bench.until(int(at) * MS)
         match what:
-            case ["live", number]:
-                bench.live(volts(int(number)))
+            case ["live", *numbers]:
+                bench.live(*(volts(int(number)) for number in numbers))
+            case ["look"]:
+                bench.jump(bench.now)
             case ["info"]:
                 bench.live(InfoData())
             case ["lost"]:
                 bench.gateway.port(0, False, bench.now)
                 bench.take()
     assert list(zip(bench.times(), bench.raws(), strict=True)) == sent
+    assert bench.raws(4, 16) == [number % 16 for number in range(len(sent))]
 
 
 # --- one step -----------------------------------------------------------------------------------------------------------
-
-
-def test_two_frames_in_one_read_make_one_frame_of_a_message_with_the_newest_values() -> None:
-    bench = lone(EVENT, 0, 0, Sig("AliveCounter", 16, 4))
-    for at in (10, 20):
-        bench.until(at * MS)
-        wire = b"".join(encode(volts(at + n), WireLayout.V4) for n in range(3))
-        bench.gateway.receive_bytes(0, wire, bench.now, bench.now)
-        bench.take()
-    assert list(zip(bench.times(), bench.raws(), bench.raws(4, 16), strict=True)) == [
-        (10, 12, 0),
-        (20, 22, 1),
-    ]
 
 
 def test_messages_of_one_step_go_in_the_order_in_which_they_became_due_then_of_their_index() -> (
@@ -187,15 +182,6 @@ def test_messages_of_one_step_go_in_the_order_in_which_they_became_due_then_of_t
 
 
 # --- cyclic -------------------------------------------------------------------------------------------------------------
-
-
-def test_a_late_call_sends_one_frame_and_the_grid_stays() -> None:
-    bench = lone(CYCLIC, 100)
-    bench.until(0)
-    for late in (101, 101, 150, 1010, 1010):
-        bench.jump(late * MS)
-    bench.until(1200 * MS)
-    assert bench.times() == [0, 101, 1010, 1100, 1200]
 
 
 @given(st.lists(st.sampled_from([0, 7 * MS, 10 * MS, 20 * MS, 100 * MS]), min_size=1, max_size=100))
@@ -267,13 +253,13 @@ def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
         replace(VOLTAGE, name="RightBatteryVoltage", start=16),
     ]
     bench = Bench([(Msg("Both", 0x100, 8, signals), EVENT, 0, 0)], ("left", "right"))
-    bench.live(volts(1), 0)
-    bench.live(volts(2), 1)
+    bench.live(volts(1))
+    bench.live(volts(2), esc=1)
     bench.now = 200 * MS
-    bench.live(volts(3), 0)
+    bench.live(volts(3))
     bench.now = 200 * MS + TIMEOUT - 1 * MS  # nobody has looked at the clock since
     bench.forget()
-    bench.live(volts(4), 0)
+    bench.live(volts(4))
     assert bench.raws(16, 0)[-1] == 4
     assert set(bench.raws(16, 16)) == {65535}
 

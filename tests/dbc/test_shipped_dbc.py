@@ -1,19 +1,93 @@
-"""The shipped DBC keeps every rule of a DBC that every tool reads, field by field of the sheet."""
+"""The shipped DBCs: rules that make every tool read them alike, and cantools, canmatrix, opendbc and asammdf, which do."""
 
+import logging
+import math
+import random
+import sys
 from decimal import Decimal
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+import cantools.database
 import pytest
-from dbc_rules import findings, parse
+from cantools.database.can import Database, Signal
+from dbc_bench import check_comments
 from esc import sheet
-from packer_oracle import pascal
+from packer_oracle import CAN_STATES, GATEWAY_STATES, LAYOUTS, LINKS, get, pascal, put
 
-SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
-DATA = SHIPPED.read_bytes()
+FILES = sorted((Path(__file__).parents[2] / "dbc").glob("*.dbc"))
+SHIPPED = next(file for file in FILES if file.stem == "kontronik_esc")
+FRAMES_PER_MESSAGE = 100
+BOTH = pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
+CODES = ("NotAvailable", "Error")
+ENUMS = {
+    "OperatingState": {
+        number: text.replace("_", "").replace("RPM", "Rpm")
+        for number, text in sheet.OPERATING_STATES.items()
+    },
+    "Device": {1: "Kosmik", 2: "Kolibri", 3: "JivePro", 4: "KontrolX", 5: "Uhv"},
+    "Layout": LAYOUTS,
+    "LinkState": LINKS,
+    "GatewayState": GATEWAY_STATES,
+    "CanState": CAN_STATES,
+}
 
 
-def test_the_shipped_dbc_keeps_the_rules() -> None:
-    assert findings(DATA) == []
+@cache
+def database_of(file: Path) -> Database:
+    found = cantools.database.load_file(file, "dbc", "ascii", strict=True, sort_signals=None)
+    assert isinstance(found, Database)
+    return found
+
+
+def signals_of(file: Path) -> list[Signal]:
+    return [signal for message in database_of(file).messages for signal in message.signals]
+
+
+def table_of(signal: Signal) -> dict[int, str]:
+    return {int(number): str(text) for number, text in (signal.choices or {}).items()}
+
+
+def names_of(signal: Signal) -> dict[int, str]:
+    """Texts of a signal's values, without the codes."""
+    return {number: text for number, text in table_of(signal).items() if text not in CODES}
+
+
+def exact(*numbers: Any) -> list[Decimal]:
+    return [Decimal(str(number)) for number in numbers]
+
+
+# --- the rules, and the sheet -------------------------------------------------------------------------------------------
+
+
+def test_limits_leave_out_the_codes_and_contain_0() -> None:
+    """[min|max] is the whole type less the two codes, of an enum 0 to its greatest name. canmatrix checks the default start
+    value, 0, against it."""
+    for signal in signals_of(SHIPPED):
+        if signal.length == 1 or signal.name.endswith("Alive"):  # flags and counters have no codes
+            continue
+        most = (1 << signal.length - signal.is_signed) - 1
+        raw = (2 - most - 1, most) if signal.is_signed else (0, most - 2)
+        if named := names_of(signal):
+            raw = (0, max(named))
+        low, high, factor, offset = exact(
+            signal.minimum, signal.maximum, signal.scale, signal.offset
+        )
+        assert [low, high] == [number * factor + offset for number in raw], signal.name
+        assert low <= 0 <= high, signal.name
+
+
+def test_every_value_of_an_enumeration_that_is_sent_has_a_name_and_nothing_else_has() -> None:
+    """One unknown sample costs asammdf all names."""
+    named = [signal for signal in signals_of(SHIPPED) if names_of(signal)]
+    assert {signal.name: names_of(signal) for signal in named} == ENUMS
+    assert not any(s.is_signed or s.unit or s.scale != 1 for s in named)
+
+
+@BOTH
+def test_everything_has_a_comment(file: Path) -> None:
+    check_comments(database_of(file))
 
 
 FIELDS = [
@@ -26,14 +100,150 @@ FIELDS = [
 @pytest.mark.parametrize("field", FIELDS, ids=lambda field: field.name)
 def test_a_field_of_the_sheet_fits_its_signal_step_by_step(field: sheet.Field) -> None:
     name = pascal(field.name) + ("Percent" if field.unit == "%" else "")
-    found = next(signal for signal in parse(DATA).signals if signal.name == name)
+    found = next(signal for signal in signals_of(SHIPPED) if signal.name == name)
     step = Decimal(1) / field.steps
-    assert found.unit == field.unit.replace("µ", "u").replace("°", "deg")
-    assert (found.factor, found.offset) == (step, Decimal(0))
-    codes = 2 if found.signed else 0
+    assert (found.unit or "") == field.unit.replace("µ", "u").replace("°", "deg")
+    assert exact(found.scale, found.offset) == [step, Decimal(0)]
+    codes = 2 if found.is_signed else 0
     low, high = sheet.TYPE_RANGES[field.code]
     if field.code == "I":
         high = 1_000_000  # no motor turns faster
     low, high = sheet.STATED_RANGES.get(field.name, (low + codes, high - 2 + codes))
-    assert found.minimum <= low * step
-    assert high * step <= found.maximum
+    least, most = exact(found.minimum, found.maximum)
+    assert least <= low * step and high * step <= most
+
+
+# --- other tools --------------------------------------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.filterwarnings("error")
+def test_cantools_loads_the_file_strictly_and_silently(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        database_of.__wrapped__(file)
+    assert caplog.records == []
+
+
+def matrix_of(file: Path, caplog: pytest.LogCaptureFixture) -> Any:
+    import canmatrix.formats  # type: ignore[import-untyped]
+
+    with caplog.at_level(logging.WARNING):
+        matrix = canmatrix.formats.loadp_flat(str(file))
+    assert [record.getMessage() for record in caplog.records] == []
+    assert matrix.load_errors == []
+    return matrix
+
+
+@BOTH
+def test_canmatrix_sees_what_cantools_sees(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+    matrix, database = matrix_of(file, caplog), database_of(file)
+    assert [ecu.name for ecu in matrix.ecus] == [node.name for node in database.nodes]
+    attributes: Any = database.dbc
+    version = attributes.attributes["LayoutVersion"].value
+    assert matrix.attributes == {"LayoutVersion": version, "BusType": "CAN"}
+    for message, seen in zip(database.messages, matrix.frames, strict=True):
+        place = (seen.name, seen.arbitration_id.id, seen.size, seen.transmitters, seen.comment)
+        own = (message.name, message.frame_id, message.length, message.senders, message.comment)
+        assert place == own
+        kinds = (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed)
+        assert not any(kinds)
+        assert seen.attributes["GenMsgSendType"] == message.send_type
+        assert seen.cycle_time == (message.cycle_time or 0)
+        for signal in message.signals:
+            its = seen.signal_by_name(signal.name)
+            assert not its.is_float
+            assert [its.min, its.max] == exact(signal.minimum, signal.maximum)
+            assert (its.unit, its.receivers) == (signal.unit or "", signal.receivers)
+            assert (its.comment, its.values) == (signal.comment, table_of(signal))
+            assert its.initial_value == int(signal.raw_initial or 0) * exact(signal.scale)[0]
+
+
+@pytest.mark.skipif(
+    sys.version_info >= (3, 13), reason="opendbc refuses Python 3.13: run it by an older one"
+)
+@BOTH
+def test_all_readers_find_the_same_raw_values_in_any_bytes(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """opendbc takes a path where one exists, else the name of a packaged file, and skips what it does not understand."""
+    from opendbc.can.dbc import DBC
+    from opendbc.can.parser import get_raw_value
+
+    opendbc, matrix, database = DBC(str(file)).msgs, matrix_of(file, caplog), database_of(file)
+    choice = random.Random(1)
+    names = {message.frame_id: message.name for message in database.messages}
+    assert {number: found.name for number, found in opendbc.items()} == names
+    for message in database.messages:
+        theirs = opendbc[message.frame_id].sigs
+        scales = {s.name: (float(s.scale), 0.0, 0) for s in message.signals}
+        assert {name: (s.factor, s.offset, s.type) for name, s in theirs.items()} == scales
+        size = message.length
+        fills = [choice.randbytes(size) for _ in range(FRAMES_PER_MESSAGE)]
+        for data in (bytes(size), b"\xff" * size, *fills):
+            expected = {
+                s.name: get(data, s.start, s.length, True, s.is_signed) for s in message.signals
+            }
+            assert expected == message.decode(data, decode_choices=False, scaling=False)
+            decoded = matrix.frame_by_name(message.name).decode(data)
+            assert {name: seen.raw_value for name, seen in decoded.items()} == expected
+            for name, its in theirs.items():
+                raw = get_raw_value(data, its)
+                raw -= (raw >> (its.size - 1) << its.size) if its.is_signed else 0
+                assert raw == expected[name], name
+
+
+def recorded(path: Path, file: Path, moments: list[dict[str, int]]) -> Any:
+    """An MF4 of raw CAN frames, one of each message per moment and 0.1 s, decoded by asammdf with the DBC."""
+    import can
+    from asammdf import MDF
+
+    with can.MF4Writer(path) as writer:
+        for number, moment in enumerate(moments):
+            for message in database_of(file).messages:
+                at, data = 1_700_000_000 + number / 10, bytearray(message.length)
+                for signal in message.signals:
+                    put(data, moment[signal.name], signal.start, signal.length, True)
+                writer.on_message_received(
+                    can.Message(
+                        at, arbitration_id=message.frame_id, is_extended_id=False, data=data
+                    )
+                )
+    with MDF(path) as measurement:
+        return measurement.extract_bus_logging({"CAN": [(str(file), 0)]})
+
+
+@BOTH
+def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path, file: Path) -> None:
+    """Of values that the gateway may send: within the limits, of an enum one with a name, and the two codes."""
+    import numpy as np
+
+    choice = random.Random(2)
+    raw: list[dict[str, int]] = [{} for _ in range(30)]
+    for signal in signals_of(file):
+        table, (low, high, factor) = (
+            table_of(signal),
+            exact(signal.minimum, signal.maximum, signal.scale),
+        )
+        least, most = int(low / factor), int(high / factor)
+        named = [number for number in table if least <= number <= most]
+        codes = {text: number for number, text in table.items()}
+        for moment, values in enumerate(raw):
+            ends = named or [least, most, choice.randint(least, most)]
+            code = CODES[moment] if moment < len(CODES) else ""
+            values[signal.name] = codes.get(code, choice.choice(ends))
+    decoded = recorded(tmp_path / "raw.mf4", file, raw)
+    for signal in signals_of(file):
+        seen, table = decoded.get(signal.name), table_of(signal)
+        sent = [moment[signal.name] for moment in raw]
+        assert list(decoded.get(signal.name, raw=True).samples) == sent, signal.name
+        assert seen.unit == (signal.unit or "")
+        if names_of(signal):
+            assert [text.decode() for text in seen.samples] == [table[number] for number in sent]
+            continue
+        expected = [math.nan if n in table else n * float(signal.scale) for n in sent]
+        samples = seen.samples.astype(float)
+        np.testing.assert_allclose(samples, expected, rtol=1e-12, err_msg=signal.name)
+        assert (seen.samples.dtype.kind == "f") == bool(table), signal.name
+    decoded.close()

@@ -14,8 +14,8 @@ from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.errors import UserError
@@ -109,8 +109,7 @@ def test_lost_telemetry_is_not_available_and_the_other_esc_goes_on() -> None:
 def test_who_reads_the_bus_takes_no_flag_that_the_protocol_has_not_for_a_good_sign() -> None:
     loaded = Flight().loaded
     reader = SignalReader(loaded.layout)
-    column = reader.column_of("undervoltage", 1)
-    assert column is not None
+    column = [(each.source, each.esc) for each in reader.columns].index(("undervoltage", 1))
     first, values = (reader.read(258, bytes(8)) or [])[0]
     assert values[column - first] is None
     (warning,) = [line for line in loaded.warnings if "not supplied by" in line]
@@ -173,7 +172,7 @@ def test_node_status_and_tables_show_what_there_is_and_nothing_else() -> None:
 def test_a_capture_names_the_protocol() -> None:
     """One of 0.5.0 has none: the first."""
     escs = tuple(parse(MIXED, "mixed.toml").escs)
-    setup = CaptureSetup(escs, ("a", "b"), None, DbcSettings(), False, False, None)
+    setup = CaptureSetup(escs, ("a", "b"), None, DbcConfig(), False, None)
     assert CaptureSetup.of(setup.header()).escs == escs
     old: Any = setup.header()
     old["escs"] = [{k: v for k, v in esc.items() if k != "protocol"} for esc in old["escs"]]

@@ -3,9 +3,9 @@
 import pytest
 from packer_oracle import Msg, Sig, dbc_text
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.kontronik import Device, InfoData, LiveData, codec, encode
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
@@ -26,7 +26,7 @@ def text_of(signal: Sig, more: str = EVENT) -> str:
 
 def layout_of(text: str) -> Layout:
     database = parse_database(text.encode(), "t.dbc")
-    return prepare(database, "t.dbc", (ESC,), DbcSettings(), fd_allowed=True)
+    return prepare(database, "t.dbc", (ESC,), DbcConfig(), fd_allowed=True)
 
 
 def wire(**values: int) -> bytes:

@@ -66,7 +66,7 @@ class Drive:
             line.replace(f"{file.parent}/", "")
             for line in (*loaded.layout.warnings, *loaded.warnings)
         ]
-        silent = loaded.config.dbc.on_loss == "silent"
+        silent = loaded.config.dbc.silent_on_loss
         self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
         self._waiting = TransmitQueue()
         self._open = True

@@ -1,7 +1,7 @@
 """Is what is golden right? Each flight and dialogue against a brute-force search, the sheet and cantools.
 
-UART bytes are searched by tests/esc/reference.py, fields and scales are those of tests/esc/sheet.py, frames are decoded by
-cantools. Nothing of the product is used but the DBC of a configuration, as text.
+UART bytes are searched by tests/esc/reference.py, fields and scales are those of tests/esc/sheet.py, values are reckoned by
+tests/signals/packer_oracle.py, frames are decoded by cantools. Nothing of the product is used but the DBC of a configuration, as text.
 """
 
 import io
@@ -18,10 +18,11 @@ from fractions import Fraction
 from functools import cache
 from itertools import accumulate
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parents[1])]
+sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent / "signals"), str(HERE.parents[1])]
 
 import drive  # noqa: E402
 import meaning  # noqa: E402
@@ -29,6 +30,7 @@ import scenario  # noqa: E402
 from cantools.database.can import Database  # noqa: E402
 from cantools.database.can.signal import Signal  # noqa: E402
 from esc import reference, sheet  # noqa: E402
+from packer_oracle import KNOWN  # noqa: E402
 
 _DOWNLOADS = 0x20, 0xC0
 """Command of an SDO client that begins to write, in one frame or segments, or in blocks (CiA 301, 7.2.4.3)."""
@@ -36,7 +38,6 @@ NOT_JUDGED = ("no_start_values.txt",)
 """Flags without a start value go to 1 on loss, which is a false alarm: a known defect (README.md)."""
 NS_PER_BYTE = 11 * 10**9 // 115_200
 INFO_NS = 10 * 10**9
-JIVEPRO = 3
 CONVERSIONS: dict[tuple[str, str], int | Fraction] = {
     ("V", "mV"): 1000,
     ("A", "mA"): 1000,
@@ -44,16 +45,10 @@ CONVERSIONS: dict[tuple[str, str], int | Fraction] = {
 }
 LIVE = {f.name: f for f in sheet.LIVE_FIELDS}
 INFO = {f.name: f for f in sheet.INFO_FIELDS}
-OF_SETTINGS = {"MotorSpeed", "OutputSpeed", "MeanCellVoltage"}
-OF_LIVE = OF_SETTINGS | {"OperatingState", "OperatingStateRaw", "BatteryPower"}
-OF_INFO = {
-    "Device": ("device_and_variant", 10, 63),
-    "DeviceRaw": ("device_and_variant", 10, 63),
-    "Variant": ("device_and_variant", 0, 1023),
-    "FirmwareMain": ("firmware_word", 8, 255),
-    "FirmwareSub": ("firmware_word", 0, 255),
-}
-"""A word of an info frame, shift, mask."""
+OF_SETTINGS = {"motor_speed", "output_speed", "mean_cell_voltage"}
+JUDGED = {"operating_state_raw", "battery_power", "device", "device_raw", "variant", "firmware_main", "firmware_sub", "layout", "data_age",
+          *OF_SETTINGS, *LIVE, *INFO} & KNOWN.keys()  # fmt: skip
+"""What depends on telemetry alone, which is followed here."""
 Values = Mapping[str, int]
 Bytes = tuple[int, bytes | None]
 """(time, bytes that are read; None where the port is lost)."""
@@ -155,49 +150,22 @@ def snake(name: str) -> str:
     return re.sub("(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
 
 
-def bec_current_supplied(state: State) -> bool:
-    """The JIVEPro does not; as long as the device is not known, 0 says nothing."""
-    known = state.info or state.last_info
-    if known is not None and known["device_and_variant"] >> 10 == JIVEPRO:
-        return False
-    return state.info is not None or bool(state.live and state.live["bec_current"])
-
-
 def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | None:
     """The value that a signal is to have, in the sheet's unit; None: not available. KeyError for what is not judged."""
     plain = snake(name)
-    live, info = state.live, state.info
-    for known, listed in ((live, LIVE), (info, INFO)):
-        if plain in listed and plain != "operating_state":
-            if known is None or (plain == "bec_current" and not bec_current_supplied(state)):
-                return None
-            if plain == "max_bec_current" and known["device_and_variant"] >> 10 == JIVEPRO:
-                return None
-            return Fraction(known[plain], listed[plain].steps)
-    if name in OF_LIVE:
-        if name in OF_SETTINGS and not esc.sure:
-            raise KeyError(name)
-        cells = esc.cells or (info or {}).get("cell_count", 0)
-        return None if live is None else _of_live(name, esc, live, cells)
-    if name in OF_INFO:
-        word, shift, mask = OF_INFO[name]
-        return None if info is None else info[word] >> shift & mask
-    if name == "Layout":
-        return state.layout
-    if name == "DataAge":
-        return None if state.live_ns is None else max(0, now - state.live_ns) // 10**6
-    raise KeyError(name)
-
-
-def _of_live(name: str, esc: Esc, live: Values, cells: int) -> Fraction | int | None:
-    speed = Fraction(live["electrical_speed"], esc.pole_pairs)
-    if name.endswith("Speed"):
-        return speed if name == "MotorSpeed" else speed / esc.gear
-    if name == "BatteryPower":
-        return Fraction(live["battery_voltage"] * live["battery_current"], 1000)
-    if name == "MeanCellVoltage":
-        return Fraction(live["battery_voltage"], 100 * cells) if cells else None
-    return live["operating_state"]
+    if plain not in JUDGED or (plain in OF_SETTINGS and not esc.sure):
+        raise KeyError(name)
+    live, info, last = (
+        None if values is None else SimpleNamespace(**values)
+        for values in (state.live, state.info, state.last_info)
+    )
+    cells = esc.cells or (state.info or {}).get("cell_count", 0)
+    made: Any = SimpleNamespace(
+        live=live, info=info, last_info=last, layout=state.layout, live_ns=state.live_ns,
+        settings=esc, cells=cells,
+    )  # fmt: skip
+    of_gateway: Any = None
+    return KNOWN[plain].read(made, of_gateway, now)
 
 
 def fits(signal: Signal, raw: float, value: Fraction | int | None, unit: str) -> bool:

@@ -26,9 +26,9 @@ from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core import Follower, PythonCore
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -60,9 +60,7 @@ def settings(chance: random.Random, number: int) -> EscSettings:
     )
 
 
-def dbc(
-    chance: random.Random, escs: Sequence[EscSettings], most: int = 8
-) -> tuple[str, DbcSettings]:
+def dbc(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) -> tuple[str, DbcConfig]:
     """A random DBC, and how its signals are bound; not always one that the gateway accepts. ``most`` messages."""
     maker = LayoutMaker(chance, escs)
     messages = [maker.message() for _ in range(chance.randint(1, most))]
@@ -75,7 +73,7 @@ def dbc(
         for m in messages
     )
     ids = {"Protected": 0x1234} if any(m.name == "Protected" for m in messages) else {}
-    return dbc_text(messages, more), DbcSettings(bind=bindings(messages), data_ids=ids)
+    return dbc_text(messages, more), DbcConfig(bind=bindings(messages), e2e_data_ids=ids)
 
 
 def layout(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) -> Layout:

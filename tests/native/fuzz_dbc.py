@@ -16,9 +16,9 @@ from typing import Any
 import equality
 
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.native.binding import load
 from kontronik_can_gw.native.rows import NotInCore
@@ -71,7 +71,7 @@ def one(library: Any, seed: int) -> tuple[str, int]:
     """What came of it, and frames compared."""
     chance = random.Random(seed)
     escs = equality.some_escs(chance)
-    chosen = DbcSettings()
+    chosen = DbcConfig()
     if chance.random() < 0.7:
         text, chosen = equality.dbc(chance, escs)
     else:

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc import protocols
 from kontronik_can_gw.esc.kontronik import LiveData, codec, encode
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
@@ -51,7 +51,7 @@ needs_c = pytest.mark.skipif(
 def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
     text = HEAD.format(signal).replace("M: 8", f"M: {length}") + more
     database = parse_database(text.encode(), "t.dbc")
-    return prepare(database, "t.dbc", (EscSettings(),), DbcSettings(), fd_allowed=True)
+    return prepare(database, "t.dbc", (EscSettings(),), DbcConfig(), fd_allowed=True)
 
 
 def why(layout: Layout = EMPTY, **settings: object) -> str:

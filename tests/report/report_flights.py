@@ -65,6 +65,5 @@ def data_of(html: str) -> dict[str, Any]:
 
 def column(bus: BusLayout, source: str, esc: int | None = 0) -> int:
     """Where a source is in a row."""
-    found = SignalReader(bus.layout).column_of(source, esc)
-    assert found is not None
-    return found
+    columns = [(column.source, column.esc) for column in SignalReader(bus.layout).columns]
+    return columns.index((source, esc))

@@ -6,9 +6,9 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -124,7 +124,7 @@ def test_pages_of_a_message_are_no_parts_of_a_transfer_however_many() -> None:
     bind: dict[str, str | float] = {f"S{n}": n for n in numbers}
     escs = (EscSettings("esc1"),)
     (plan,) = prepare(
-        parse_database(text.encode(), "m.dbc"), "m.dbc", escs, DbcSettings(bind)
+        parse_database(text.encode(), "m.dbc"), "m.dbc", escs, DbcConfig(bind=bind)
     ).messages
     make = compile_frame(plan)
     queue, sent = TransmitQueue(), list[CanFrame]()

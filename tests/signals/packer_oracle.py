@@ -179,22 +179,28 @@ KNOWN: dict[str, Known] = {
         lambda _, gateway: gateway, True),
 }  # fmt: skip
 
-# unit -> other units: (text, factor, shift), value in other = value * factor + shift
 UNITS: dict[str, list[tuple[str, str, str]]] = {
-    "V": [("V", "1", "0"), ("mV", "1000", "0"), ("kV", "1/1000", "0"), ("", "1", "0")],
-    "A": [("A", "1", "0"), ("mA", "1000", "0"), ("kA", "1/1000", "0")],
-    "W": [("W", "1", "0"), ("kW", "1/1000", "0"), ("mW", "1000", "0")],
+    "V": [("V|v|Volt|Volts|volt|VOLT|Unit_Volt|[V]|| |-|none|Unit_None|unitless|N/A", "1", "0"),
+          ("mV|mv|Unit_MilliVolt|millivolts|(mV)", "1000", "0"), ("kV|KV", "1/1000", "0")],
+    "A": [("A|Amp|Amps|amps|ampere|Ampere|Unit_Amper|Unit_Ampere", "1", "0"), ("mA|Unit_MilliAmper", "1000", "0"), ("kA", "1/1000", "0")],
+    "W": [("W|watts|Watt|Unit_Watt", "1", "0"), ("kW|KW|kw|Kw|Unit_KiloWatt", "1/1000", "0"), ("mW", "1000", "0")],
     "Wh": [("Wh", "1", "0"), ("kWh", "1/1000", "0"), ("J", "3600", "0"), ("kJ", "18/5", "0"), ("mWh", "1000", "0")],
-    "mAh": [("mAh", "1", "0"), ("Ah", "1/1000", "0"), ("As", "18/5", "0")],
-    "s": [("s", "1", "0"), ("ms", "1000", "0"), ("min", "1/60", "0"), ("h", "1/3600", "0"), ("us", "1000000", "0")],
-    "us": [("us", "1", "0"), ("ms", "1/1000", "0"), ("s", "1/1000000", "0")],
+    "mAh": [("mAh|mA*h", "1", "0"),
+            ("Ah|AH|A h|AmpHour|amperehour|ampere*hour|Unit_AmperHour", "1/1000", "0"), ("As|C|coulomb", "18/5", "0")],
+    "s": [("s|sec|secs|Seconds|Unit_Secon", "1", "0"), ("ms", "1000", "0"), ("min", "1/60", "0"), ("h", "1/3600", "0"),
+          ("us", "1000000", "0")],
+    "us": [("us|µs|μs|Âµs|usec|uSec|Unit_MicroSecon|microseconds", "1", "0"), ("ms|msec|mSec|millisecond|Unit_MilliSecon", "1/1000", "0"),
+           ("s", "1/1000000", "0")],
     "ms": [("ms", "1", "0"), ("s", "1/1000", "0"), ("us", "1000", "0")],
-    "Hz": [("Hz", "1", "0"), ("kHz", "1/1000", "0")],
-    "1/min": [("1/min", "1", "0"), ("rpm", "1", "0"), ("rps", "1/60", "0"), ("1/s", "1/60", "0"), ("U/min", "1", "0")],
-    "%": [("%", "1", "0"), ("percent", "1", "0")],
-    "degC": [("degC", "1", "0"), ("C", "1", "0"), ("K", "1", "273.15"), ("degF", "9/5", "32"), ("Celsius", "1", "0")],
-    "": [("", "1", "0"), ("-", "1", "0"), ("count", "1", "0"), ("1", "1", "0")],
+    "Hz": [("Hz|hz|Unit_Hertz|1/s", "1", "0"), ("kHz", "1/1000", "0")],
+    "1/min": [("1/min|rpm|RPM|Rpm|U/min|Umin|upm|r/min|R/min|min⁻¹|min^-1|/min|rev/min|Unit_MinutInver", "1", "0"),
+              ("rps|1/s|U/sec|s⁻¹", "1/60", "0"), ("deg/s|°/s|degrees/second|Grad/sec|Unit_DegreOfArcPerSecon", "6", "0")],
+    "%": [("%|percent|Percent|Unit_PerCent|pct", "1", "0"), ("1|ratio", "1/100", "0")],
+    "degC": [("degC|DegC|Deg C|deg C|deg_C|°C|° C|ºC|Â°C|\ufffdC|C|Cel|Celsius|celsius|Degrees C|Unit_DegreCelsi|[°C]|Grad C", "1", "0"),
+             ("K|Kelvin|degK|Unit_Kelvi", "1", "273.15"), ("F|degF|°F|Fahrenheit", "9/5", "32")],
+    "": [("|-|1|count|counts|Cnt|#|Unit_None|number", "1", "0")],
 }  # fmt: skip
+"""By unit of a source spellings of units, factor and shift: value in the other = value * factor + shift."""
 
 
 # --- a signal and what it must hold -------------------------------------------------------------------------------------
@@ -489,7 +495,8 @@ class LayoutMaker:
         name = f"S{len(message.signals)}"
         signal = Sig(name, place[0], length, place[1], signed, is_float, mux=mux, source=source)
         signal.esc = rng.randrange(len(self.escs))
-        signal.unit, *conversion = rng.choice(UNITS[known.unit])
+        texts, *conversion = rng.choice(UNITS[known.unit])
+        signal.unit = rng.choice(texts.split("|"))
         signal.conversion = conversion[0], conversion[1]
         if is_number and length > 1:
             signal.factor, signal.offset = rng.choice(FACTORS), rng.choice(OFFSETS)

@@ -13,7 +13,6 @@ from packer_oracle import (
     KNOWN,
     LayoutMaker,
     Msg,
-    Sig,
     bindings,
     dbc_text,
     get,
@@ -23,18 +22,13 @@ from packer_oracle import (
     read,
 )
 
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.settings import DbcSettings
-from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.signals.packer import compile_frame, compile_pack, float_of, ratio
-from kontronik_can_gw.signals.plan import MessagePlan
+from kontronik_can_gw.signals.packer import compile_frame, float_of, ratio
 
 ESCS = (
     EscSettings("left", pole_pairs=7, gear=Fraction(31, 4), timeout_ns=250 * MS),
@@ -44,13 +38,6 @@ FILES = int(os.environ.get("PACKER_FILES", "110"))
 MESSAGES = 30
 """Each file holds so many messages: 110 files are 3300 layouts."""
 ROUNDS = 3
-
-
-def compiled(
-    messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS
-) -> dict[str, MessagePlan]:
-    layout = prepare(database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True)
-    return {plan.name: plan for plan in layout.messages}
 
 
 State = tuple[Sequence[EscTelemetry], GatewayStatus, int]
@@ -107,7 +94,8 @@ def test_every_random_layout_is_packed_as_the_oracle_and_cantools_say(seed: int)
     messages = [maker.message() for _ in range(MESSAGES)]
     text = dbc_text(messages)
     database = read(text)
-    plans = compiled(messages, database)
+    layout = prepare(database, "x", ESCS, DbcConfig(bind=bindings(messages)), fd_allowed=True)
+    plans = {plan.name: plan for plan in layout.messages}
     assert len(plans) == MESSAGES
     makers = {name: compile_frame(plan) for name, plan in plans.items()}
     for message in messages:
@@ -126,16 +114,3 @@ def test_every_random_layout_is_packed_as_the_oracle_and_cantools_say(seed: int)
 
 def test_the_oracle_knows_every_source_and_no_other() -> None:
     assert set(KNOWN) == set(VALUES)
-
-
-# --- floats ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("voltage", "sent"), [(9_999, 99.99), (10_000, 100), (10_001, math.nan)])
-def test_a_float_outside_its_limits_is_sent_as_error(voltage: int, sent: float) -> None:
-    signal = Sig("BatteryVoltage", 0, 64, signed=True, is_float=True, maximum="100", unit="V")
-    message = Msg("EscPower", 1, 8, [signal])
-    plan = compiled([message], read(dbc_text([message])), ESCS[:1])["EscPower"]
-    esc = EscStream(ESCS[0], 0)
-    list(esc.receive_each(encode(LiveData(battery_voltage=voltage), WireLayout.V4), 0, 0))
-    assert same(float_of(compile_pack(plan)([esc], GatewayStatus(), 0, 0, 0), 64), sent)

@@ -3,16 +3,16 @@
 import math
 import random
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import pytest
+from dbc_bench import compiled
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text, get, put, read
 from test_packer_against_cantools import ESCS, MESSAGES
 
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
@@ -43,7 +43,9 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
     database = read(dbc_text(messages))
-    layout = prepare(database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True)
+    layout = prepare(
+        database, "random.dbc", ESCS, DbcConfig(bind=bindings(messages)), fd_allowed=True
+    )
     reader = SignalReader(layout)
     compared = 0
     for message, plan in zip(messages, layout.messages, strict=True):
@@ -102,7 +104,7 @@ def test_an_error_code_beside_them_does_not_hide_flags() -> None:
         assert values[flag - first] == expected
 
 
-def view_of(tmp_path: Path, *messages: tuple[str, int, str]) -> View:
+def view_of(*messages: tuple[str, int, str]) -> View:
     """A view of messages with one signal each: name, cycle in ms, send type."""
     made = [
         Msg(f"M{number}", 100 + number, 8, [Sig(name, 0, 16, maximum="65533")])
@@ -113,34 +115,36 @@ def view_of(tmp_path: Path, *messages: tuple[str, int, str]) -> View:
         f'BA_ "GenMsgCycleTime" BO_ {100 + number} {cycle};\nBA_ "GenMsgSendType" BO_ {100 + number} {kinds[send]};\n'
         for number, (_, cycle, send) in enumerate(messages)
     )
-    path = tmp_path / "v.dbc"
-    path.write_text(dbc_text(made, more))
-    return View(SignalReader(layout_of_dbc(path).layout))
+    return View(SignalReader(compiled(dbc_text(made, more))))
 
 
-def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer(tmp_path: Path) -> None:
-    view = view_of(tmp_path, ("losses", 5000, "Cyclic"), ("variant", 0, "OnChange"))
+def value(view: View, source: str) -> Any:
+    return dict(zip((c.source for c in view.reader.columns), view.values, strict=True))[source]
+
+
+def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer() -> None:
+    view = view_of(("losses", 5000, "Cyclic"), ("variant", 0, "OnChange"))
     for when in range(0, 60, 5):
         view.take(100, b"\1" * 8, when * SECOND)
         if not when:
             view.take(101, b"\2" * 8, 0)
         for later in (1, 3, 4.9):
             view.expire(int((when + later) * SECOND))
-            assert view.value("losses", 0) == 0x0101
-            assert view.value("variant", 0) == 0x0202
+            assert value(view, "losses") == 0x0101
+            assert value(view, "variant") == 0x0202
     view.expire(55 * SECOND + 15 * SECOND + 1)
-    assert view.value("losses", 0) is None
-    assert view.value("variant", 0) is None
+    assert value(view, "losses") is None
+    assert value(view, "variant") is None
 
 
-def test_what_comes_with_telemetry_is_fresh_for_a_second(tmp_path: Path) -> None:
-    view = view_of(tmp_path, ("battery_voltage", 0, "Event"), ("losses", 100, "Cyclic"))
+def test_what_comes_with_telemetry_is_fresh_for_a_second() -> None:
+    view = view_of(("battery_voltage", 0, "Event"), ("losses", 100, "Cyclic"))
     view.take(100, b"\1" * 8, 0)
     for when in range(0, 2000, 100):
         view.take(101, b"\1" * 8, when * MS)
         view.expire(when * MS)
-        assert (view.value("battery_voltage", 0) is not None) == (when <= 1000)
-        assert view.value("losses", 0) is not None
+        assert (value(view, "battery_voltage") is not None) == (when <= 1000)
+        assert value(view, "losses") is not None
     assert view.expire(2000 * MS + 250 * MS + 1)
-    assert view.value("losses", 0) is None
+    assert value(view, "losses") is None
     assert view.next_expiry is None

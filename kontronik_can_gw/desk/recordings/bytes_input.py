@@ -10,8 +10,8 @@ from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core import PythonCore
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.errors import RunError, UserError
@@ -46,7 +46,7 @@ class BytesInput(PlayedInput):
         self._path = path
         timeout_ns = max(layout.escs[0].timeout_ns, 3 * PERIOD_NS)
         escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
-        setup = CaptureSetup(escs, (str(path),), None, DbcSettings(), False, False, None)
+        setup = CaptureSetup(escs, (str(path),), None, DbcConfig(), False, None)
         super().__init__(str(path), layout, setup)
         self.times_assumed = True
         self.provenance["times"] = "assumed: 100 live frames a second"

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import Config
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.reader import choose_node, load_database
-from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Group
@@ -32,7 +32,7 @@ class BusLayout:
     def copies(self) -> dict[str, Copy]:
         """The file's messages by their names on the bus."""
         layout = self.layout
-        settings = self.config.dbc_settings if self.config else DbcSettings(node=layout.node)
+        settings = self.config.dbc if self.config else DbcConfig(node=layout.node)
         copies = copies_of(self.database, layout.file, self.escs, settings)
         return {copy.name: copy for copy in copies}
 
@@ -70,7 +70,7 @@ def _made(database: "Database", node: str, file: str, known: Sequence[EscSetting
     escs = list(known) or [EscSettings(name) for name in names] or [EscSettings("esc1")]
     if names:
         escs = [replace(esc, name=name) for esc, name in zip(escs, names, strict=True)]
-    layout = prepare(database, file, escs, DbcSettings(node=node), fd_allowed=True)
+    layout = prepare(database, file, escs, DbcConfig(node=node), fd_allowed=True)
     return BusLayout(database, layout, escs)
 
 

@@ -1,4 +1,9 @@
-"""The computed bus load: bits of a frame, frames a second, and what is said of a bus that is full."""
+"""What a compiled layout says of itself: what signals cannot carry, the bus load; and what lies near a mistake and is none.
+
+(Each mistake, in its line: tests/golden/commands/refused_dbc.txt; random ones: tests/native/fuzz_dbc.py.)
+"""
+
+import re
 
 import pytest
 from dbc_bench import compiled
@@ -6,6 +11,75 @@ from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.dbc.prepare import check_load
 from kontronik_can_gw.signals.plan import Layout
+
+PAGE, VOLTAGE = Sig("Page", 0, 8, mux="M"), Sig("BatteryVoltage", 0, 16, factor="0.01", unit="V")
+
+
+def one(*signals: Sig) -> str:
+    return dbc_text([Msg("Power", 0x100, 8, list(signals))])
+
+
+def test_pages_may_share_bits_and_a_crc_may_stand_beside_them() -> None:
+    current = Sig("BatteryCurrent", 16, 16, signed=True, mux="m1", unit="A")
+    text = one(PAGE, Sig("BatteryVoltage", 8, 16, unit="V", mux="m0"), current)
+    assert compiled(text).messages[0].pages == (0, 1)
+    crc, alive = Sig("Crc8", 8, 8), Sig("AliveCounter", 16, 4)
+    assert compiled(one(PAGE, crc, alive, Sig("Timing", 24, 8, unit="us", mux="m1"))).messages
+    wide = Sig("BatteryVoltage", 16, 16, unit="V", mux="m16")
+    assert compiled(one(Sig("Page", 0, 5, mux="M"), wide)).messages[0].pages == (16,)
+
+
+def test_an_id_of_11_bits_is_none_of_29_bits_and_what_others_send_is_not_looked_at() -> None:
+    foo = [Sig("Foo", 0, 8)]
+    others = [Msg(name, 0x123, 8, foo, sender="Other") for name in ("Brake", "Wheel")]
+    ours = [Msg("Power", 0x124, 8, [VOLTAGE]), Msg("Flow", 0x124, 8, [VOLTAGE], True)]
+    both = compiled(dbc_text([*others, *ours]), node="Gateway").messages
+    assert [message.extended for message in both] == [False, True]
+
+
+def test_a_start_value_that_is_no_number_does_no_harm() -> None:
+    more = 'BA_ "GenSigStartValue" SG_ 256 BatteryVoltage 1;'
+    text = dbc_text([Msg("Power", 0x100, 8, [VOLTAGE])], more)
+    text = re.sub(r'(?m)^(BA_DEF_ SG_ "GenSigStartValue").*', r'\1 ENUM "a","b";', text)
+    text = text.replace('BA_DEF_DEF_ "GenSigStartValue" 0', 'BA_DEF_DEF_ "GenSigStartValue" "a"')
+    assert compiled(text).messages[0].signals[0].not_available == 65535
+
+
+# --- what a signal cannot carry ---
+
+CODES = {255: "NotAvailable", 254: "Error"}
+NO_NAMES = "the value table has no name of it: sent as the ESC's number"
+
+
+def volts(length: int, factor: str, **more: object) -> Sig:
+    return Sig("BatteryVoltage", 0, length, **{"factor": factor, "unit": "V"} | more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("signal", "expected"),
+    [
+        (volts(16, "0.01"), ["not available is sent as 655.35"]),
+        (volts(17, "0.01"), ["not available is sent as 1310.71"]),
+        (volts(16, "0.01", texts={65535: "NotAvailable", 65534: "Error"}), []),
+        (volts(32, "1", signed=True, is_float=True), []),
+        (Sig("CrcErrors", 0, 8, texts=CODES), ["starts again at 0 after 253"]),
+        (Sig("CrcErrors", 0, 8, maximum="99"), ["starts again at 0 after 99"]),
+        (Sig("OperatingState", 0, 8), [NO_NAMES, "not available is sent as 255"]),
+        (Sig("OperatingState", 0, 8, texts={1: "Asleep"} | CODES), [NO_NAMES]),
+        (Sig("LinkState", 0, 8, texts={9: "Ok", 8: "LOST", 7: "Searching", 6: "never_seen"} | CODES),
+         ["sent as Error, not in the value table: Degraded, PortError"]),
+        (Sig("Undervoltage", 0, 1), ["not available is sent as 0"]),
+        # a source without names leaves a value table alone
+        (Sig("CellCount", 0, 8, texts={0: "unknown", 6: "six"} | CODES), []),
+    ],
+    ids=lambda value: value.line if isinstance(value, Sig) else "",
+)  # fmt: skip
+def test_what_a_signal_cannot_carry_is_noted(signal: Sig, expected: list[str]) -> None:
+    layout = compiled(one(signal))
+    assert list(layout.messages[0].signals[0].notes) == expected
+
+
+# --- bus load ---
 
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
 NO_FD, FD = 0, 14
