@@ -2,6 +2,7 @@
 
 import random
 import struct
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -13,8 +14,9 @@ from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.dronecan.measured import fill, plans_of
 from kontronik_can_gw.dronecan.transport import Assembler, message_id, response_id
 from kontronik_can_gw.dronecan.types import DataType
-from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
@@ -58,6 +60,13 @@ class Measuring:
             frames: list[CanFrame] = self.core.take(self.now)
         return frames
 
+    def read(self, live: LiveData, index: int, errors: int = 0) -> Any:
+        """The message, as the package reads it."""
+        reader = Reader()
+        found = [reader.read(0, frame) for frame in self.sent(live, index, errors)][-1]
+        assert found is not None
+        return found.payload
+
 
 pure = pytest.mark.parametrize("is_pure", [True, False])
 
@@ -96,13 +105,6 @@ def half(value: float) -> float:
     return found
 
 
-def read(frames: list[CanFrame]) -> Any:
-    reader = Reader()
-    found = [reader.read(0, frame) for frame in frames][-1]
-    assert found is not None
-    return found.payload
-
-
 @pure
 def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
     rng = random.Random(1)
@@ -111,55 +113,58 @@ def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
         live = random_live(rng)
         live = live._replace(throttle=max(-127, live.throttle))
         index, errors = rng.randrange(32), rng.choice((0, 1, 300, (1 << 32) - 1))
-        got = read(status.sent(live, index, errors))
+        got = status.read(live, index, errors)
         volts, amperes = live.battery_voltage / 100, live.battery_current / 10
         kelvin = live.power_stage_temperature + 273.15
         found = (got.error_count, got.voltage, got.current, got.temperature, got.esc_index)
         assert found == (errors, half(volts), half(amperes), half(kelvin), index)
         assert got.rpm == min(live.electrical_speed, 131_071)
         assert got.power_rating_pct == min(live.output_opening, 127)
-        got, word = read(extended.sent(live, index)), live.operating_errors
+        got, word = extended.read(live, index), live.operating_errors
         assert got.input_pct == abs(live.throttle)
         assert got.output_pct == min(live.output_opening, 127)
         assert (got.motor_temperature_degC, got.motor_angle, got.esc_index) == (-256, 0, index)
         assert got.status_flags == word & 0x3FFFF | (word > 0x3FFFF) << 18
 
 
+def request(source: int, name: bytes, number: int = 1) -> list[CanFrame]:
+    made = protocol.param.GetSet.Request(index=source)
+    made.name.from_bytes(name)
+    return peers_frames(made, source, to=42, transfer_id=number)
+
+
+def received(frames: Iterable[CanFrame], pause_ns: int = 0) -> list[bytes]:
+    """What comes of frames, each of which comes so long after the one before."""
+    assembler = Assembler()
+    seed = types.GET_SET.seed
+    found = [
+        assembler.receive(frame.can_id, frame.data, seed, number * pause_ns)
+        for number, frame in enumerate(frames)
+    ]
+    return [each for each in found if each is not None]
+
+
 def test_transfers_of_the_package_are_put_together_however_they_are_mixed() -> None:
     """Transfers of several nodes with frames in between, some doubled; each comes out once, whole."""
-    rng, assembler = random.Random(2), Assembler()
+    rng = random.Random(2)
     wanted: list[bytes] = []
-    found: list[bytes] = []
+    mixed: list[CanFrame] = []
     streams: list[list[CanFrame]] = []
     for source in range(1, 30):
-        request = protocol.param.GetSet.Request(index=source)
-        request.name.from_bytes(rng.randbytes(rng.randrange(93)))
-        made = peers_frames(request, source, to=42, transfer_id=rng.randrange(32))
+        made = request(source, rng.randbytes(rng.randrange(93)), rng.randrange(32))
         data = b"".join(frame.data[:-1] for frame in made)
         wanted.append(data if len(made) == 1 else data[2:])
         streams.append(made)
     while streams:
         stream = rng.choice(streams)
         frame = stream.pop(0)
-        for _ in range(rng.choice([1, 1, 2]) if len(frame.data) == 8 else 1):
-            whole = assembler.receive(frame.can_id, frame.data, types.GET_SET.seed, 0)
-            found += [] if whole is None else [whole]
+        mixed += [frame] * (rng.choice([1, 1, 2]) if len(frame.data) == 8 else 1)
         streams = [each for each in streams if each]
-    assert sorted(found) == sorted(wanted)
+    assert sorted(received(mixed)) == sorted(wanted)
 
 
 def test_a_transfer_that_is_damaged_or_late_is_dropped() -> None:
-    request = protocol.param.GetSet.Request(index=1)
-    request.name.from_bytes(b"e0.pole_pairs")
-    frames = peers_frames(request, 9, to=42)
-
-    def received(changed: list[CanFrame], pause_ns: int = 0) -> bool:
-        assembler, now, whole = Assembler(), 0, None
-        for frame in changed:
-            whole = assembler.receive(frame.can_id, frame.data, types.GET_SET.seed, now)
-            now += pause_ns
-        return whole is not None
-
+    frames = request(9, b"e0.pole_pairs")
     assert received(frames)
     assert received(frames, 800_000_000)
     assert not received(frames, 2_000_000_001)
