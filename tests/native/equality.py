@@ -3,7 +3,6 @@
 import math
 import random
 from collections.abc import Sequence
-from contextlib import suppress
 from fractions import Fraction
 from functools import cache
 from itertools import zip_longest
@@ -131,18 +130,16 @@ def _difference(*sides: Sequence[CanFrame]) -> str:
 
 _STATE_EACH = 10
 STATE = (
+    *("live", "info", "last_live", "last_info", "link", "layout", "cells", "last_cells"),
     *(
-        "live",
-        "info",
-        "last_live",
-        "last_info",
-        "link",
-        "layout",
-        "cells",
-        "last_cells",
         "counters",
+        "frame_rate",
+        "losses",
+        "late_frames",
+        "suspect_frames",
+        "live_ns",
+        "last_info_ns",
     ),
-    *("frame_rate", "losses", "late_frames", "suspect_frames", "live_ns", "last_info_ns"),
     *("info_bound_ns", "pole_pairs", "output_divisor", "gear_denominator"),
     *("energy_mw_ns", "run_time_ns"),
 )
@@ -201,16 +198,10 @@ FILL = 2
 
 
 def transfer_plan(chance: random.Random) -> SlotPlan:
-    """One that the core in C can express: slots of one id are all there, and count together."""
-    while True:
-        plan = _transfer_plan(chance)
-        with suppress(NotInCore):
-            _rows(plan, EscSettings().protocol)
-            return plan
+    """Up to seven values as integers or floats of any length; their Error code is the type's limit.
 
-
-def _transfer_plan(chance: random.Random) -> SlotPlan:
-    """Up to seven values as integers or floats of any length; their Error code is the type's limit."""
+    One that the core in C can express: slots of one id are all there, and count together.
+    """
     at, signals = 8 * FILL, []
     sources = [v for v in VALUES.values() if v.supplied and v.kind is not Kind.OBJECT]
     for source in chance.sample(sources, chance.randint(1, 7)):
@@ -239,7 +230,12 @@ def _transfer_plan(chance: random.Random) -> SlotPlan:
         *(frozenset({0}), frozenset({Group.LIVE})),
     )
     seed, paced = chance.randrange(1 << 16), chance.random() < 0.7
-    return SlotPlan(plan, compile_pack(plan), Event.LIVE, 0, None, False, "", seed, paced)
+    found = SlotPlan(plan, compile_pack(plan), Event.LIVE, 0, None, False, "", seed, paced)
+    try:
+        _rows(found, EscSettings().protocol)
+    except NotInCore:
+        return transfer_plan(chance)
+    return found
 
 
 @cache
@@ -315,6 +311,18 @@ class Both:
             for name in STATE:
                 assert getattr(esc, name) == getattr(other, name), name
 
+    def run(self, steps: int) -> int:
+        """Frames compared in so many steps."""
+        self.call("repeat", self.now)
+        self.compare()
+        for _ in range(steps):
+            self.step()
+            self.compare()
+        self.call("stop", self.now)
+        self.compared = -1
+        self.compare()
+        return self.count
+
     def step(self) -> None:
         """Something happens, and time passes."""
         chance = self.chance
@@ -359,19 +367,6 @@ def run(library: Any, seed: int, steps: int = 300, most: int = 8) -> int:
     chance = random.Random(seed)
     escs = some_escs(chance)
     try:
-        return compare(Both(library, chance, escs, layout(chance, escs, most)), steps)
+        return Both(library, chance, escs, layout(chance, escs, most)).run(steps)
     except NotInCore:
         return 0
-
-
-def compare(both: Both, steps: int) -> int:
-    """Frames compared in so many steps."""
-    both.call("repeat", both.now)
-    both.compare()
-    for _ in range(steps):
-        both.step()
-        both.compare()
-    both.call("stop", both.now)
-    both.compared = -1
-    both.compare()
-    return both.count
