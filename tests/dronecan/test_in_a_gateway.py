@@ -2,7 +2,6 @@
 
 import json
 import random
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,17 +12,14 @@ import pytest
 import wire_world
 from command_line import run
 from dronecan_bench import LIVE, Bench, loaded
-from statistics_bench import moment_of
 from test_replay_is_identical import replayed
 
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.desk.monitor import status
 from kontronik_can_gw.dronecan import types
 from kontronik_can_gw.dronecan.transport import Assembler
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime.snapshot import snapshot
 from kontronik_can_gw.signals.plan import Layout
 
 ON = {"enabled": True, "node_id": 42, "per_esc_nodes": True, "extended_hz": 7}
@@ -184,21 +180,6 @@ def test_the_header_makes_the_same_nodes_on_any_machine() -> None:
     for outputs in (*({"dronecan": ours | change} for change in wrong), {"xyzzy": {}}, 7):
         with pytest.raises(ValueError, match="the header cannot be used"):
             CaptureSetup.of(header | {"outputs": outputs})
-
-
-def shown(bench: Bench) -> str:
-    """What ``status`` says of it."""
-    document = json.loads(snapshot(moment_of(bench.gateway, bench.now)))
-    seen = status.judge(Path("status.json"), document, bench.now)
-    return "\n".join(line.plain for line in status.lines_of(seen))
-
-
-def test_status_shows_the_nodes() -> None:
-    bench = Bench(2, per_esc_nodes=True).run(1)
-    assert bench.output.facts()["status_sent"] == 100
-    assert "DroneCAN 42 kontronik_can_gw.e0: operational" in shown(bench)
-    waiting = shown(Bench(node_id=0).run(2.5))
-    assert re.search("DroneCAN kontronik_can_gw: waits for a node-ID, [23] requests", waiting)
 
 
 def test_measurements_do_not_need_python() -> None:
