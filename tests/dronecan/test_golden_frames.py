@@ -10,10 +10,9 @@ from dronecan_bench import Reader, dronecan, peers_frames
 from packer_oracle import random_live
 
 from kontronik_can_gw.core import PythonCore
-from kontronik_can_gw.dronecan import types
-from kontronik_can_gw.dronecan.measured import fill, plans_of
-from kontronik_can_gw.dronecan.transport import Assembler, message_id, response_id
-from kontronik_can_gw.dronecan.types import DataType
+from kontronik_can_gw.dronecan import wire
+from kontronik_can_gw.dronecan.esc_report import fill, plans_of
+from kontronik_can_gw.dronecan.wire import Assembler, DataType, message_id, response_id
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -75,24 +74,22 @@ pure = pytest.mark.parametrize("is_pure", [True, False])
 def test_golden_messages(is_pure: bool) -> None:
     """Made by another implementation, of node 42, with transfer id 5."""
     live = LiveData(6303, 2423, 473, power_stage_temperature=30, output_opening=42)
-    assert shown(Measuring(types.STATUS, is_pure).sent(live, 3, 7, turns=6)) == (
+    assert shown(Measuring(wire.STATUS, is_pure).sent(live, 3, 7, turns=6)) == (
         "10040A2A#A1F1070000000F85 #4EEA51BD5C9F1825 #150C45"
     )
     live = LiveData(throttle=-50, output_opening=48, operating_errors=0x12345)
-    extended = Measuring(types.STATUS_EXTENDED, is_pure).sent(live, 3, turns=6)
+    extended = Measuring(wire.STATUS_EXTENDED, is_pure).sent(live, 3, turns=6)
     assert shown(extended) == "10040C2A#64C00200452323C5"
-    state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
-    frames = transfer(
-        message_id(types.NODE_STATUS.number, 42, 24), types.NODE_STATUS.seed, state, 5
-    )
+    state = wire.NODE_STATUS.pack(100, wire.OK << 6 | wire.OPERATIONAL << 3, 0xBEEF)
+    frames = transfer(message_id(wire.NODE_STATUS.number, 42, 24), wire.NODE_STATUS.seed, state, 5)
     assert shown(frames) == "1801552A#6400000000EFBEC5"
 
 
 def test_a_golden_answer() -> None:
-    state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
-    info = types.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
+    state = wire.NODE_STATUS.pack(100, wire.OK << 6 | wire.OPERATIONAL << 3, 0xBEEF)
+    info = wire.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
     request = 0x10018000 | 42 << 8 | 0x80 | 10
-    answer = transfer(response_id(request), types.GET_NODE_INFO.seed, info, 5)
+    answer = transfer(response_id(request), wire.GET_NODE_INFO.seed, info, 5)
     assert shown(answer) == (
         "10010AAA#6A76640000000085 #EFBE010200000025 #0000000000000005 #0000000304010225 #0304050607080905"
         " #0A0B0C0D0E0F1025 #006F72672E657805 #616D706C652E6525 #736345"
@@ -108,7 +105,7 @@ def half(value: float) -> float:
 @pure
 def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
     rng = random.Random(1)
-    status, extended = (Measuring(k, is_pure) for k in (types.STATUS, types.STATUS_EXTENDED))
+    status, extended = (Measuring(k, is_pure) for k in (wire.STATUS, wire.STATUS_EXTENDED))
     for _ in range(500):
         live = random_live(rng)
         live = live._replace(throttle=max(-127, live.throttle))
@@ -136,7 +133,7 @@ def request(source: int, name: bytes, number: int = 1) -> list[CanFrame]:
 def received(frames: Iterable[CanFrame], pause_ns: int = 0) -> list[bytes]:
     """What comes of frames, each of which comes so long after the one before."""
     assembler = Assembler()
-    seed = types.GET_SET.seed
+    seed = wire.GET_SET.seed
     found = [
         assembler.receive(frame.can_id, frame.data, seed, number * pause_ns)
         for number, frame in enumerate(frames)

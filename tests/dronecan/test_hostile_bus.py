@@ -7,7 +7,7 @@ import tracemalloc
 import pytest
 from dronecan_bench import Bench, Reader, dronecan
 
-from kontronik_can_gw.dronecan.transport import MAX_PAYLOAD, MAX_TRANSFERS
+from kontronik_can_gw.dronecan.wire import MAX_PAYLOAD, MAX_TRANSFERS
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.frames import CanFrame
 

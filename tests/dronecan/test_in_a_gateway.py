@@ -15,8 +15,7 @@ from dronecan_bench import LIVE, Bench, loaded
 from test_replay_is_identical import replayed
 
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.dronecan import types
-from kontronik_can_gw.dronecan.transport import Assembler
+from kontronik_can_gw.dronecan.wire import STATUS, Assembler
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
@@ -225,7 +224,7 @@ def test_a_bus_that_is_too_slow_gets_whole_transfers(
     wire_world.run(loop, world, begun + 5 * SECOND)
     assembler = Assembler()
     sent = [frame for _, frame in world.bus.sent if frame.can_id == 0x18040A2A]
-    seed = types.STATUS.seed
+    seed = STATUS.seed
     whole = [assembler.receive(frame.can_id, frame.data, seed, 0) for frame in sent]
     assert assembler.errors == 0
     assert sum(each is not None for each in whole) == len(sent) // 3 > 150

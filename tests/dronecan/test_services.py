@@ -28,15 +28,15 @@ def test_node_info_says_who_it_is_and_a_restart_is_refused() -> None:
     assert bytes(again.hardware_version.unique_id.to_bytes()) == ids[0]
 
 
-def held(bench: Bench, name: str = "", index: int = 0, **given: Any) -> object:
+def held(bench: Bench, name: str = "", index: int = 0, given: tuple[str, Any] = ("", 0)) -> object:
     """What a parameter is after a GetSet request: its name and value; None for none."""
     request = GetSet.Request(index=index)
     request.name.from_bytes(name.encode())
-    for field, value in given.items():
-        if field == "string_value":
-            request.value.string_value.from_bytes(value)
-        else:
-            setattr(request.value, field, value)
+    field, new = given
+    if field == "string_value":
+        request.value.string_value.from_bytes(new)
+    elif field:
+        setattr(request.value, field, new)
     answer = bench.ask(request)
     found = bytes(answer.name.to_bytes()).decode()
     kind = dronecan.get_active_union_field(answer.value)
@@ -53,12 +53,12 @@ def test_parameters_are_listed_and_read_by_name_and_nobody_sets_one() -> None:
     for number in (0, 1):
         expected += [(f"e{number}.esc_index", 4 + number), (f"e{number}.pole_pairs", 7)]
         expected += [(f"e{number}.gear", pytest.approx(10))]
-    for field, value in (
+    for given in (
         *(("integer_value", 1), ("real_value", 2.5)),
         *(("boolean_value", 1), ("string_value", b"electrical")),
     ):
         for index, one in enumerate(expected):
-            assert held(bench, index=index, **{field: value}) == one
+            assert held(bench, index=index, given=given) == one
         bench.run(1)
     listed = [held(bench, index=index) for index in range(len(expected) + 2)]
     assert listed == [*expected, None, None]

@@ -5,7 +5,7 @@ import math
 import pytest
 from dronecan_bench import LIVE, START, Bench
 
-from kontronik_can_gw.dronecan import types
+from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.esc.kontronik.fields import InfoData, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
@@ -116,7 +116,7 @@ def test_errors_of_an_esc_count_in_health_by_choice_only(health: str) -> None:
         found.append([bench.of("NodeStatus", node)[-1].payload.health for node in (42, 43)])
     by_choice = [[0, 0], [1, 0], [2, 0], [1, 0]]
     assert found == (by_choice if health == "esc" else [[0, 0]] * 4)
-    assert {each.payload.mode for each in bench.of("NodeStatus")} == {types.OPERATIONAL}
+    assert {each.payload.mode for each in bench.of("NodeStatus")} == {wire.OPERATIONAL}
 
 
 def test_a_node_says_each_second_that_it_is_there_and_how_the_gateway_is() -> None:
