@@ -20,7 +20,8 @@ from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
-from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group, values_of
 from kontronik_can_gw.gateway import Gateway

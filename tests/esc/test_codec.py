@@ -10,19 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
-from kontronik_can_gw.esc.kontronik import (
-    Deframer,
-    Frame,
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.deframer import Deframer, Frame
+from kontronik_can_gw.esc.kontronik.fields import (
+    Data,
+    DataType,
     InfoData,
-    Layout,
     LiveData,
-    OperatingError,
-    SelfTestError,
-    encode,
+    device_and_variant,
     rows,
 )
-from kontronik_can_gw.esc.kontronik.fields import Data, DataType, device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 
 from . import reference, sheet
 from .sheet import FORM_ROWS, Bit, Field, FormRow

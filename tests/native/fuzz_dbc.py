@@ -82,7 +82,7 @@ def one(library: Any, seed: int) -> int:
 def main(seconds: str, seed: str, core: str) -> None:
     logging.disable()
     library = load(Path(core))
-    found = []
+    found: list[int] = []
     end = time.monotonic() + float(seconds)
     while time.monotonic() < end:
         number = int(seed) + len(found)

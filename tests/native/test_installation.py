@@ -38,13 +38,14 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
     """The program in a fresh environment, the name of its wheel, and what pip printed."""
     folder, wheels = sources.parent / "fresh", sources.parent / "wheels"
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    command = [*pip, "wheel", "-v", "--no-deps", "--no-build-isolation", "-w", wheels, sources]
+    build = ["wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(wheels), str(sources)]
+    command = [*pip, *build]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (wheel,) = wheels.iterdir()
     venv.create(folder, symlinks=True)
-    into = ["--python", folder / "bin" / "python", "install", "-q", "--no-deps", "--no-index"]
-    subprocess.run([*pip, *into, wheel], check=True)
+    into = ["--python", f"{folder}/bin/python", "install", "-q", "--no-deps", "--no-index"]
+    subprocess.run([*pip, *into, str(wheel)], check=True)
     (packages,) = folder.glob("lib/python*/site-packages")
     # what it depends on is that of the tests
     (packages / "others.pth").write_text(sysconfig.get_path("purelib"))
@@ -78,7 +79,7 @@ def test_the_gateway_works_and_says_which_core_runs_and_why(
     assert not why or f"the core in Python will run: {why}" in printed
     config = program.with_name("gateway.toml")
     config.write_text(CONFIG)
-    command = [program, "run", "--wait", "-c", config]
+    command = [str(program), "run", "--wait", "-c", str(config)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd="/") as process:
         assert process.stderr is not None
         said = next((line for line in process.stderr if "core: " in line), "")

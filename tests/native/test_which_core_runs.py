@@ -15,7 +15,9 @@ from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc import protocols
-from kontronik_can_gw.esc.kontronik import LiveData, codec, encode
+from kontronik_can_gw.esc.kontronik import codec
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import compile as compiling
