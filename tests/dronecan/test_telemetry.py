@@ -16,15 +16,6 @@ WARM = OperatingError.POWER_STAGE_OVERTEMP_WARNING
 HOT_NOW, WARM_NOW = (LIVE._replace(operating_errors=1 << bit) for bit in (HOT, WARM))
 
 
-@pytest.mark.parametrize(
-    ("rpm", "sent"), [("motor", 6000), ("output", 600), ("electrical", 42_000)]
-)
-def test_status_has_the_speed_that_was_chosen_and_the_index_of_the_esc(rpm: str, sent: int) -> None:
-    bench = Bench(2, first_index=3, rpm=rpm).run(0.5)
-    found = [(each.payload.esc_index, each.payload.rpm) for each in bench.of("Status")]
-    assert found[-2:] == [(3, sent), (4, sent)]
-
-
 @pytest.mark.parametrize("per_esc_nodes", [False, True])
 def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh_and_no_longer(
     per_esc_nodes: bool,
