@@ -2,16 +2,18 @@
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import PythonSlot, SlotPlan, SlotSettings
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.core import NativeCore
 
 MAX_SIGNALS = 8
 """Of a slot."""
@@ -80,7 +82,7 @@ class NativeSlot:
 
     def __init__(
         self,
-        handle: Handle,
+        core: "NativeCore",
         place: Place | None,
         esc: int,
         protocol: str,
@@ -89,7 +91,7 @@ class NativeSlot:
     ) -> None:
         self.why_python = ""
         """Why its settings are for the one in Python; empty else."""
-        self._handle = handle
+        self._core = core
         self._place = place
         self._esc = esc
         self._protocol = protocol
@@ -148,14 +150,13 @@ class NativeSlot:
 
     def _call(self, name: str, *arguments: int) -> int:
         assert self._place is not None
-        handle = self._handle
-        function = getattr(handle.library, f"kcg_slot_{name}")
-        found: int = function(handle.core, self._place.number, *arguments)
+        function = getattr(self._core.library, f"kcg_slot_{name}")
+        found: int = function(self._core.core, self._place.number, *arguments)
         return found
 
     def _write(self, settings: SlotSettings) -> bool:
         """Write the rows; False where the slot cannot be in C."""
-        plan, place, handle = settings.plan, self._place, self._handle
+        plan, place, core = settings.plan, self._place, self._core
         try:
             if place is None:
                 raise NotInCore("no room")
@@ -165,21 +166,21 @@ class NativeSlot:
             return False
         self.why_python = ""
         for number, row in enumerate(rows.signals):
-            handle.signals[place.signal + number] = row
-            signal = handle.signals[place.signal + number]
+            core.signals[place.signal + number] = row
+            signal = core.signals[place.signal + number]
             signal.first_piece += place.piece
             if row.esc == 0:
                 signal.esc = self._esc
         for number, row in enumerate(rows.pieces):
-            handle.pieces[place.piece + number] = row
-        handle.watched[place.number] = plan.watched
-        message: Any = handle.messages[place.message]
+            core.pieces[place.piece + number] = row
+        core.watched[place.number] = plan.watched
+        message: Any = core.messages[place.message]
         is_transfer, length = plan.seed is not None, plan.message.length
         message.id = settings.can_id | EXTENDED * is_transfer
         message.length, message.words = length, 1 + (length > 8)
         message.crc_at, message.data_id = settings.page, plan.seed or 0
         for word in range(2):
-            handle.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
+            core.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
         message.flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live
         message.flags |= KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
         message.triggers, message.signals = plan.triggers, len(rows.signals)
