@@ -11,8 +11,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
-from kontronik_can_gw.native.rows import NotInCore, Rows, Settings
-from kontronik_can_gw.native.settings import held_settings
+from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, held_settings
 from kontronik_can_gw.native.slots import NativeSlot, reserve
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import END_OF_TIME, Tables

@@ -89,8 +89,6 @@ class NativeSlot:
         python: PythonSlot,
         changed: Callable[[], None],
     ) -> None:
-        self.why_python = ""
-        """Why its settings are for the one in Python; empty else."""
         self._core = core
         self._place = place
         self._esc = esc
@@ -98,7 +96,7 @@ class NativeSlot:
         self._python = python
         self._changed = changed
         self._started = False
-        self._in_c = False
+        self.is_in_c = False
 
     @property
     def sent(self) -> int:
@@ -106,44 +104,40 @@ class NativeSlot:
 
     @property
     def is_news(self) -> bool:
-        return bool(self._call("is_news")) if self._in_c else self._python.is_news
+        return bool(self._call("is_news")) if self.is_in_c else self._python.is_news
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
-        was_in_c, was_in_python = self._in_c, bool(self._python.triggers)
-        self._in_c = settings is not None and self._write(settings)
-        self._python.configure(None if self._in_c else settings, now)
-        if was_in_c and not self._in_c:
+        was_in_c = self.is_in_c
+        self.is_in_c = settings is not None and self._write(settings)
+        self._python.configure(None if self.is_in_c else settings, now)
+        if was_in_c and not self.is_in_c:
             self._call("stop")
-        elif self._in_c and self._started:
+        elif self.is_in_c and self._started:
             self._call("changed" if was_in_c else "start", now)
-        if was_in_python or self._python.triggers:
-            self._changed()
+        self._changed()
 
     def start(self, now: int) -> None:
         self._started = True
         self._python.start(now)
-        if self._in_c:
+        if self.is_in_c:
             self._call("start", now)
-        if self._python.triggers:
-            self._changed()
+        self._changed()
 
     def stop(self) -> None:
         self._started = False
-        was_in_python = bool(self._python.triggers)
         self._python.stop()
-        if self._in_c:
+        if self.is_in_c:
             self._call("stop")
-        if was_in_python:
-            self._changed()
+        self._changed()
 
     def news(self, now: int) -> None:
-        if self._in_c:
+        if self.is_in_c:
             self._call("news", now)
         else:
             self._python.news(now)
 
     def send(self, now: int) -> None:
-        if self._in_c:
+        if self.is_in_c:
             self._call("send", now)
         else:
             self._python.send(now)
@@ -157,14 +151,12 @@ class NativeSlot:
     def _write(self, settings: SlotSettings) -> bool:
         """Write the rows; False where the slot cannot be in C."""
         plan, place, core = settings.plan, self._place, self._core
-        try:
-            if place is None:
-                raise NotInCore("no room")
-            rows = _rows(plan, self._protocol)
-        except NotInCore as error:
-            self.why_python = str(error)
+        if place is None:
             return False
-        self.why_python = ""
+        try:
+            rows = _rows(plan, self._protocol)
+        except NotInCore:
+            return False
         for number, row in enumerate(rows.signals):
             core.signals[place.signal + number] = row
             signal = core.signals[place.signal + number]

@@ -36,8 +36,7 @@ from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.core import NativeCore
-from kontronik_can_gw.native.rows import GATEWAY, NotInCore
-from kontronik_can_gw.native.settings import MAX_GEAR
+from kontronik_can_gw.native.rows import GATEWAY, MAX_GEAR, NotInCore
 from kontronik_can_gw.native.slots import _rows
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
@@ -291,7 +290,7 @@ class Both:
     def compare(self) -> None:
         """What came out, each time; the state of the ESCs, which keeps what is wrong, now and then."""
         frames, others = self.python.take(self.now), self.native.take(self.now)
-        if any(slot.both[1].why_python for slot in self.slots):  # type: ignore[attr-defined]
+        if any(slot.settings and not slot.both[1].is_in_c for slot in self.slots):  # type: ignore[attr-defined]
             frames.sort()  # such slots are handed over before the others
             others.sort()
         assert frames == others, _difference(frames, others)

@@ -24,7 +24,7 @@ from kontronik_can_gw.native import compile as compiling
 from kontronik_can_gw.native import load, objects
 from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import sealed
-from kontronik_can_gw.native.settings import MAX_GEAR
+from kontronik_can_gw.native.rows import MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
 
 EMPTY = Layout("", "", ())
