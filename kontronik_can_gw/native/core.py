@@ -68,7 +68,7 @@ class NativeCore:
         self.own_ids: dict[int, Owner] = own_ids(layout)
         self._slots = Slots(self.escs, self.status)
         self._followers: Sequence[Follower] = ()
-        self._choose_events()
+        self.choose_events()
         self.link_changes: list[int] = []
         self.shortest_timeout_ns = min(esc.timeout_ns for esc in escs)
         self.packs_at_once = False
@@ -102,9 +102,9 @@ class NativeCore:
     @followers.setter
     def followers(self, given: Sequence[Follower]) -> None:
         self._followers = given
-        self._choose_events()
+        self.choose_events()
 
-    def _choose_events(self) -> None:
+    def choose_events(self) -> None:
         """Be given the events that somebody in Python follows."""
         events = Event.LINK | self._slots.triggers  # which is followed here in any case
         for wanted, _ in self._followers:
@@ -115,10 +115,8 @@ class NativeCore:
         self.state.mask = events
 
     def slot(self, esc: int) -> Slot:
-        places, python = self._places[esc], self._slots.add(esc)
-        place = places.pop(0) if places else None
-        protocol = self.escs[esc].settings.protocol
-        return NativeSlot(self, place, esc, protocol, python, self._choose_events)
+        places = self._places[esc]
+        return NativeSlot(self, places.pop(0) if places else None, esc, self._slots.add(esc))
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         _check(esc, now, len(self.escs))

@@ -1,6 +1,5 @@
 """Slots of the core in C (core.h, kcg_slot_start ...): their rows in its tables, and each as its owner sees it."""
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -78,23 +77,15 @@ def _rows(plan: SlotPlan, protocol: str) -> Tables:
 
 
 class NativeSlot:
-    """As Slot: in C where it can be, else ``python`` is at work. ``changed`` is called where that may follow other events."""
+    """As Slot: in C where it can be, else ``python`` is at work."""
 
     def __init__(
-        self,
-        core: "NativeCore",
-        place: Place | None,
-        esc: int,
-        protocol: str,
-        python: PythonSlot,
-        changed: Callable[[], None],
+        self, core: "NativeCore", place: Place | None, esc: int, python: PythonSlot
     ) -> None:
         self._core = core
         self._place = place
         self._esc = esc
-        self._protocol = protocol
         self._python = python
-        self._changed = changed
         self._started = False
         self.is_in_c = False
 
@@ -114,21 +105,21 @@ class NativeSlot:
             self._call("stop")
         elif self.is_in_c and self._started:
             self._call("changed" if was_in_c else "start", now)
-        self._changed()
+        self._core.choose_events()
 
     def start(self, now: int) -> None:
         self._started = True
         self._python.start(now)
         if self.is_in_c:
             self._call("start", now)
-        self._changed()
+        self._core.choose_events()
 
     def stop(self) -> None:
         self._started = False
         self._python.stop()
         if self.is_in_c:
             self._call("stop")
-        self._changed()
+        self._core.choose_events()
 
     def news(self, now: int) -> None:
         if self.is_in_c:
@@ -154,7 +145,7 @@ class NativeSlot:
         if place is None:
             return False
         try:
-            rows = _rows(plan, self._protocol)
+            rows = _rows(plan, core.escs[self._esc].settings.protocol)
         except NotInCore:
             return False
         for number, row in enumerate(rows.signals):
