@@ -1,25 +1,135 @@
-"""What is reported of one ESC: its measurements, which the core sends while they are fresh, and the errors that begin and end."""
+"""What is reported of one ESC: its measurements, which the core sends while they are fresh, and the errors that begin and end.
+
+Measurements are plans for slots of the core. Layouts as in the DSDL. What a device does not supply is NaN, or 0 where the type has no
+such thing; what is out of range is the limit (a throttle beyond 127 %, which no ESC sends, is 0).
+"""
 
 import re
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from fractions import Fraction
+from functools import cache
+from typing import Any, NamedTuple
 
-from kontronik_can_gw.dronecan import types
-from kontronik_can_gw.dronecan.measured import fill, plans_of
-from kontronik_can_gw.dronecan.transport import LOW, message_id
-from kontronik_can_gw.esc.decoder import ErrorBit, Severity
+from kontronik_can_gw.dronecan import wire
+from kontronik_can_gw.dronecan.wire import LOW, DataType, message_id
+from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, Severity
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
-from kontronik_can_gw.esc.values import steps_of, values_of
+from kontronik_can_gw.esc.values import Group, Value, steps_of, values_of
 from kontronik_can_gw.frames import FIRST_PART, PARTS
-from kontronik_can_gw.slots import Slot, SlotSettings
+from kontronik_can_gw.signals.packer import compile_pack, place
+from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.slots import Slot, SlotPlan, SlotSettings
 
 SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
 """Key ``rpm`` of the configuration to the value that is sent."""
 _QUIET_NS = 10 * SECOND
 """A bit is logged at most this often."""
-_PARTS = re.compile(rf"\S(?:.{{0,{types.MAX_TEXT - 1}}}(?!\S)|.{{0,{types.MAX_TEXT - 1}}})")
+_PARTS = re.compile(rf"\S(?:.{{0,{wire.MAX_TEXT - 1}}}(?!\S)|.{{0,{wire.MAX_TEXT - 1}}})")
 """A text in parts that end with a word, where there is one; textwrap would be loaded for this alone."""
 _LEVELS = {Severity.ERROR: 3, Severity.WARNING: 2}
+MAX_RPM, MAX_ESC_INDEX = (1 << 17) - 1, 31
+_KELVIN = Fraction("273.15")
+_MAX_HALF, _MAX_HALF_BITS, _NAN = 65504.0, 0x7BFF, 0x7E00
+_NO_BITS = 1 << 40
+"""What of an integer is not available: 0 at its place, and like no value."""
+_UNKNOWN_MOTOR_TEMPERATURE = -256
+"""StatusExtended has no such thing: what is certainly no temperature."""
+
+
+class _Part(NamedTuple):
+    """A value in a message: from which bit on, how many; 16 are a float, 18 have a sign. Parts at one place are ORed."""
+
+    name: str
+    """Empty: the speed that the configuration chooses."""
+    at: int
+    bits: int
+    slope: Fraction = Fraction(1)
+    intercept: Fraction = Fraction(0)
+    error: int | None = None
+    """What is sent instead of what is out of range; None: the greatest number."""
+    is_cut: bool = False
+    """Its low bits are sent."""
+
+
+_ANY_HIGHER = Fraction(1, 1 << 18), Fraction(-1, 2)
+"""Of the error word: 1 where a bit from the 18th on is set."""
+_LAYOUTS: Mapping[DataType, tuple[int, tuple[int, int], Sequence[_Part]]] = {
+    # bytes, place and bits of the index, values: without the first one there is no message
+    wire.STATUS: (14, (105, 5), (
+        _Part("", 80, 18), _Part("battery_voltage", 32, 16), _Part("battery_current", 48, 16),
+        _Part("power_stage_temperature", 64, 16), _Part("output_opening", 98, 7),
+    )),
+    wire.STATUS_EXTENDED: (7, (51, 5), (
+        _Part("output_opening", 7, 7), _Part("throttle", 0, 7, error=0), _Part("throttle", 0, 7, Fraction(-1), error=0),
+        _Part("operating_errors", 32, 19, is_cut=True), _Part("operating_errors", 48, 1, *_ANY_HIGHER),
+    )),
+    wire.CIRCUIT_STATUS: (7, (0, 16), (
+        _Part("bec_voltage", 16, 16), _Part("bec_current", 32, 16),
+        _Part("bec_overcurrent", 53, 1), _Part("bec_undervoltage", 54, 1), _Part("bec_overvoltage", 55, 1),
+    )),
+    wire.TEMPERATURE: (5, (0, 16), (_Part("bec_temperature", 16, 16), _Part("bec_overtemperature", 39, 1))),
+}  # fmt: skip
+
+
+@cache
+def plans_of(protocol: EscProtocol, speed: str) -> Mapping[DataType, SlotPlan]:
+    """Of what an ESC of this protocol supplies; ``speed``: the value that is sent as rpm."""
+    values, found = values_of(protocol), {}
+    for kind, (length, _, parts) in _LAYOUTS.items():
+        signals = tuple(_signal(part, values[part.name or speed]) for part in parts)
+        if signals[0].source is None or not signals[0].source.supplied:
+            continue
+        plan = MessagePlan(
+            *("transfer", 0, True, False, length, SendType.EVENT, 0, 0, signals),
+            *(frozenset({0}), frozenset({Group.LIVE})),
+        )
+        pack = compile_pack(plan)
+        found[kind] = SlotPlan(plan, pack, Event.LIVE, 0, None, False, "", kind.seed, True)
+    return found
+
+
+def fill(kind: DataType, index: int, errors: int) -> int:
+    """The bits of a message that are no value of the ESC. ``errors``: since the motor was started."""
+    found = place(pieces(*_LAYOUTS[kind][1]), index)
+    if kind is wire.STATUS:
+        found |= errors & 0xFFFF_FFFF
+    elif kind is wire.STATUS_EXTENDED:
+        found |= place(pieces(14, 9), _UNKNOWN_MOTOR_TEMPERATURE)
+    return found
+
+
+def pieces(at: int, bits: int) -> tuple[Piece, ...]:
+    """Where a number is, from bit ``at`` of the message on: its low byte first, in each byte the most significant bit."""
+    whole = 0 if at % 8 else bits // 8 * 8
+    found = [Piece(0, whole, at)] if whole else []
+    at += whole
+    for shift in range(whole, bits, 8):
+        left = min(8, bits - shift)
+        while left:
+            width = min(left, 8 - at % 8)
+            left -= width
+            found.append(Piece(shift + left, width, at // 8 * 8 + 8 - at % 8 - width))
+            at += width
+    return tuple(found)
+
+
+def _signal(part: _Part, value: Value) -> SignalPlan:
+    is_float, signed = part.bits == 16, part.bits == 18
+    intercept, not_available, error = part.intercept, _NO_BITS, part.error
+    high = 0xFFFF_FFFF if part.is_cut else (1 << part.bits - signed) - 1
+    if is_float:
+        not_available, error = _NAN, _MAX_HALF_BITS
+        intercept = _KELVIN if value.unit == "°C" else intercept
+    return SignalPlan(
+        *(part.name, value.unit, Role.SOURCE, high.bit_length() + signed, signed, is_float),
+        *(pieces(part.at, part.bits), -high - 1 if signed else 0, high),
+        *(not_available, high if error is None else error),
+        slope=part.slope / value.per_unit,
+        intercept=intercept,
+        source=value,
+        esc=0,
+        limits=(-_MAX_HALF, _MAX_HALF),
+    )
 
 
 class EscReport:
@@ -29,13 +139,13 @@ class EscReport:
         self.esc = esc
         self.index = index
         self._rates = {
-            types.STATUS: table.rate_hz,
-            types.STATUS_EXTENDED: table.extended_hz,
-            types.CIRCUIT_STATUS: 1,
-            types.TEMPERATURE: 1,
+            wire.STATUS: table.rate_hz,
+            wire.STATUS_EXTENDED: table.extended_hz,
+            wire.CIRCUIT_STATUS: 1,
+            wire.TEMPERATURE: 1,
         }
         self._plans = plans_of(esc.protocol, SPEEDS[table.rpm])
-        self._slots: dict[types.DataType, Slot] = {}
+        self._slots: dict[wire.DataType, Slot] = {}
         self._node_id = self._page = 0
         values = values_of(esc.protocol)
         self._word, self._speed = values["operating_errors"], values["electrical_speed"]
@@ -70,7 +180,7 @@ class EscReport:
     @property
     def status_sent(self) -> int:
         """esc.Status so far."""
-        slot = self._slots.get(types.STATUS)
+        slot = self._slots.get(wire.STATUS)
         return 0 if slot is None else slot.sent
 
     def _configure(self, now: int) -> None:
@@ -95,9 +205,9 @@ class EscReport:
         """Of the ESC, as NodeStatus has it."""
         word = self.word
         if word & self._errors:
-            return types.ERROR
+            return wire.ERROR
         is_well = self.esc.up and not any(word >> bit & 1 for bit in self._bits)
-        return types.OK if is_well else types.WARNING
+        return wire.OK if is_well else wire.WARNING
 
     def follow(self, events: int, now: int) -> None:
         """Count errors that begin; not those of the link's return, which may be old. ``events``: bits of Event, or each second none."""
@@ -136,6 +246,6 @@ class EscReport:
         if not begins:
             level, text = 1, f"{name}: over: {bit.meaning}"
         source = name.encode("ascii", "replace")
-        head = types.LOG_MESSAGE.pack(level << 5 | len(source)) + source
+        head = wire.LOG_MESSAGE.pack(level << 5 | len(source)) + source
         for part in _PARTS.findall(text):
             yield head + part.encode("ascii", "replace")

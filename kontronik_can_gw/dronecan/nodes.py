@@ -1,27 +1,128 @@
-"""The DroneCAN output: the gateway's node, or one for each ESC, on one bus."""
+"""The DroneCAN output: the gateway's node, or one for each ESC, on one bus; what a node says of itself, what it answers."""
 
+import struct
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.dronecan import types
+from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.allocation import Allocation
 from kontronik_can_gw.dronecan.esc_report import EscReport
-from kontronik_can_gw.dronecan.node import SERVICES, Node
-from kontronik_can_gw.dronecan.transport import LOWEST, NODE, REQUEST, SERVICE, Assembler
+from kontronik_can_gw.dronecan.wire import NODE, REQUEST, SERVICE, Assembler, DataType
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.output import NEVER, Output, Owner
-from kontronik_can_gw.signals.transfer import TRANSFER_ID
+from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
 from kontronik_can_gw.slots import Slot
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.dronecan.setup import DronecanSetup
+    from kontronik_can_gw.dronecan.setup import DronecanSetup, NodeSetup
 
+SERVICES = {kind.number: kind for kind in (wire.GET_NODE_INFO, wire.RESTART_NODE, wire.GET_SET)}
+_HARDWARE = (1, 0)
+_VALUE_SIZES = (0, 8, 4, 1)
+"""Bytes of a parameter's value by the tag of its union: none, integer, real, boolean."""
+_STRING = 4
+Parameter = int | float | str
 MAX_ANSWERS = 50
 """Requests that are answered in a second: nobody keeps the bus busy by asking."""
 _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
 """Ids of Allocation messages: of an allocator, of others that ask."""
+
+
+class Node:
+    """``node_id`` 0: it waits for one, and says nothing."""
+
+    def __init__(
+        self, setup: "NodeSetup", of_all: "DronecanSetup", reports: Sequence[EscReport]
+    ) -> None:
+        self.setup = setup
+        self.node_id = setup.node_id
+        self.reports = [reports[number] for number in setup.escs]
+        self.is_duplicate = False
+        """Another device sends with this node-ID."""
+        self._table = of_all.given.table
+        self._version = of_all.given.version
+        self._transfer_ids: dict[int, int] = {}
+
+    def start(self, now: int) -> None:
+        """It has its node-ID: let the core send what its ESCs measure."""
+        for place, report in enumerate(self.reports):
+            report.start(self.node_id, place, now)
+
+    def message(
+        self, kind: DataType, payload: bytes, queued: bool = False, priority: int = wire.LOW
+    ) -> list[CanFrame]:
+        """The frames of a message to all. ``queued`` as in CanFrame."""
+        count = self._transfer_ids.get(kind.number, 0)
+        self._transfer_ids[kind.number] = count + 1 & TRANSFER_ID
+        can_id = wire.message_id(kind.number, self.node_id, priority)
+        return transfer(can_id, kind.seed, payload, count, queued)
+
+    def status(self, uptime_s: int, mode: int, bus_is_well: bool) -> bytes:
+        """NodeStatus. The ESCs' health counts by choice only: an autopilot does not arm beside a node that is not well."""
+        health = wire.OK if bus_is_well and not self.is_duplicate else wire.WARNING
+        code = 0
+        for report in self.reports:
+            code |= report.word
+            if self._table.health == "esc":
+                health = max(health, report.health)
+        return wire.NODE_STATUS.pack(uptime_s & 0xFFFFFFFF, health << 6 | mode << 3, code & 0xFFFF)
+
+    def answer(
+        self, request_id: int, kind: DataType, request: bytes, transfer_id: int, status: bytes
+    ) -> list[CanFrame]:
+        """The response; empty to what is no request. ``request_id``: its CAN id; ``status``: the NodeStatus of now."""
+        if kind is wire.GET_NODE_INFO:
+            versions = *self._version, 0, 0, 0, *_HARDWARE
+            answer = wire.GET_NODE_INFO.pack(status, *versions, self.setup.unique_id, 0)
+            answer += self.setup.name.encode("ascii")
+        elif kind is wire.GET_SET:
+            answer = _get_set(request, self._parameters())
+        else:
+            answer = wire.RESTART_NODE.pack(False)
+        if not answer:
+            return []
+        return transfer(wire.response_id(request_id), kind.seed, answer, transfer_id, True)
+
+    def _parameters(self) -> dict[str, Parameter]:
+        table = self._table
+        found: dict[str, Parameter]
+        found = {name: getattr(table, name) for name in ("rate_hz", "extended_hz", "rpm")}
+        for report in self.reports:
+            esc, name = report.esc, report.esc.settings.name
+            found[f"{name}.esc_index"] = report.index
+            found[f"{name}.pole_pairs"] = esc.pole_pairs
+            gear = esc.output_divisor / (esc.pole_pairs * esc.gear_denominator)
+            found[f"{name}.gear"] = gear
+        return found
+
+
+def _get_set(request: bytes, parameters: dict[str, Parameter]) -> bytes:
+    """The response of param.GetSet: the parameter that is named, else that of the index; nobody sets one. Empty to what is no request."""
+    if len(request) < 2:
+        return b""
+    index, tag = request[0] | request[1] >> 3 << 8, request[1] & 7
+    if tag == _STRING:
+        start = 3 + int.from_bytes(request[2:3])
+    else:
+        start = 2 + _VALUE_SIZES[tag] if tag < _STRING else len(request) + 1
+    if len(request) < start:
+        return b""
+    name = request[start:].decode("latin-1")
+    if not name:
+        name = next(iter([*parameters][index : index + 1]), "")
+    value = parameters.get(name)
+    # without a default and limits: nobody can set it
+    if value is None:
+        return bytes(4)
+    if isinstance(value, str):
+        packed = bytes((_STRING, len(value))) + value.encode("ascii")
+    else:
+        packed = struct.pack(
+            "<Bq" if isinstance(value, int) else "<Bf", 2 - isinstance(value, int), value
+        )
+    return packed + bytes(3) + name.encode("ascii")
 
 
 class Dronecan(Output):
@@ -63,7 +164,7 @@ class Dronecan(Output):
         for report in self._reports:
             report.stop()
         for node in self._by_id.values():
-            self._say_node_status(node, now, types.OFFLINE)
+            self._say_node_status(node, now, wire.OFFLINE)
 
     def can_returned(self, now: int) -> None:
         self._log_anew()
@@ -99,7 +200,7 @@ class Dronecan(Output):
         source = can_id & NODE
         if not can_id & SERVICE:
             number = can_id >> 8 & (0xFFFF if source else 3)
-            if number == types.ALLOCATION.number and self._allocation.due != NEVER:
+            if number == wire.ALLOCATION.number and self._allocation.due != NEVER:
                 self._take_allocation(frame, source, now)
             return
         node, kind = self._by_id.get(can_id >> 8 & NODE), SERVICES.get(can_id >> 16 & 0xFF)
@@ -154,17 +255,17 @@ class Dronecan(Output):
             self._say_node_status(node, now)
             for report in node.reports if self._table.log_messages else ():
                 for message in report.log(now):
-                    self.frames += node.message(types.LOG_MESSAGE, message, queued=True)
+                    self.frames += node.message(wire.LOG_MESSAGE, message, queued=True)
 
     def _log_anew(self) -> None:
         for report in self._reports:
             report.log_anew()
 
-    def _say_node_status(self, node: Node, now: int, mode: int = types.OPERATIONAL) -> None:
+    def _say_node_status(self, node: Node, now: int, mode: int = wire.OPERATIONAL) -> None:
         status = self._status_of(node, now, mode)
-        self.frames += node.message(types.NODE_STATUS, status, priority=LOWEST)
+        self.frames += node.message(wire.NODE_STATUS, status, priority=wire.LOWEST)
 
-    def _status_of(self, node: Node, now: int, mode: int = types.OPERATIONAL) -> bytes:
+    def _status_of(self, node: Node, now: int, mode: int = wire.OPERATIONAL) -> bytes:
         bus_is_well = self._gateway.can_state not in (CanState.ERROR_PASSIVE, CanState.BUS_OFF)
         return node.status((now - self._gateway.started_ns) // SECOND, mode, bus_is_well)
 
@@ -177,7 +278,7 @@ class Dronecan(Output):
         self._follow_ids()
 
     def _take_allocation(self, frame: CanFrame, source: int, now: int) -> None:
-        payload = self._assembler.receive(frame.can_id, frame.data, types.ALLOCATION.seed, now)
+        payload = self._assembler.receive(frame.can_id, frame.data, wire.ALLOCATION.seed, now)
         if payload is None:
             return
         node_id = self._allocation.receive(source, payload, set(self._by_id), now)

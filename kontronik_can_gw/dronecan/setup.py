@@ -5,10 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from kontronik_can_gw.dronecan.esc_report import SPEEDS
-from kontronik_can_gw.dronecan.measured import MAX_ESC_INDEX, MAX_RPM
+from kontronik_can_gw.dronecan.esc_report import MAX_ESC_INDEX, MAX_RPM, SPEEDS
 from kontronik_can_gw.dronecan.nodes import Dronecan
-from kontronik_can_gw.dronecan.transport import MAX_NODE_ID, NODE
+from kontronik_can_gw.dronecan.wire import MAX_NODE_ID, NODE
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import id_block

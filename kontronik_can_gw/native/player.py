@@ -9,12 +9,10 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 from kontronik_can_gw.esc.decoder import Counters
-from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows
-from kontronik_can_gw.native.state import NativeEsc
-from kontronik_can_gw.native.tables import Tables, bind, places_of
+from kontronik_can_gw.native.tables import bind, places_of
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals.plan import Layout
 
@@ -128,9 +126,9 @@ class Player(Output):
 
     def set_bytes(self, period_ns: int) -> None:
         """Times: a live frame each ``period_ns``."""
-        tables = Tables(Layout("", "", ()), [self._settings])
-        self._finder = Handle(self._library, tables, 0, lambda *_: None)
-        self._finder.report_only(0)
+        layout = Layout("", "", ())
+        self._finder = NativeCore(self._library, [self._settings], layout, 0, False)
+        self._finder.state.mask = 0  # no events
         self._state.finder = self._finder.core
         self._state.period = period_ns
 
@@ -150,7 +148,7 @@ class Player(Output):
     @property
     def counters(self) -> Counters:
         """Of what found the frames."""
-        return NativeEsc(self._settings, self._finder.esc_states[0]).counters
+        return self._finder.escs[0].counters
 
     # --- what came of it
 

@@ -1,17 +1,18 @@
 """Slots of the core in C (core.h, kcg_slot_start ...): their rows in its tables, and each as its owner sees it."""
 
-from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.native.binding import Handle
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.slots import PythonSlot, SlotPlan, SlotSettings
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.native.core import NativeCore
 
 MAX_SIGNALS = 8
 """Of a slot."""
@@ -76,27 +77,17 @@ def _rows(plan: SlotPlan, protocol: str) -> Tables:
 
 
 class NativeSlot:
-    """As Slot: in C where it can be, else ``python`` is at work. ``changed`` is called where that may follow other events."""
+    """As Slot: in C where it can be, else ``python`` is at work."""
 
     def __init__(
-        self,
-        handle: Handle,
-        place: Place | None,
-        esc: int,
-        protocol: str,
-        python: PythonSlot,
-        changed: Callable[[], None],
+        self, core: "NativeCore", place: Place | None, esc: int, python: PythonSlot
     ) -> None:
-        self.why_python = ""
-        """Why its settings are for the one in Python; empty else."""
-        self._handle = handle
+        self._core = core
         self._place = place
         self._esc = esc
-        self._protocol = protocol
         self._python = python
-        self._changed = changed
         self._started = False
-        self._in_c = False
+        self.is_in_c = False
 
     @property
     def sent(self) -> int:
@@ -104,82 +95,75 @@ class NativeSlot:
 
     @property
     def is_news(self) -> bool:
-        return bool(self._call("is_news")) if self._in_c else self._python.is_news
+        return bool(self._call("is_news")) if self.is_in_c else self._python.is_news
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
-        was_in_c, was_in_python = self._in_c, bool(self._python.triggers)
-        self._in_c = settings is not None and self._write(settings)
-        self._python.configure(None if self._in_c else settings, now)
-        if was_in_c and not self._in_c:
+        was_in_c = self.is_in_c
+        self.is_in_c = settings is not None and self._write(settings)
+        self._python.configure(None if self.is_in_c else settings, now)
+        if was_in_c and not self.is_in_c:
             self._call("stop")
-        elif self._in_c and self._started:
+        elif self.is_in_c and self._started:
             self._call("changed" if was_in_c else "start", now)
-        if was_in_python or self._python.triggers:
-            self._changed()
+        self._core.choose_events()
 
     def start(self, now: int) -> None:
         self._started = True
         self._python.start(now)
-        if self._in_c:
+        if self.is_in_c:
             self._call("start", now)
-        if self._python.triggers:
-            self._changed()
+        self._core.choose_events()
 
     def stop(self) -> None:
         self._started = False
-        was_in_python = bool(self._python.triggers)
         self._python.stop()
-        if self._in_c:
+        if self.is_in_c:
             self._call("stop")
-        if was_in_python:
-            self._changed()
+        self._core.choose_events()
 
     def news(self, now: int) -> None:
-        if self._in_c:
+        if self.is_in_c:
             self._call("news", now)
         else:
             self._python.news(now)
 
     def send(self, now: int) -> None:
-        if self._in_c:
+        if self.is_in_c:
             self._call("send", now)
         else:
             self._python.send(now)
 
     def _call(self, name: str, *arguments: int) -> int:
         assert self._place is not None
-        handle = self._handle
-        function = getattr(handle.library, f"kcg_slot_{name}")
-        found: int = function(handle.core, self._place.number, *arguments)
+        function = getattr(self._core.library, f"kcg_slot_{name}")
+        found: int = function(self._core.core, self._place.number, *arguments)
         return found
 
     def _write(self, settings: SlotSettings) -> bool:
         """Write the rows; False where the slot cannot be in C."""
-        plan, place, handle = settings.plan, self._place, self._handle
-        try:
-            if place is None:
-                raise NotInCore("no room")
-            rows = _rows(plan, self._protocol)
-        except NotInCore as error:
-            self.why_python = str(error)
+        plan, place, core = settings.plan, self._place, self._core
+        if place is None:
             return False
-        self.why_python = ""
+        try:
+            rows = _rows(plan, core.escs[self._esc].settings.protocol)
+        except NotInCore:
+            return False
         for number, row in enumerate(rows.signals):
-            handle.signals[place.signal + number] = row
-            signal = handle.signals[place.signal + number]
+            core.signals[place.signal + number] = row
+            signal = core.signals[place.signal + number]
             signal.first_piece += place.piece
             if row.esc == 0:
                 signal.esc = self._esc
         for number, row in enumerate(rows.pieces):
-            handle.pieces[place.piece + number] = row
-        handle.watched[place.number] = plan.watched
-        message: Any = handle.messages[place.message]
+            core.pieces[place.piece + number] = row
+        core.watched[place.number] = plan.watched
+        message: Any = core.messages[place.message]
         is_transfer, length = plan.seed is not None, plan.message.length
         message.id = settings.can_id | EXTENDED * is_transfer
         message.length, message.words = length, 1 + (length > 8)
         message.crc_at, message.data_id = settings.page, plan.seed or 0
         for word in range(2):
-            handle.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
+            core.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
         message.flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live
         message.flags |= KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
         message.triggers, message.signals = plan.triggers, len(rows.signals)

@@ -23,14 +23,16 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
     GATEWAY,
+    MAX_GEAR,
+    MAX_POLES,
     Message,
     NotInCore,
     Pair,
     Piece,
     Rows,
     Signal,
+    settings_of,
 )
-from kontronik_can_gw.native.settings import MAX_GEAR, MAX_POLES, settings_of
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 

@@ -31,7 +31,6 @@ class Turns:
         for esc, one in enumerate(self.inputs):
             one.esc, one.undrained_ns = esc, NEVER
         self.state = _Turns(core=core, inputs=c.addressof(self.inputs), epoll=-1)
-        assert library.kcg_turns_size() == c.sizeof(self.state)
         self._address = address = c.byref(self.state)
         self._watch = library.kcg_watch
         self.begin = partial(library.kcg_begin, address)

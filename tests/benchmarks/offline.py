@@ -135,14 +135,14 @@ def plain_bytes(context: Context) -> list[Figure]:
 def scan(source: Path) -> float:
     """CPU seconds that the core in C needs to find all frames."""
     from kontronik_can_gw.esc.telemetry import EscSettings
-    from kontronik_can_gw.native.binding import Handle, load
+    from kontronik_can_gw.native.binding import load
+    from kontronik_can_gw.native.core import NativeCore
     from kontronik_can_gw.native.objects import shared_object
-    from kontronik_can_gw.native.tables import Tables
     from kontronik_can_gw.signals.plan import Layout
 
     data, escs = source.read_bytes(), [EscSettings("esc1")]
-    core = Handle(load(shared_object()), Tables(Layout("", "", ()), escs), 0, lambda *_: None)
-    core.report_only(0)
+    core = NativeCore(load(shared_object()), escs, Layout("", "", ()), 0, False)
+    core.state.mask = 0  # no events
     begun = time.process_time()
     for at in range(0, len(data), 16384):
         core.receive(0, data[at : at + 16384], 0, 0)

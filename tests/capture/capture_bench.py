@@ -12,8 +12,8 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState

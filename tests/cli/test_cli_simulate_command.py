@@ -9,17 +9,12 @@ from pathlib import Path
 import pytest
 from command_line import refused, run
 
-from kontronik_can_gw.esc.kontronik import (
-    Deframer,
-    Device,
-    Frame,
-    InfoData,
-    Layout,
-    LiveData,
-    OperatingError,
-)
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.deframer import Deframer, Frame
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
 

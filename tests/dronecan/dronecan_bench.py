@@ -7,15 +7,15 @@ from typing import Any
 
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.esc.kontronik import Device, InfoData, LiveData, codec, encode
-from kontronik_can_gw.esc.kontronik.fields import device_and_variant
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway import Gateway
 
 dronecan: Any = import_module("dronecan")
 """The package; for mypy this folder has its name."""
-transport, CANFrame = dronecan.transport, dronecan.driver.common.CANFrame
+transport = dronecan.transport
 START = 777 * SECOND + 5
 LIVE = LiveData(
     electrical_speed=42_000,
@@ -57,7 +57,9 @@ class Transfer:
     at: int
     source: int
     payload: Any
-    to: int | None = None
+    to: int | None
+    number: int
+    """Its transfer id."""
 
     @property
     def name(self) -> str:
@@ -88,7 +90,8 @@ class Reader:
             return None
         found = transport.Transfer()
         found.from_frames(self._begun.pop(frame.can_id))  # checks order, toggle and CRC
-        return Transfer(at, found.source_node_id, found.payload, found.dest_node_id)
+        of = found.source_node_id, found.payload, found.dest_node_id, found.transfer_id
+        return Transfer(at, *of)
 
 
 class Bench:
@@ -114,13 +117,15 @@ class Bench:
     def output(self) -> Any:
         return next(each for each in self.gateway.outputs if each.name == "dronecan")
 
-    def info(self, esc: int, device: Device) -> None:
-        """An info frame of this device."""
-        self.hear(InfoData(device_and_variant=device_and_variant(device, 1)), esc)
+    @property
+    def nodes(self) -> list[Any]:
+        """What is reported of each node."""
+        found: list[Any] = self.output.facts()["nodes"]
+        return found
 
     def hear(self, data: LiveData | InfoData, esc: int = 0) -> None:
         """A frame of an ESC."""
-        self.gateway.receive_bytes(esc, encode(data, codec.Layout.V4), self.now, self.now)
+        self.gateway.receive_bytes(esc, encode(data, Layout.V4), self.now, self.now)
 
     def take(self) -> None:
         for frame in self.gateway.take_frames(self.now):
@@ -154,79 +159,36 @@ class Bench:
         self.gateway.advance(self.now)
         self.take()
 
+    def ask(self, request: Any, to: int = 42) -> Any:
+        """The answer to a foreign node's request; None for none."""
+        self.receive(*peers_frames(request, 100, to, transfer_id=7))
+        answers = [each for each in self.read if each.to == 100]
+        self.read = [each for each in self.read if each.to != 100]
+        assert {each.number for each in answers} <= {7}
+        return answers[-1].payload if answers else None
+
     def of(self, name: str, source: int | None = None) -> list[Transfer]:
         """Transfers of a type so far."""
         return [each for each in self.read if each.name == name and source in (None, each.source)]
 
-    def intervals(self, name: str, esc: int | None = None) -> list[int]:
-        """Between transfers of a type, of one ESC where they have its index."""
-        found = [e.at for e in self.of(name) if esc is None or e.payload.esc_index == esc]
-        return [after - before for before, after in pairwise(found)]
+    def intervals(self, name: str) -> set[int]:
+        """Between transfers of a type."""
+        return {after.at - before.at for before, after in pairwise(self.of(name))}
 
     def clear(self) -> None:
         self.read.clear()
         self.frames.clear()
 
 
-class BenchDriver(dronecan.driver.common.AbstractDriver):  # type: ignore[misc]
-    """The bus of a bench, for a node of the package ``dronecan``: its frames go to the gateway at once, and come back when it spins."""
-
-    def __init__(self, bench: Bench) -> None:
-        super().__init__()
-        self._bench = bench
-        self._seen = 0
-
-    def close(self) -> None:
-        pass
-
-    def receive(self, timeout: float | None = None) -> Any:
-        frames = self._bench.frames
-        while self._seen < len(frames):
-            frame = frames[self._seen][1]
-            self._seen += 1
-            if frame.extended:
-                return CANFrame(frame.can_id, frame.data, True)
-        return None
-
-    def send(self, message_id: int, message: bytes, extended: bool = False, **_: object) -> None:
-        self.send_frame(CANFrame(message_id, message, extended))
-
-    def send_frame(self, frame: Any) -> None:
-        self._bench.receive(CanFrame(frame.id, bytes(frame.data), frame.extended))
-
-
-class Peer:
-    """A node of the package ``dronecan`` on the bench's bus."""
-
-    def __init__(self, bench: Bench, node_id: int = 100) -> None:
-        self.bench = bench
-        self.driver = BenchDriver(bench)
-        self.node = dronecan.node.Node(self.driver, node_id=node_id)
-
-    def spin(self) -> None:
-        """Take what has come; timers of the package itself run by the wall clock, and do not matter here."""
-        for _ in range(3):
-            self.node.spin(timeout=0)
-
-    def ask(self, request: Any, to: int) -> Any:
-        """The response; None without one."""
-        answers: list[Any] = []
-        self.node.request(request, to, lambda event: answers.append(event and event.response))
-        self.bench.run(0.001)
-        self.spin()
-        return answers[0] if answers else None
-
-
 def peers_frames(payload: Any, source: int, to: int | None = None, **more: Any) -> list[CanFrame]:
     """The frames of a transfer as the package makes them."""
+    is_service = to is not None
     made = transport.Transfer(
         payload=payload,
         source_node_id=source,
         dest_node_id=to,
-        transfer_priority=more.get("priority", 24),
-        transfer_id=more.get("transfer_id", 1),
-        request_not_response=to is not None,
-        service_not_message=to is not None,
-        discriminator=more.get("discriminator"),
+        request_not_response=is_service,
+        service_not_message=is_service,
+        **{"transfer_priority": 24, "transfer_id": 1} | more,
     )
     return [CanFrame(each.message_id, bytes(each.bytes), True) for each in made.to_frames()]

@@ -6,7 +6,7 @@ import subprocess
 
 import dronecan_bench
 import pytest
-from dronecan_bench import LIVE, Bench, Peer
+from dronecan_bench import LIVE, Bench
 from foreign_tools import PACKAGES, need
 
 READER = PACKAGES / "dronecan_reader" / "release" / "dronecan-reader"
@@ -29,14 +29,14 @@ def test_the_crate_reads_what_the_package_reads() -> None:
                 operating_errors=1 << turn % 20,
             )
         bench.run(0.1)
-    assert Peer(bench).ask(protocol.GetNodeInfo.Request(), 42) is not None
-    for number in range(16):
-        assert Peer(bench).ask(protocol.param.GetSet.Request(index=number), 42) is not None
+    requests = [protocol.param.GetSet.Request(index=number) for number in range(16)]
+    for request in (protocol.GetNodeInfo.Request(), *requests):
+        assert bench.ask(request) is not None
     lines = "".join(f"{f.can_id:X}#{f.data.hex()}\n" for _, f in bench.frames if f.extended)
     done = subprocess.run([READER], input=lines, capture_output=True, text=True, check=True)
     found = [line.split() for line in done.stdout.splitlines()]
     assert not [each for each in found if each[0] == "error"]
-    assert len(found) == len(bench.read)
+    assert len(found) == len(bench.read) + 17
     assert {each[4] for each in found} == {"true"}  # each CRC is right
     assert {(each[0], each[2]) for each in found} == {("message", "42"), ("response", "42")}
     assert sum(each[0] == "response" for each in found) == 17

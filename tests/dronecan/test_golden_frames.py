@@ -2,6 +2,7 @@
 
 import random
 import struct
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -9,12 +10,12 @@ from dronecan_bench import Reader, dronecan, peers_frames
 from packer_oracle import random_live
 
 from kontronik_can_gw.core import PythonCore
-from kontronik_can_gw.dronecan import types
-from kontronik_can_gw.dronecan.measured import fill, plans_of
-from kontronik_can_gw.dronecan.transport import Assembler, message_id, response_id
-from kontronik_can_gw.dronecan.types import DataType
-from kontronik_can_gw.esc.kontronik import LiveData, encode
+from kontronik_can_gw.dronecan import wire
+from kontronik_can_gw.dronecan.esc_report import fill, plans_of
+from kontronik_can_gw.dronecan.wire import Assembler, DataType, message_id, response_id
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
@@ -58,6 +59,13 @@ class Measuring:
             frames: list[CanFrame] = self.core.take(self.now)
         return frames
 
+    def read(self, live: LiveData, index: int, errors: int = 0) -> Any:
+        """The message, as the package reads it."""
+        reader = Reader()
+        found = [reader.read(0, frame) for frame in self.sent(live, index, errors)][-1]
+        assert found is not None
+        return found.payload
+
 
 pure = pytest.mark.parametrize("is_pure", [True, False])
 
@@ -66,24 +74,22 @@ pure = pytest.mark.parametrize("is_pure", [True, False])
 def test_golden_messages(is_pure: bool) -> None:
     """Made by another implementation, of node 42, with transfer id 5."""
     live = LiveData(6303, 2423, 473, power_stage_temperature=30, output_opening=42)
-    assert shown(Measuring(types.STATUS, is_pure).sent(live, 3, 7, turns=6)) == (
+    assert shown(Measuring(wire.STATUS, is_pure).sent(live, 3, 7, turns=6)) == (
         "10040A2A#A1F1070000000F85 #4EEA51BD5C9F1825 #150C45"
     )
     live = LiveData(throttle=-50, output_opening=48, operating_errors=0x12345)
-    extended = Measuring(types.STATUS_EXTENDED, is_pure).sent(live, 3, turns=6)
+    extended = Measuring(wire.STATUS_EXTENDED, is_pure).sent(live, 3, turns=6)
     assert shown(extended) == "10040C2A#64C00200452323C5"
-    state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
-    frames = transfer(
-        message_id(types.NODE_STATUS.number, 42, 24), types.NODE_STATUS.seed, state, 5
-    )
+    state = wire.NODE_STATUS.pack(100, wire.OK << 6 | wire.OPERATIONAL << 3, 0xBEEF)
+    frames = transfer(message_id(wire.NODE_STATUS.number, 42, 24), wire.NODE_STATUS.seed, state, 5)
     assert shown(frames) == "1801552A#6400000000EFBEC5"
 
 
 def test_a_golden_answer() -> None:
-    state = types.NODE_STATUS.pack(100, types.OK << 6 | types.OPERATIONAL << 3, 0xBEEF)
-    info = types.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
+    state = wire.NODE_STATUS.pack(100, wire.OK << 6 | wire.OPERATIONAL << 3, 0xBEEF)
+    info = wire.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
     request = 0x10018000 | 42 << 8 | 0x80 | 10
-    answer = transfer(response_id(request), types.GET_NODE_INFO.seed, info, 5)
+    answer = transfer(response_id(request), wire.GET_NODE_INFO.seed, info, 5)
     assert shown(answer) == (
         "10010AAA#6A76640000000085 #EFBE010200000025 #0000000000000005 #0000000304010225 #0304050607080905"
         " #0A0B0C0D0E0F1025 #006F72672E657805 #616D706C652E6525 #736345"
@@ -96,70 +102,66 @@ def half(value: float) -> float:
     return found
 
 
-def read(frames: list[CanFrame]) -> Any:
-    reader = Reader()
-    found = [reader.read(0, frame) for frame in frames][-1]
-    assert found is not None
-    return found.payload
-
-
 @pure
 def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
     rng = random.Random(1)
-    status, extended = (Measuring(k, is_pure) for k in (types.STATUS, types.STATUS_EXTENDED))
+    status, extended = (Measuring(k, is_pure) for k in (wire.STATUS, wire.STATUS_EXTENDED))
     for _ in range(500):
         live = random_live(rng)
         live = live._replace(throttle=max(-127, live.throttle))
         index, errors = rng.randrange(32), rng.choice((0, 1, 300, (1 << 32) - 1))
-        got = read(status.sent(live, index, errors))
+        got = status.read(live, index, errors)
         volts, amperes = live.battery_voltage / 100, live.battery_current / 10
         kelvin = live.power_stage_temperature + 273.15
         found = (got.error_count, got.voltage, got.current, got.temperature, got.esc_index)
         assert found == (errors, half(volts), half(amperes), half(kelvin), index)
         assert got.rpm == min(live.electrical_speed, 131_071)
         assert got.power_rating_pct == min(live.output_opening, 127)
-        got, word = read(extended.sent(live, index)), live.operating_errors
+        got, word = extended.read(live, index), live.operating_errors
         assert got.input_pct == abs(live.throttle)
         assert got.output_pct == min(live.output_opening, 127)
         assert (got.motor_temperature_degC, got.motor_angle, got.esc_index) == (-256, 0, index)
         assert got.status_flags == word & 0x3FFFF | (word > 0x3FFFF) << 18
 
 
+def request(source: int, name: bytes, number: int = 1) -> list[CanFrame]:
+    made = protocol.param.GetSet.Request(index=source)
+    made.name.from_bytes(name)
+    return peers_frames(made, source, to=42, transfer_id=number)
+
+
+def received(frames: Iterable[CanFrame], pause_ns: int = 0) -> list[bytes]:
+    """What comes of frames, each of which comes so long after the one before."""
+    assembler = Assembler()
+    seed = wire.GET_SET.seed
+    found = [
+        assembler.receive(frame.can_id, frame.data, seed, number * pause_ns)
+        for number, frame in enumerate(frames)
+    ]
+    return [each for each in found if each is not None]
+
+
 def test_transfers_of_the_package_are_put_together_however_they_are_mixed() -> None:
     """Transfers of several nodes with frames in between, some doubled; each comes out once, whole."""
-    rng, assembler = random.Random(2), Assembler()
+    rng = random.Random(2)
     wanted: list[bytes] = []
-    found: list[bytes] = []
+    mixed: list[CanFrame] = []
     streams: list[list[CanFrame]] = []
     for source in range(1, 30):
-        request = protocol.param.GetSet.Request(index=source)
-        request.name.from_bytes(rng.randbytes(rng.randrange(93)))
-        made = peers_frames(request, source, to=42, transfer_id=rng.randrange(32))
+        made = request(source, rng.randbytes(rng.randrange(93)), rng.randrange(32))
         data = b"".join(frame.data[:-1] for frame in made)
         wanted.append(data if len(made) == 1 else data[2:])
         streams.append(made)
     while streams:
         stream = rng.choice(streams)
         frame = stream.pop(0)
-        for _ in range(rng.choice([1, 1, 2]) if len(frame.data) == 8 else 1):
-            whole = assembler.receive(frame.can_id, frame.data, types.GET_SET.seed, 0)
-            found += [] if whole is None else [whole]
+        mixed += [frame] * (rng.choice([1, 1, 2]) if len(frame.data) == 8 else 1)
         streams = [each for each in streams if each]
-    assert sorted(found) == sorted(wanted)
+    assert sorted(received(mixed)) == sorted(wanted)
 
 
 def test_a_transfer_that_is_damaged_or_late_is_dropped() -> None:
-    request = protocol.param.GetSet.Request(index=1)
-    request.name.from_bytes(b"e0.pole_pairs")
-    frames = peers_frames(request, 9, to=42)
-
-    def received(changed: list[CanFrame], pause_ns: int = 0) -> bool:
-        assembler, now, whole = Assembler(), 0, None
-        for frame in changed:
-            whole = assembler.receive(frame.can_id, frame.data, types.GET_SET.seed, now)
-            now += pause_ns
-        return whole is not None
-
+    frames = request(9, b"e0.pole_pairs")
     assert received(frames)
     assert received(frames, 800_000_000)
     assert not received(frames, 2_000_000_001)

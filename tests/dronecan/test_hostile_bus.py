@@ -5,9 +5,9 @@ import random
 import tracemalloc
 
 import pytest
-from dronecan_bench import Bench, Peer, Reader, dronecan
+from dronecan_bench import Bench, Reader, dronecan
 
-from kontronik_can_gw.dronecan.transport import MAX_PAYLOAD, MAX_TRANSFERS
+from kontronik_can_gw.dronecan.wire import MAX_PAYLOAD, MAX_TRANSFERS
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.frames import CanFrame
 
@@ -76,7 +76,7 @@ def test_a_hostile_bus(count: int, node_id: int) -> None:
         assert facts["requests_unanswered"] > 0
         assert {node["state"] for node in facts["nodes"]} == {"another device has this node-ID"}
         assert len(bench.of("Status")) == 2 * 11 * 50
-        assert {node["state"] for node in bench.output.facts()["nodes"]} == {"operational"}
-        assert Peer(bench).ask(dronecan.uavcan.protocol.GetNodeInfo.Request(), 42) is not None
+        assert {node["state"] for node in bench.nodes} == {"operational"}
+        assert bench.ask(dronecan.uavcan.protocol.GetNodeInfo.Request()) is not None
     else:
         assert {each.name for each in bench.read} == {"Allocation"}

@@ -4,8 +4,7 @@ import random
 
 from hypothesis import strategies as st
 
-from kontronik_can_gw.esc.kontronik import Form
-from kontronik_can_gw.esc.kontronik.codec import FORMS
+from kontronik_can_gw.esc.kontronik.codec import FORMS, Form
 from kontronik_can_gw.esc.kontronik.fields import Data
 
 from . import sheet

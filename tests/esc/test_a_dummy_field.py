@@ -16,7 +16,9 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
-from kontronik_can_gw.esc.kontronik import Device, Layout, LiveData
+from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.gateway import Gateway

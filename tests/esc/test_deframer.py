@@ -9,16 +9,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.esc.kontronik import (
-    Counters,
-    Deframer,
-    Frame,
-    InfoData,
-    Layout,
-    LiveData,
-    deframer,
-    encode,
-)
+from kontronik_can_gw.esc.kontronik import deframer
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 
 from . import sheet
 from .reference import certain_at, counters_of, form_row, frames_of

@@ -4,9 +4,8 @@ Losses, frame rate, and what is forgotten of another device or layout: the golde
 """
 
 import random
-from bisect import bisect_right
 from functools import reduce
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from operator import or_
 
 import pytest
@@ -15,10 +14,11 @@ from hypothesis import strategies as st
 
 from esc.reference import SHORTEST_FIRST, fits
 from esc.streams import decoded, form_of, random_stream
-from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode
-from kontronik_can_gw.esc.kontronik.fields import device_and_variant
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
@@ -28,8 +28,6 @@ from kontronik_can_gw.esc.telemetry import (
     Event,
     LinkState,
 )
-from kontronik_can_gw.esc.values import MWS_PER_WH, VALUES, steps
-from kontronik_can_gw.gateway_status import GatewayStatus
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 
@@ -70,29 +68,15 @@ def alive(now: int = SECOND) -> EscStream:
     return telemetry
 
 
-def stream(
-    telemetry: EscStream,
-    begin: int,
-    seconds: float,
-    period: int = 10 * MS,
-    extra: bytes = b"",
-    frame: bytes = b"",
-) -> int:
-    """Frames each ``period``, with what the runtime does beside: ``advance`` at each deadline. Returns the last time."""
+def stream(telemetry: EscStream, begin: int, seconds: float, extra: bytes = b"") -> int:
+    """Frames each 10 ms, with what the runtime does beside: ``advance`` at each deadline. Returns the last time."""
     now = begin
     while now < begin + seconds * SECOND:
         while telemetry.next_deadline() <= now:
             telemetry.advance(max(telemetry.next_deadline(), 0))
-        read(telemetry, extra + (frame or live()), now)
-        now += period
-    return now - period
-
-
-def value(name: str, telemetry: EscStream) -> float:
-    """One without a divisor, in its unit."""
-    found = steps(VALUES[name], telemetry, GatewayStatus(), 0)
-    assert found is not None
-    return found / VALUES[name].per_unit
+        read(telemetry, extra + live(), now)
+        now += 10 * MS
+    return now - 10 * MS
 
 
 # --- link states
@@ -113,7 +97,6 @@ def test_crc_errors_or_dropped_bytes_in_a_second_degrade_the_link_and_a_clean_se
         read(telemetry, BROKEN + live(), SECOND + (n + 1) * 10 * MS)
     now = stream(telemetry, SECOND + 60 * MS, 1.1, extra=b"\x55" * noise)
     states = [telemetry.link]
-    assert telemetry.live is not None
     stream(telemetry, now + 10 * MS, 2.2)
     assert [*states, telemetry.link] == [state, LinkState.OK]
 
@@ -129,19 +112,16 @@ def test_a_lost_port_is_an_error_until_it_is_open_again(seen: bool) -> None:
     assert events & Event.LINK
     assert bool(events & Event.LIVE) is seen
     assert (telemetry.live, telemetry.info) == (None, None)
-    states = [telemetry.link]
     telemetry.advance(3 * SECOND)
     assert telemetry.port_lost() == Event.NONE
-    states.append(telemetry.link)
+    states = [telemetry.link]
     assert telemetry.port_opened() == Event.LINK
-    states.append(telemetry.link)
-    read(telemetry, live()[30:], 4 * SECOND)
-    states.append(telemetry.link)
-    assert telemetry.live is None
-    read(telemetry, live(), 5 * SECOND)
+    for data in (live()[30:], live()):
+        states.append(telemetry.link)
+        assert telemetry.live is None
+        read(telemetry, data, 4 * SECOND)
     lost = [LinkState.LOST] * 2 if seen else [LinkState.NEVER_SEEN, LinkState.SEARCHING]
-    error = LinkState.PORT_ERROR
-    assert [*states, telemetry.link] == [error, error, *lost, LinkState.OK]
+    assert [*states, telemetry.link] == [LinkState.PORT_ERROR, *lost, LinkState.OK]
 
 
 # --- freshness
@@ -236,22 +216,19 @@ def test_an_info_frame_is_late_by_its_own_time_out() -> None:
 
 
 def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight() -> None:
-    simulated = SimulatedEsc(EscOptions(info_every=0), seed=3)
     telemetry = esc()
     watt_seconds = run_seconds = 0.0
-    sent = simulated.frames_until(60 * SECOND)
-    assert any(s.data.battery_current < 0 for s in sent if isinstance(s.data, LiveData))
+    sent = SimulatedEsc(EscOptions(info_every=0), seed=3).frames_until(60 * SECOND)
     for before, after in pairwise(sent):
-        assert isinstance(before.data, LiveData)
-        seconds = (after.time_ns - before.time_ns) / 1e9
-        watt_seconds += (
-            max(0.0, before.data.battery_voltage / 100 * before.data.battery_current / 10) * seconds
-        )
-        run_seconds += seconds if before.data.electrical_speed else 0
+        data, seconds = before.data, (after.time_ns - before.time_ns) / 1e9
+        assert isinstance(data, LiveData)
+        watts = data.battery_voltage / 100 * data.battery_current / 10
+        watt_seconds += max(0.0, watts) * seconds  # regeneration is not subtracted
+        run_seconds += seconds if data.electrical_speed else 0
     for each in sent:
         read(telemetry, each.wire, SECOND + each.time_ns)
-    assert value("energy_used", telemetry) == pytest.approx(watt_seconds / 3600, abs=1 / MWS_PER_WH)
-    assert value("motor_run_time", telemetry) == pytest.approx(run_seconds, rel=1e-9)
+    assert telemetry.energy_mw_ns / 1e12 == pytest.approx(watt_seconds, rel=1e-9)
+    assert telemetry.run_time_ns / 1e9 == pytest.approx(run_seconds, rel=1e-9)
     assert watt_seconds > 10_000
     assert 30 < run_seconds < 50
 
@@ -287,21 +264,18 @@ def chunks_of(seed: int) -> list[tuple[bytes, int]]:
     return timed
 
 
-def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[LiveData]:
+def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[Data]:
     """By brute force: the live frames of which each byte was read within the time-out before the last one, and that within
     the time-out before ``now``."""
     whole = b"".join(piece for piece, _ in timed)
-    ends = list(accumulate(len(piece) for piece, _ in timed))
+    read_at = [when for piece, when in timed for _ in piece]
     found = []
     for at in range(len(whole)):
         row = next((row for row in SHORTEST_FIRST if fits(whole, at, row)), None)
-        if row is not None:
-            form = form_of(row)
-            first = timed[bisect_right(ends, at)][1]
-            last = timed[bisect_right(ends, at + form.length - 1)][1]
-            data = decoded(form, whole, at)
-            if isinstance(data, LiveData) and last - first <= TIMEOUT and now - last <= TIMEOUT:
-                found.append(data)
+        if row is not None and row.kind == "live":
+            first, last = read_at[at], read_at[at + row.length - 1]
+            if last - first <= TIMEOUT and now - last <= TIMEOUT:
+                found.append(decoded(form_of(row), whole, at))
     return found
 
 

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
-from kontronik_can_gw.esc.kontronik import LiveData, codec, encode
+from kontronik_can_gw.esc.kontronik import codec
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, steps
 from kontronik_can_gw.frames import EXTENDED, CanFrame

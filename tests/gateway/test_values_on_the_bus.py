@@ -6,8 +6,10 @@ from packer_oracle import Msg, Sig, dbc_text
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.esc.kontronik import Device, InfoData, LiveData, codec, encode
-from kontronik_can_gw.esc.kontronik.fields import device_and_variant
+from kontronik_can_gw.esc.kontronik import codec
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
+from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout

@@ -19,7 +19,6 @@ from esc.sheet import INFO_FIELDS, LIVE_FIELDS
 from numpy.typing import NDArray
 
 from kontronik_can_gw.capture.format import Entry, Kind, numbers_data
-from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import (
     Dropout,
@@ -30,7 +29,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     Swap,
 )
 from kontronik_can_gw.esc.kontronik.simulator import Sent as Wired
-from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
 from kontronik_can_gw.gateway_status import CanState
 
 Floats = NDArray[np.float64]

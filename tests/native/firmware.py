@@ -3,6 +3,7 @@
 import random
 import subprocess
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import equality
@@ -56,15 +57,9 @@ class Case:
 
     def output(self, *command: str) -> str:
         """What a program prints that runs in the folder. AssertionError with what it said if it failed."""
-        done = subprocess.run(
-            command,
-            cwd=self.folder,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=300,
-        )
+        nothing = subprocess.DEVNULL
+        run = partial(subprocess.run, stdin=nothing, capture_output=True, text=True, timeout=300)
+        done = run(command, cwd=self.folder, check=False)
         assert done.returncode == 0, done.stderr[:3000]
         return done.stdout
 

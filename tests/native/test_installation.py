@@ -14,15 +14,8 @@ import pytest
 from kontronik_can_gw.native.compile import compiler
 
 PROJECT = Path(__file__).resolve().parents[2]
-PARTS = (
-    "pyproject.toml",
-    "hatch_build.py",
-    "README.md",
-    "LICENSE",
-    "dbc",
-    "eds",
-    "kontronik_can_gw",
-)
+FILES = "pyproject.toml", "hatch_build.py", "README.md", "LICENSE"
+FOLDERS = "dbc", "eds", "kontronik_can_gw"
 CONFIG = '[can]\ninterface = "virtual"\nchannel = "x"\n[[esc]]\nport = "/dev/no-port"\n'
 
 pytestmark = pytest.mark.extended
@@ -33,12 +26,11 @@ def sources(tmp_path: Path) -> Path:
     """A copy of what a source distribution holds: an installation writes in there."""
     made = tmp_path / "sources"
     made.mkdir()
-    for name in PARTS:
-        if (part := PROJECT / name).is_dir():
-            left_out = shutil.ignore_patterns("*.so", "not_built.txt", "__pycache__")
-            shutil.copytree(part, made / name, ignore=left_out)
-        else:
-            shutil.copy(part, made)
+    for name in FILES:
+        shutil.copy(PROJECT / name, made)
+    left_out = shutil.ignore_patterns("*.so", "not_built.txt", "__pycache__")
+    for name in FOLDERS:
+        shutil.copytree(PROJECT / name, made / name, ignore=left_out)
     return made
 
 
@@ -46,54 +38,52 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
     """The program in a fresh environment, the name of its wheel, and what pip printed."""
     folder, wheels = sources.parent / "fresh", sources.parent / "wheels"
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    build = [*pip, "wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(wheels)]
-    command = [*build, str(sources)]
+    build = ["wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(wheels), str(sources)]
+    command = [*pip, *build]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (wheel,) = wheels.iterdir()
     venv.create(folder, symlinks=True)
-    python = folder / "bin" / "python"
-    command = [*pip, "--python", str(python), "install", "-q", "--no-deps", "--no-index"]
-    subprocess.run([*command, str(wheel)], check=True)
+    into = ["--python", f"{folder}/bin/python", "install", "-q", "--no-deps", "--no-index"]
+    subprocess.run([*pip, *into, str(wheel)], check=True)
     (packages,) = folder.glob("lib/python*/site-packages")
     # what it depends on is that of the tests
     (packages / "others.pth").write_text(sysconfig.get_path("purelib"))
     return folder / "bin" / "kontronik-can-gw", wheel.name, done.stdout + done.stderr
 
 
-def first_words(program: Path) -> str:
-    """Of a gateway that starts and ends: the line about its core."""
-    folder = program.parent
-    (folder / "gateway.toml").write_text(CONFIG)
-    command = [str(program), "run", "--wait", "-c", str(folder / "gateway.toml")]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder) as process:
+@pytest.mark.parametrize(
+    ("compiles", "why"),
+    [
+        (None, ""),
+        ("", "there was no C compiler at the installation"),
+        ("echo 'cc: error: broken' >&2\nexit 1\n", "at the installation {} failed: cc: error: broken"),
+    ],
+    ids=["with a compiler", "without one", "with one that fails"],
+)  # fmt: skip
+def test_the_gateway_works_and_says_which_core_runs_and_why(
+    sources: Path, compiles: str | None, why: str
+) -> None:
+    programs, environment = sources.parent / "programs", dict(os.environ)
+    programs.mkdir()
+    if compiles is None and compiler() is None:
+        pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev")
+    if compiles is not None:
+        environment["PATH"] = str(programs)
+    if compiles:
+        (programs / "cc").write_text(f"#!/bin/sh\n{compiles}")
+        (programs / "cc").chmod(0o755)
+    why = why.format(programs / "cc")
+    program, wheel, printed = installed(sources, environment)
+    assert ("-py3-none-any.whl" in wheel) is bool(why)
+    assert not why or f"the core in Python will run: {why}" in printed
+    config = program.with_name("gateway.toml")
+    config.write_text(CONFIG)
+    command = [str(program), "run", "--wait", "-c", str(config)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd="/") as process:
         assert process.stderr is not None
         said = next((line for line in process.stderr if "core: " in line), "")
         process.terminate()
         process.stderr.read()
     assert process.returncode == 0
-    return said.strip().partition("core: ")[2]
-
-
-def test_with_a_compiler_the_core_in_c_is_built(sources: Path) -> None:
-    if compiler() is None:
-        pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev")
-    program, wheel, _ = installed(sources, os.environ)
-    assert first_words(program) == "C"
-    assert "-py3-none-linux_" in wheel
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_without_a_compiler_or_with_one_that_fails_the_core_in_python_runs(
-    sources: Path, fails: bool
-) -> None:
-    programs, why = sources.parent / "programs", "there was no C compiler at the installation"
-    programs.mkdir()
-    if fails:
-        (programs / "cc").write_text("#!/bin/sh\necho 'cc: error: broken' >&2\nexit 1\n")
-        (programs / "cc").chmod(0o755)
-        why = f"at the installation {programs / 'cc'} failed: cc: error: broken"
-    program, wheel, printed = installed(sources, os.environ | {"PATH": str(programs)})
-    assert f"the core in Python will run: {why}" in printed
-    assert wheel.endswith("-py3-none-any.whl")
-    assert first_words(program) == f"Python ({why})"
+    assert said.strip().partition("core: ")[2] == (f"Python ({why})" if why else "C")

@@ -1,11 +1,9 @@
 """A loop that turns in C, with a kernel that is played: what it records, replayed by the core in Python, gives what it sent."""
 
-import logging
 import random
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import load
-from kontronik_can_gw.output import NEVER, Given, Output
+from kontronik_can_gw.output import Given, Output
 from kontronik_can_gw.outputs import setup_of
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
@@ -225,37 +223,6 @@ def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
     waiting = [f for f in it.loop.can.transmitter.queue.in_order() if f.can_id == 0x700]
     assert waiting[-1].data == struct.pack("<I", beacon.count)
     assert len(waiting) > 10 if queued else len(waiting) == 1
-    it.loop.close()
-
-
-def test_what_is_due_in_python_is_done_between_turns_in_c(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A foreign frame with our id is over after 10 s, and a further one is said anew; the kernel is asked for the interface each second."""
-    caplog.set_level(logging.INFO)
-    it = InC(monkeypatch)
-    asked: list[int] = []
-
-    def ask(now: int) -> None:
-        asked.append(now)
-        it.loop.can.controller.due = now + SECOND
-
-    monkeypatch.setattr(it.loop.can, "ask", ask)
-    it.loop.can.controller.due = it.begun
-    it.world.wires[0].stream(it.begun, it.begun + 40 * SECOND, 10 * MS)
-    conflicts = it.loop.gateway.conflicts
-    for came in (1, 25):
-        it.bus.came(0x100, bytes(8), it.begun + came * SECOND)
-        it.run(came + 9)
-        assert conflicts.next_deadline() < NEVER
-        it.run(came + 11)
-        assert conflicts.next_deadline() == NEVER
-    it.run(39)
-    texts = [record.getMessage() for record in caplog.records]
-    said = [text.split(": ")[2].split()[0] for text in texts if "else sends" in text]
-    assert said == ["somebody", "nobody", "somebody", "nobody"]
-    gaps = [later - at for at, later in pairwise([it.begun, *asked, it.world.now])]
-    assert max(gaps) <= 1600 * MS and len(asked) < 45
     it.loop.close()
 
 

@@ -15,14 +15,16 @@ from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc import protocols
-from kontronik_can_gw.esc.kontronik import LiveData, codec, encode
+from kontronik_can_gw.esc.kontronik import codec
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.native import compile as compiling
 from kontronik_can_gw.native import load, objects
 from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import sealed
-from kontronik_can_gw.native.settings import MAX_GEAR
+from kontronik_can_gw.native.rows import MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
 
 EMPTY = Layout("", "", ())
@@ -62,14 +64,11 @@ def why(layout: Layout = EMPTY, **settings: object) -> str:
 
 
 @needs_c
-@pytest.mark.parametrize(
-    ("pure", "said"), [(None, ""), ("", ""), ("0", ""), ("1", "KONTRONIK_PURE is set")]
-)
+@pytest.mark.parametrize(("pure", "said"), [("", ""), ("0", ""), ("1", "KONTRONIK_PURE is set")])
 def test_it_is_the_one_in_c_unless_the_other_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch, pure: str | None, said: str
+    monkeypatch: pytest.MonkeyPatch, pure: str, said: str
 ) -> None:
-    if pure is not None:
-        monkeypatch.setenv(load.PURE, pure)
+    monkeypatch.setenv(load.PURE, pure)
     assert why() == said
 
 
@@ -105,20 +104,18 @@ def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_p
 
 
 @pytest.mark.parametrize(
-    ("machine", "largest", "name"),
+    ("machine", "bits", "its"),
     [
-        ("aarch64", 1 << 63, "core-aarch64.so"),
-        ("aarch64", 1 << 31, "core-armv7l.so"),
-        ("armv6l", 1 << 31, "core-armv6l.so"),
-        ("x86_64", 1 << 31, "core-i686.so"),
+        *(("aarch64", 64, "aarch64"), ("aarch64", 32, "armv7l")),
+        *(("armv6l", 32, "armv6l"), ("x86_64", 32, "i686")),
     ],
 )
 def test_a_process_of_32_bits_has_an_object_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, machine: str, largest: int, name: str
+    monkeypatch: pytest.MonkeyPatch, machine: str, bits: int, its: str
 ) -> None:
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine=machine))
-    monkeypatch.setattr(sys, "maxsize", largest - 1)
-    assert objects.shared_object().name == name
+    monkeypatch.setattr(sys, "maxsize", (1 << bits - 1) - 1)
+    assert objects.shared_object().name == f"core-{its}.so"
 
 
 @needs_c
@@ -136,15 +133,14 @@ NOT_AVAILABLE = 0xFFFF_FFFF
 def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available() -> None:
     gateway = Gateway([EscSettings(pole_pairs=7)], layout_of(SPEEDS), 0)
     assert gateway.core.language == "C"
-    for now, (poles, gear, motor, output) in enumerate(
-        (
-            (7, Fraction(490_909, 50_000), 10_000, 1_019),
-            (7, Fraction(1, MAX_GEAR + 1), 10_000, NOT_AVAILABLE),
-            (7, Fraction(MAX_GEAR + 2, 2), 10_000, NOT_AVAILABLE),
-            (100_000, Fraction(1), NOT_AVAILABLE, NOT_AVAILABLE),
-            (7, Fraction(5), 10_000, 2_000),
-        )
-    ):
+    cases = (
+        (7, Fraction(490_909, 50_000), 10_000, 1_019),
+        (7, Fraction(1, MAX_GEAR + 1), 10_000, NOT_AVAILABLE),
+        (7, Fraction(MAX_GEAR + 2, 2), 10_000, NOT_AVAILABLE),
+        (100_000, Fraction(1), NOT_AVAILABLE, NOT_AVAILABLE),
+        (7, Fraction(5), 10_000, 2_000),
+    )
+    for now, (poles, gear, motor, output) in enumerate(cases):
         given = EscSettings(pole_pairs=poles, gear=gear)
         gateway.core.apply(0, given)
         assert gateway.escs[0].settings == given

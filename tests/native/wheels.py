@@ -8,10 +8,10 @@ packages, which have the same ones (tests/deb).
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,41 +23,33 @@ PROJECT = Path(__file__).resolve().parents[2]
 
 def build(folder: Path) -> Path:
     """The wheel."""
+    folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation"]
     environment = os.environ | {"KONTRONIK_WHEEL_FOR_ALL": "1"}
     with tempfile.TemporaryDirectory(prefix="kcg-wheel.") as made:
-        command += ["-w", made, str(PROJECT)]
-        subprocess.run(command, env=environment, check=True)
+        subprocess.run([*command, "-w", made, str(PROJECT)], env=environment, check=True)
         (wheel,) = Path(made).iterdir()
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / wheel.name).write_bytes(wheel.read_bytes())
-    return folder / wheel.name
+        return Path(shutil.copy(wheel, folder))
 
 
 def mistakes(wheel: Path) -> Iterator[str]:
-    """What is wrong with a wheel and its objects."""
+    """What is wrong with a wheel and its objects: libraries that one needs, and what not every C library has."""
     if not wheel.name.endswith("-py3-none-any.whl"):
         yield f"{wheel.name}: a wheel for one machine"
     with tempfile.TemporaryDirectory(prefix="kcg-wheel.") as made:
-        with zipfile.ZipFile(wheel) as file:
-            file.extractall(made)
-        native = Path(made) / "kontronik_can_gw" / "native"
+        shutil.unpack_archive(wheel, made, "zip")
         for machine in CROSS_COMPILERS:
-            path = native / shared_object(machine).name
+            path = Path(made) / "kontronik_can_gw" / "native" / shared_object(machine).name
             if not path.exists():
                 yield f"{path.name} is not there"
                 continue
-            yield from needs(path)
-
-
-def needs(path: Path) -> Iterator[str]:
-    """Libraries, and what not every C library has."""
-    found = subprocess.run(["readelf", "-dsW", path], capture_output=True, text=True, check=True)
-    if library := re.search(r"\(NEEDED\).*", found.stdout):
-        yield f"{path.name}: {library[0]}"
-    for name in set(re.findall(r" UND (\S+)", found.stdout)):
-        if "@" in name or (name.startswith("_") and name != "__errno_location"):
-            yield f"{path.name}: needs {name}"
+            command = ["readelf", "-dsW", path]
+            text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+            if "(NEEDED)" in text:
+                yield f"{path.name}: needs a library"
+            for name in set(re.findall(r" UND (\S+)", text)):
+                if "@" in name or (name.startswith("_") and name != "__errno_location"):
+                    yield f"{path.name}: needs {name}"
 
 
 def main(folder: Path) -> int:

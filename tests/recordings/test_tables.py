@@ -28,8 +28,8 @@ from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
-from kontronik_can_gw.esc.kontronik import LiveData, encode
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus

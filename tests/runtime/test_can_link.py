@@ -10,7 +10,8 @@ from wire_world import CAN_FD, Bus, World
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway

@@ -14,14 +14,7 @@ from enum import Enum
 from zlib import crc32
 
 from kontronik_can_gw.esc.decoder import FrameForm
-from kontronik_can_gw.esc.kontronik.fields import (
-    Data,
-    DataType,
-    InfoData,
-    LiveData,
-    body_format,
-    rows,
-)
+from kontronik_can_gw.esc.kontronik.fields import Data, DataType, InfoData, LiveData, body_format
 
 
 class Layout(Enum):
@@ -51,16 +44,8 @@ class Form(FrameForm):
         self.fields_of = struct.Struct(f"<4x{body}").unpack_from
 
     def encode(self, data: Data) -> bytes:
-        """The frame with reserved bytes 0 and its CRC. ValueError naming the field that does not fit its wire type."""
-        try:
-            frame = self._struct.pack(self.header, *data, 0)
-        except struct.error:
-            for name, row in rows(self.data_type).items():
-                low, high = row.type_range
-                value = getattr(data, name)
-                if not low <= value <= high:
-                    raise ValueError(f"{name}: {value} is outside {low}..{high}") from None
-            raise
+        """The frame with reserved bytes 0 and its CRC. struct.error where a value does not fit its wire type."""
+        frame = self._struct.pack(self.header, *data, 0)
         return frame[:-4] + crc32(frame[: self.covered]).to_bytes(4, "little")
 
 
@@ -77,6 +62,6 @@ MAX_LENGTH = max(form.length for form in FORMS)
 
 
 def encode(data: Data, layout: Layout) -> bytes:
-    """The frame bytes of a LiveData or InfoData in the given layout. ValueError if a value does not fit its wire type."""
+    """The frame bytes of a LiveData or InfoData in the given layout. struct.error where a value does not fit its wire type."""
     of = type(data), layout
     return next(form for form in FORMS if (form.data_type, form.layout) == of).encode(data)

@@ -19,73 +19,47 @@ import cantools
 import serial
 
 LIVE = struct.Struct("<4xIHhhhHHHHbBbbIBB")
+SIGNALS = (
+    *("ElectricalSpeed", "BatteryVoltage", "BatteryCurrent", "MotorCurrent", "PeakCurrent"),
+    *("ConsumedCharge", "BecCurrent", "BecVoltage", "PwmInput", "ThrottlePercent"),
+    *("OutputOpeningPercent", "PowerStageTemperature", "BecTemperature"),
+    *("OperatingErrors", "OperatingStateRaw", "Timing"),
+)
+STEPS = (1, 100, 10, 10, 10, 1, 1000, 1000, 1, 1, 1, 1, 1, 1, 1, 1)
+"""To a unit."""
 LENGTHS = {b"KODL": (38, 40), b"KODI": (41, 44)}
 TIMEOUT = 0.25
 INFO_TIMEOUT = 10.0
 JIVEPRO = 3
 
 
-def messages(frame: bytes, supplied: bool) -> list[tuple[str, dict[str, Any]]]:
-    """The five messages of a live frame; ``supplied``: its BEC current is one."""
-    (
-        speed, voltage, current, motor_current, peak_current, charge, bec_current, bec_voltage,
-        pwm, throttle, opening, temperature, bec_temperature, errors, state, timing,
-    ) = LIVE.unpack_from(frame)  # fmt: skip
-    return [
-        (
-            "FiveSpeed",
-            {
-                "ElectricalSpeed": speed,
-                "BatteryVoltage": voltage / 100,
-                "PwmInput": pwm,
-                "Timing": timing,
-            },
-        ),
-        (
-            "FiveCurrent",
-            {
-                "BatteryCurrent": current / 10,
-                "MotorCurrent": motor_current / 10,
-                "PeakCurrent": peak_current / 10,
-                "ThrottlePercent": throttle,
-                "OutputOpeningPercent": opening,
-            },
-        ),
-        ("FiveState", {"OperatingErrors": errors, "OperatingStateRaw": state}),
-        (
-            "FiveBec",
-            {
-                "BecVoltage": bec_voltage / 1000,
-                "BecCurrent": bec_current / 1000 if supplied else "NotAvailable",
-                "PowerStageTemperature": temperature,
-                "BecTemperature": bec_temperature,
-            },
-        ),
-        ("FiveCharge", {"ConsumedCharge": charge}),
-    ]
+def values_of(frame: bytes, supplied: bool) -> dict[str, Any]:
+    """The signals of a live frame; ``supplied``: its BEC current is one."""
+    found = zip(SIGNALS, STEPS, LIVE.unpack_from(frame), strict=True)
+    values: dict[str, Any] = {name: value / steps for name, steps, value in found}
+    if not supplied:
+        values["BecCurrent"] = "NotAvailable"
+    return values
 
 
 def can_frame(message: Any, values: dict[str, Any], index: int) -> can.Message:
     """A message of ESC number ``index``; what a signal has no room for is Error."""
+    own = {signal.name: values[signal.name] for signal in message.signals}
     for signal in message.signals:
-        value = values[signal.name]
+        value = own[signal.name]
         if not isinstance(value, str) and not signal.minimum <= value <= signal.maximum:
-            values[signal.name] = "Error"
-    data = message.encode(values)
+            own[signal.name] = "Error"
+    data = message.encode(own)
     return can.Message(arbitration_id=message.frame_id + index, data=data, is_extended_id=False)
 
 
 class Esc:
     """One ESC: its port, what was received and is not decoded yet, its messages."""
 
-    def __init__(
-        self, index: int, port: Any, database: Any, bus: Any, lock: threading.Lock
-    ) -> None:
+    def __init__(self, index: int, port: Any, *shared: Any) -> None:
         self.index = index
         self.port = port
-        self.database = database
-        self.bus = bus
-        self.lock = lock
+        self.database, self.bus, self.lock = shared
         self.buffer = b""
         self.layout: int | None = None
         self.device: int | None = None
@@ -96,7 +70,7 @@ class Esc:
 
     def run(self) -> None:
         """Serve the port for ever."""
-        self.send_not_available()
+        self.send(dict.fromkeys(SIGNALS, "NotAvailable"))
         while True:
             self.step()
 
@@ -107,7 +81,7 @@ class Esc:
         if self.is_up and now - self.live_time > TIMEOUT:
             self.is_up = False
             self.device = None
-            self.send_not_available()
+            self.send(dict.fromkeys(SIGNALS, "NotAvailable"))
         if self.device is not None and now - self.info_time > INFO_TIMEOUT:
             self.device = None
         if data:
@@ -131,11 +105,8 @@ class Esc:
             for layout, length in enumerate(lengths):
                 if len(self.buffer) < length:
                     return
-                covered = (length - 4) // 4 * 4
-                if (
-                    crc32(self.buffer[:covered])
-                    == struct.unpack_from("<I", self.buffer, length - 4)[0]
-                ):
+                crc = crc32(self.buffer[: (length - 4) // 4 * 4])
+                if crc == struct.unpack_from("<I", self.buffer, length - 4)[0]:
                     frame, self.buffer = self.buffer[:length], self.buffer[length:]
                     self.handle(frame, layout)
                     break
@@ -158,24 +129,15 @@ class Esc:
             supplied = bec_current != 0 and self.last_device != JIVEPRO
         self.live_time = time.monotonic()
         self.is_up = True
-        for name, values in messages(frame, supplied):
-            self.send(name, values)
+        self.send(values_of(frame, supplied))
 
-    def send_not_available(self) -> None:
-        """Nothing is known."""
+    def send(self, values: dict[str, Any]) -> None:
+        """Encode and send all messages."""
         for message in self.database.messages:
-            self.send(message.name, {signal.name: "NotAvailable" for signal in message.signals})
-
-    def send(self, name: str, values: dict[str, Any]) -> None:
-        """Encode and send a message."""
-        message = self.database.get_message_by_name(name)
-        frame = can_frame(message, values, self.index)
-        with (
-            self.lock,
-            contextlib.suppress(can.CanOperationError),
-        ):
+            frame = can_frame(message, values, self.index)
             # the bus is full: the next one is newer anyway
-            self.bus.send(frame)
+            with self.lock, contextlib.suppress(can.CanOperationError):
+                self.bus.send(frame)
 
 
 def main(arguments: list[str]) -> None:
