@@ -30,7 +30,6 @@ ORDER = (
     ("native",),
     ("canopen",),
     ("dronecan",),
-    ("outputs",),
     ("id_conflicts",),
     ("gateway",),
     ("transmit_queue",),

@@ -12,7 +12,7 @@ from kontronik_can_gw.dbc.binding import VALUES_BY_KEY
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.node_state import UNCONFIGURED
-from kontronik_can_gw.outputs import OUTPUTS
+from kontronik_can_gw.output import OUTPUTS
 
 
 def load(path: Path) -> Config:

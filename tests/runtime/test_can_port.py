@@ -24,8 +24,7 @@ from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
-from kontronik_can_gw.runtime.driver_port import QUEUE_LENGTH, DriverPort
-from kontronik_can_gw.runtime.open_can import open_can
+from kontronik_can_gw.runtime.open_can import QUEUE_LENGTH, DriverPort, open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
 
