@@ -5,9 +5,10 @@ is integer nanoseconds of one monotonic clock.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from typing import Any, NamedTuple, Protocol
 
-from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 
@@ -135,7 +136,7 @@ class OutputSetup(Protocol):
 
     @property
     def name(self) -> str:
-        """As in outputs.OUTPUTS."""
+        """As in OUTPUTS."""
 
     @property
     def title(self) -> str:
@@ -162,3 +163,16 @@ class OutputSetup(Protocol):
 
     def lines(self) -> list[str]:
         """What ``check -v`` shows."""
+
+
+OUTPUTS = ("dronecan",)
+"""The outputs besides DBC and CANopen: each is a folder, loaded only where it is enabled.
+
+Its module ``setup`` has ``configured``, which makes an OutputSetup; its table of the configuration has its name and a key ``enabled``.
+"""
+
+
+def setup_of(name: str, given: Given, escs: Sequence[EscSettings]) -> OutputSetup:
+    """The setup of the output with this name. UserError with the mistakes in its table."""
+    setup: OutputSetup = import_module(f"{__package__}.{name}.setup").configured(given, escs)
+    return setup

@@ -28,8 +28,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.output import Given, OutputSetup
-from kontronik_can_gw.outputs import OUTPUTS, setup_of
+from kontronik_can_gw.output import OUTPUTS, Given, OutputSetup, setup_of
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:

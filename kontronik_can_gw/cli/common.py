@@ -43,7 +43,7 @@ def announced_config(with_nodes: bool = False) -> Path | None:
 @contextmanager
 def logging_to_stderr() -> Iterator[None]:
     """Write log lines to standard error from a thread; under systemd without time, with journald's priorities."""
-    from kontronik_can_gw.runtime.log_writer import BackgroundHandler
+    from kontronik_can_gw.runtime.fault_log import BackgroundHandler
     from kontronik_can_gw.runtime.systemd import log_formatter
 
     handler = BackgroundHandler(sys.stderr)

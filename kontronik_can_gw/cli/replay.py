@@ -19,8 +19,7 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.id_locks import in_use, names_of
-from kontronik_can_gw.runtime.locks import Locks
+from kontronik_can_gw.runtime.locks import Locks, in_use, names_of
 from kontronik_can_gw.runtime.open_can import check_interface, open_can
 from kontronik_can_gw.transmit_queue import Sent
 

@@ -17,8 +17,7 @@ from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
-from kontronik_can_gw.output import Given, OutputSetup
-from kontronik_can_gw.outputs import OUTPUTS, setup_of
+from kontronik_can_gw.output import OUTPUTS, Given, OutputSetup, setup_of
 from kontronik_can_gw.runtime.machine import identity_digest
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.plan import Layout

@@ -19,11 +19,10 @@ from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_controller import CanController
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.id_locks import IdLocks
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.locks import IdLocks
 from kontronik_can_gw.runtime.open_can import open_can
-from kontronik_can_gw.runtime.poller import Poller, PortInput, StuckCheck
-from kontronik_can_gw.runtime.retry import Retry
+from kontronik_can_gw.runtime.poller import Poller, PortInput, Retry, StuckCheck
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.transmitter import Transmitter
 from kontronik_can_gw.transmit_queue import Sent

@@ -1,4 +1,4 @@
-"""A CAN interface as the loop uses it: what a raw socket (socketcan_port.py) and python-can's drivers (driver_port.py) have in common.
+"""A CAN interface as the loop uses it: what a raw socket (socketcan_port.py) and python-can's drivers (open_can.py) have in common.
 
 ``send`` never blocks on SocketCAN and never raises: it says what became of the frame. ``receive`` never blocks and never raises. Data
 frames come only with ids that were asked for, so that foreign traffic does not wake the process. Ids here are as SocketCAN has them:

@@ -12,8 +12,7 @@ from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.esc_log import EscLog
 from kontronik_can_gw.runtime.facts import PortFacts
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.poller import Poller, StuckCheck
-from kontronik_can_gw.runtime.retry import Retry
+from kontronik_can_gw.runtime.poller import Poller, Retry, StuckCheck
 from kontronik_can_gw.runtime.serial_port import (
     NoPort,
     PortLost,

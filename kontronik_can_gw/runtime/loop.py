@@ -2,7 +2,7 @@
 
 What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` may be called from elsewhere (a signal handler,
 another thread). Threads of their own (worker.py) have the parameter store (store.py), the statistics (statistics.py), captures
-(recorder.py), the log (log_writer.py), and reception where python-can has no descriptor (driver_port.py).
+(recorder.py), the log (fault_log.py), and reception where python-can has no descriptor (open_can.py).
 """
 
 import logging

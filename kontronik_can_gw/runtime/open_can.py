@@ -1,15 +1,39 @@
-"""Opens the CAN interface that the configuration names: any of python-can's, SocketCAN by a socket of our own."""
+"""Opens the CAN interface that the configuration names: SocketCAN by a socket of our own, any other by python-can's driver.
 
+Those have no descriptor to wait on: they are received from by a thread, a bounded queue, a descriptor. What may touch what: ``_read`` and
+``_fail`` run in the worker's thread, everything else in the loop's. They share ``_ids``, ``_failed`` and ``_dropped`` (each written by
+one side only) and the queue.
+"""
+
+import contextlib
 import logging
-from typing import Any
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
+from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.runtime.can_port import CanPort
+from kontronik_can_gw.runtime.can_port import (
+    MAX_STANDARD_ID,
+    RECEIVE_LIMIT,
+    CanPort,
+    Received,
+)
 from kontronik_can_gw.runtime.socketcan_port import open_socketcan
+from kontronik_can_gw.runtime.worker import Handover, Worker
+from kontronik_can_gw.transmit_queue import Sent
+
+if TYPE_CHECKING:
+    import can
 
 log = logging.getLogger("kontronik_can_gw")
+
+QUEUE_LENGTH = 1024
+_POLL_S = 0.1
+_MAX_END_S = 1.0
 
 
 def check_interface(config: CanConfig) -> None:
@@ -32,8 +56,6 @@ def open_can(config: CanConfig) -> CanPort:
     check_interface(config)
     with without_asammdf():
         import can
-
-        from kontronik_can_gw.runtime.driver_port import DriverPort
     options: dict[str, Any] = {"bitrate": config.bitrate}
     if config.fd:
         options |= {"fd": True, "data_bitrate": config.data_bitrate}
@@ -44,3 +66,135 @@ def open_can(config: CanConfig) -> CanPort:
         raise RunError(
             f"CAN {config.interface} {config.channel}: cannot be opened: {error}"
         ) from None
+
+
+class DriverPort(CanPort):
+    """A bus of python-can. A thread reads it as soon as there is an id to receive, until ``close`` or until the interface fails."""
+
+    def __init__(self, bus: "can.BusABC") -> None:
+        super().__init__()
+        self._bus = bus
+        self._worker: Worker[None] | None = None
+        self._frames: Handover[tuple[CanFrame, int | None]] = Handover(QUEUE_LENGTH)
+        self._dropped = 0
+        """Frames that came while the queue was full."""
+        self._failed = False
+        """The thread has ended; the descriptor became readable."""
+
+    def fileno(self) -> int | None:
+        return None if self._worker is None else self._frames.fileno()
+
+    def close(self) -> None:
+        """It takes as long as one wait of the driver. A thread that a driver holds is left running, without effect."""
+        if self._worker is not None:
+            # before the driver is shut down: few of them bear both at once
+            self._worker.stop(_MAX_END_S)
+        self._frames.close()
+        with contextlib.suppress(Exception):
+            # an interface that is gone may fail in its own ways; nothing is left to do
+            self._bus.shutdown()
+
+    def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
+        frames = self._frames.take(limit)
+        self.drained = len(frames) < limit
+        if self._has_failed():
+            self.state = CanState.DOWN
+        self._note_drops()
+        return frames
+
+    def _filter(self) -> None:
+        if self._worker is None and not self._ids:
+            return
+        self._filter_bus()
+        if self._worker is None:
+            self._worker = Worker("can-reader", self._read, failed=self._fail, wait=lambda: None)
+            self._failed = not self._worker.start()  # so that it is tried again with another one
+
+    def _filter_bus(self) -> None:
+        """Ask the driver for our ids; one that cannot filter is left to the thread."""
+        filters: can.typechecking.CanFilters = [
+            {
+                "can_id": key & MAX_EXTENDED_ID,
+                "can_mask": mask & (MAX_EXTENDED_ID if key & EXTENDED else MAX_STANDARD_ID),
+                "extended": bool(key & EXTENDED),
+            }
+            for key, mask in map(id_and_mask, sorted(self._ids))
+        ]
+        for wanted in (filters, None):
+            with contextlib.suppress(Exception):  # each driver fails in its own way
+                self._bus.set_filters(wanted)
+                return
+        self.gone = True
+
+    def _has_failed(self) -> bool:
+        self.gone = self.gone or self._failed
+        return self.gone
+
+    def _drops(self) -> int:
+        return self._dropped
+
+    def _send_each(
+        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+    ) -> tuple[int, Sent]:
+        if self._has_failed():
+            return 0, Sent.GONE
+        for count, frame in enumerate(frames):
+            if clock() > latest:
+                return count, Sent.LATE
+            answer = self._send_message(frame)
+            if answer is not Sent.OK:
+                return count, answer
+        return len(frames), Sent.OK
+
+    def _send_message(self, frame: CanFrame) -> Sent:
+        import can
+
+        message = can.Message(
+            arbitration_id=frame.can_id,
+            data=frame.data,
+            is_extended_id=frame.extended,
+            is_remote_frame=frame.remote,
+            is_fd=frame.fd,
+            bitrate_switch=frame.fd,
+        )
+        try:
+            self._bus.send(message, timeout=0)
+        except can.CanError:
+            return Sent.BUSY
+        except Exception:
+            # what a driver lets out when its adapter has gone: OSError, termios.error ...
+            return Sent.GONE
+        return Sent.OK
+
+    # --- the thread's side
+
+    def _read(self, _items: list[None]) -> None:
+        assert self._worker is not None
+        if self._worker.is_ending:
+            return
+        message = self._bus.recv(_POLL_S)
+        if message is None or not self._wanted(message):
+            return
+        data, extended = bytes(message.data), message.is_extended_id
+        frame = CanFrame(message.arbitration_id, data, extended, message.is_fd)
+        # what drivers put into ``timestamp`` counts from anything
+        if not self._frames.put((frame, time.monotonic_ns())):
+            self._dropped += 1
+
+    def _fail(self, error: Exception) -> None:
+        """What a driver lets out when its adapter has gone: CanError, OSError, TypeError ..."""
+        assert self._worker is not None
+        if not self._worker.is_ending:
+            log.debug("CAN: receiving failed: %r", error)
+            self._failed = True
+            self._frames.wake()
+        self._worker.end()
+
+    def _wanted(self, message: "can.Message") -> bool:
+        """A data frame with one of our ids, not sent by ourselves."""
+        return (
+            self._is_wanted(message.arbitration_id | (EXTENDED if message.is_extended_id else 0))
+            and not message.is_remote_frame
+            and not message.is_error_frame
+            and message.is_rx
+        )

@@ -25,6 +25,7 @@ Handler = Callable[[int, int], None]
 
 MIN_HELD_UP_NS = 20 * MS
 """A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
+FIRST_RETRY_NS = 100 * MS
 _IN = select.POLLIN
 
 
@@ -58,6 +59,29 @@ class StuckCheck:
         stuck = waiting and self._seen_waiting
         self._noted.served, self._seen_waiting = False, waiting
         return stuck
+
+
+class Retry:
+    """When to try again what failed: soon at first, then more and more seldom, up to a bound, for ever.
+
+    ``due`` is None while nothing is to be tried.
+    """
+
+    def __init__(self, longest_ns: int) -> None:
+        self.due: int | None = None
+        self._longest = longest_ns
+        self._pause = FIRST_RETRY_NS
+
+    def failed(self, now: int) -> int:
+        """Try later, at the time that is returned: each time twice as late."""
+        self.due = due = now + self._pause
+        self._pause = min(self._pause * 2, self._longest)
+        return due
+
+    def succeeded(self) -> None:
+        """Nothing is to be tried; the next failure begins with the shortest pause."""
+        self.due = None
+        self._pause = FIRST_RETRY_NS
 
 
 class Poller:

@@ -128,3 +128,30 @@ class RecordedGateway(Gateway):
         if counters != self._counters:
             self._counters = counters
             self._put(now, Kind.COUNTERS, 0, numbers_data(*counters), 0, None)
+
+
+def state_of(gateway: Gateway) -> dict[str, Any]:
+    """What a replay that begins now cannot know."""
+    return {
+        "escs": [
+            {"energy": e.energy_mw_ns, "run_time": e.run_time_ns, "losses": e.losses}
+            for e in gateway.escs
+        ],
+        "can_state": int(gateway.status.can_state),
+        "started_ns": gateway.status.started_ns,
+    }
+
+
+def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
+    """What each ESC's last info frame says of the device now on its line; None where none has come."""
+    return [
+        None
+        if esc.last_info is None
+        else {
+            "device": esc.protocol.device_text(esc.last_info),
+            "variant": esc.protocol.value("variant", esc.last_info),
+            "firmware": esc.protocol.firmware_text(esc.last_info),
+            "layout": esc.protocol.layout_text(esc.layout) or "",
+        }
+        for esc in gateway.escs
+    ]

@@ -6,7 +6,11 @@ recorded when there is room again. Each half second what has come is one block, 
 A fault of the disk is reported once, tried again each five seconds, and never ends the gateway nor the recorder.
 """
 
+import contextlib
+import errno
+import fcntl
 import os
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,13 +18,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.capture.format import SUFFIX, Kind, json_payload, numbers_data
+from kontronik_can_gw.capture.format import (
+    SUFFIX,
+    Kind,
+    block,
+    data_payload,
+    json_payload,
+    numbers_data,
+)
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.capture_part import CapturePart, Item, remove_oldest
-from kontronik_can_gw.runtime.disk import reason_of
+from kontronik_can_gw.runtime.disk import is_locked, reason_of, sync_folder, write_all
+from kontronik_can_gw.runtime.recorded_gateway import devices_of, state_of
 from kontronik_can_gw.runtime.worker import Report, Worker
 
 CAPACITY = 50_000
@@ -36,6 +47,9 @@ _STATE_NS = 2 * SECOND
 _STEP_NS = MS
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
+_OURS = re.compile(rf"[0-9]{{8}}T[0-9]{{6}}Z-[0-9a-f]{{6}}-[0-9]+{SUFFIX}")
+Item = tuple[int, int, int, bytes, int, int | None]
+"""(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
 
 
 @dataclass
@@ -210,7 +224,7 @@ class Recorder:
         self.facts.problem = problem
         self._worker.faults.note("captures: folder", bool(problem), f"captures: {problem or over}")
 
-    def _new_part(self, since: int) -> CapturePart:
+    def _new_part(self, since: int) -> "CapturePart":
         """``since``: time of its first entry."""
         now = self._clock()
         self._offset = time.time_ns() - now
@@ -237,28 +251,86 @@ class Recorder:
             self.facts.bytes += file.close()
 
 
-def state_of(gateway: Gateway) -> dict[str, Any]:
-    """What a replay that begins now cannot know."""
-    return {
-        "escs": [
-            {"energy": e.energy_mw_ns, "run_time": e.run_time_ns, "losses": e.losses}
-            for e in gateway.escs
-        ],
-        "can_state": int(gateway.status.can_state),
-        "started_ns": gateway.status.started_ns,
-    }
+class CapturePart:
+    """One file of a capture, locked while it is written."""
+
+    def __init__(self, path: Path, header: bytes, now: int) -> None:
+        self.path = path
+        self.begun = now
+        self.size = 0
+        self._number = 0
+        self._new = 0
+        self._header: bytes | None = header
+        self._fd = os.open(
+            self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640
+        )
+        try:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self.write(b"H", header)
+            with contextlib.suppress(OSError):  # a file system that cannot
+                sync_folder(path.parent)
+        except BaseException:  # nothing is in there yet
+            os.close(self._fd)
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+            raise
+
+    def write(self, kind: bytes, payload: bytes) -> None:
+        """Append a block."""
+        data = block(kind, self._number, payload)
+        self._number += 1
+        self.size += len(data)
+        self._new += len(data)
+        write_all(self._fd, data)
+
+    def take(self, items: list[Item]) -> None:
+        """Append what came."""
+        self.write(b"D", data_payload(items))
+        if self._header is not None:
+            # once more, elsewhere: without it nothing can be made of the rest
+            self.write(b"H", self._header)
+            self._header = None
+
+    def sync(self) -> int:
+        """Force to the disk what was written; how many bytes since the last call. OSError where somebody removed a file."""
+        if os.fstat(self._fd).st_nlink == 0:
+            raise OSError(errno.ENOENT, "what was being written was removed")
+        if self._new:
+            os.fdatasync(self._fd)
+        new, self._new = self._new, 0
+        return new
+
+    def close(self) -> int:
+        """Close in good order; how many bytes since the last ``sync``."""
+        try:
+            self.write(b"E", b"")
+            os.fdatasync(self._fd)
+        finally:
+            os.close(self._fd)
+        return self._new
+
+    def abandon(self) -> None:
+        """Close without writing any more."""
+        with contextlib.suppress(OSError):
+            os.close(self._fd)
 
 
-def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
-    """What each ESC's last info frame says of the device now on its line; None where none has come."""
-    return [
-        None
-        if esc.last_info is None
-        else {
-            "device": esc.protocol.device_text(esc.last_info),
-            "variant": esc.protocol.value("variant", esc.last_info),
-            "firmware": esc.protocol.firmware_text(esc.last_info),
-            "layout": esc.protocol.layout_text(esc.layout) or "",
-        }
-        for esc in gateway.escs
-    ]
+def remove_oldest(folder: Path, keep_bytes: int) -> None:
+    """Keep the folder below a size, 0: any; what is being written, by any process, stays."""
+    if not keep_bytes:
+        return
+    found: list[tuple[int, str, int, Path]] = []
+    for path in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # another gateway has removed it
+            if _OURS.fullmatch(path.name) and not path.is_symlink() and path.is_file():
+                status = path.stat()
+                found.append((status.st_mtime_ns, path.name, status.st_size, path))
+    total = sum(size for _, _, size, _ in found)
+    for _, _, size, path in sorted(found):
+        if total <= keep_bytes:
+            return
+        if not is_locked(path):  # it is being written
+            with contextlib.suppress(OSError):
+                path.unlink()
+                total -= size

@@ -1,7 +1,13 @@
 """The recipe for another output: one class, one line in the gateway's tuple. It sends one invented frame a second for each ESC."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
+import pytest
+
+from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -90,3 +96,26 @@ def test_another_device_with_its_ids_is_noticed() -> None:
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
     assert [(each.whose, each.node) for each in gateway.conflicts.take()] == [("voltage", 1)]
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (0x182, "Volts: id 182h is used by TPDO 1 of CANopen node 2"),
+        (0x80, "SYNC"),
+        (0x581, "SDO answers of CANopen node 1"),
+    ],
+)
+def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused_by_name(
+    tmp_path: Path, number: int, said: str
+) -> None:
+    text = f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Logger\nBO_ {number} Volts: 8 Gw\n'
+    text += ' SG_ esc2BatteryVoltage : 0|16@1+ (0.01,0) [0|0] "V" Logger\n'
+    (tmp_path / "my.dbc").write_text(text)
+    tables = {
+        "esc": [{"port": "a"}, {"port": "b"}],
+        "canopen": {"enabled": True, "store": str(tmp_path)},
+        "dbc": {"file": str(tmp_path / "my.dbc")},
+    }
+    with pytest.raises(UserError, match=said):
+        assemble(parse(tables, "test"))

@@ -253,26 +253,6 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
     assert back.startswith("CAN can0: frames are sent again, after 5.0 s")
 
 
-def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> None:
-    loaded = assemble(
-        parse(
-            {"can": {"interface": "slcan", "channel": "/dev/ttyUSB1"}, "esc": [{"port": "p"}]},
-            "test",
-        )
-    )
-    gateway = Gateway(loaded.escs, loaded.layout, 0)
-    side = CanLink(
-        loaded.config.can,
-        gateway,
-        World().poller,
-        FaultLog(),
-        lambda path: "left" if "USB1" in path else None,
-    )
-    with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
-        side.open(0, wait=False)
-    side.close()
-
-
 def test_a_bus_that_stood_still_gets_no_backlog(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:

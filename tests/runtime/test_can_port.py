@@ -24,8 +24,7 @@ from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
-from kontronik_can_gw.runtime.driver_port import QUEUE_LENGTH, DriverPort
-from kontronik_can_gw.runtime.open_can import open_can
+from kontronik_can_gw.runtime.open_can import QUEUE_LENGTH, DriverPort, open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
 
@@ -179,13 +178,6 @@ def test_a_port_is_drained_when_nothing_waits(port: CanPort, fake: FakeSocket) -
     assert found == [(RECEIVE_LIMIT // 2, False), (RECEIVE_LIMIT // 2, False), (0, True)]
 
 
-def test_each_way_into_bus_off_is_counted_once(port: CanPort, fake: FakeSocket) -> None:
-    off, restarted = packet(ERROR | 0x40, bytes(8)), packet(ERROR | 0x100, bytes(8))
-    fake.inbox = [off, off, restarted, off, packet(ERROR | 0x04, b"\0\x10"), off]
-    port.receive()
-    assert port.bus_off_count == 3
-
-
 @pytest.mark.parametrize("number", [errno.ENETDOWN, errno.ENODEV, errno.EIO])
 def test_an_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number: int) -> None:
     port.set_receive_ids({1})
@@ -195,13 +187,9 @@ def test_an_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number
     assert port.gone is (number == errno.ENODEV)
     assert frames_of(port) == [CanFrame(1, b"b")]
     assert port.send(CanFrame(2, b"")) is (Sent.GONE if number == errno.ENODEV else Sent.OK)
-
-
-def test_an_interface_may_go_while_filters_are_set(port: CanPort, fake: FakeSocket) -> None:
     fake.fault = errno.ENODEV
     port.set_receive_ids({1})
-    assert port.gone
-    assert port.send(CanFrame(2, b"")) is Sent.GONE
+    assert port.gone, "an interface may go while filters are set, too"
 
 
 def test_frames_go_out_as_the_kernel_wants_them(port: CanPort, fake: FakeSocket) -> None:
@@ -244,9 +232,7 @@ def test_a_refusal_of_the_kernel_shows_what_is_wrong(
         (0x40, 0, CanState.BUS_OFF),
         (0x100, 0, CanState.ERROR_ACTIVE),
         (0x04, 0x04, CanState.ERROR_WARNING),
-        (0x04, 0x08, CanState.ERROR_WARNING),
         (0x04, 0x10, CanState.ERROR_PASSIVE),
-        (0x04, 0x20, CanState.ERROR_PASSIVE),
         (0x04, 0x30, CanState.ERROR_PASSIVE),
         (0x04, 0x40, CanState.ERROR_ACTIVE),
         (0x04, 0x00, CanState.UNKNOWN),
@@ -259,8 +245,8 @@ def test_error_frames_show_the_controllers_state_and_do_not_hold_the_loop(
     fake.inbox = [packet(ERROR | kind, bytes((0, detail)) + bytes(6)), b"short"] * 500
     assert port.receive() == []
     assert port.state is state
+    assert port.bus_off_count == (state is CanState.BUS_OFF)
     assert len(fake.inbox) >= 900
-    port.close()
 
 
 @pytest.mark.parametrize(
@@ -292,15 +278,11 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
 FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
 
 
-@pytest.mark.parametrize("proven", [True, False])
 @pytest.mark.parametrize("stopped_before", range(7))
 def test_what_became_late_in_the_middle_of_a_turn_stays(
-    port: CanPort, fake: FakeSocket, proven: bool, stopped_before: int
+    port: CanPort, fake: FakeSocket, stopped_before: int
 ) -> None:
     """The process is stopped in front of one of the frames: those before have gone, and nothing after."""
-    if proven:
-        assert port.send(CanFrame(0x7FF, b"")) is Sent.OK
-        fake.sent.clear()
     steps = itertools.count()
     answer = port.send_all(FRAMES, lambda: 1000 if next(steps) < stopped_before else 1001, 1000)
     assert answer == ((6, Sent.OK) if stopped_before == 6 else (stopped_before, Sent.LATE))

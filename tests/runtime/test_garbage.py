@@ -2,19 +2,16 @@
 
 import gc
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from capture_bench import Bench, made
 from statistics_bench import moment_of
+from wire_world import World, loop_in, run
 
-from kontronik_can_gw.config.keys import CanConfig, RecordConfig
-from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
-from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS
-from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.config.keys import RecordConfig
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.snapshot import snapshot
 
@@ -50,13 +47,13 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
     recorder.start()
     assert recorder._worker.stop(60)
     bench = Bench(*EVERYTHING)
-    run = bench.running(7)
-    run(2)  # the nodes boot, and what is made once is made
+    running = bench.running(7)
+    running(2)  # the nodes boot, and what is made once is made
     before, written, begun = None, 0, len(bench.sent)
     with collector_off():
         for _ in range(40):
             entries = len(bench.entries)
-            now = run(0.5)
+            now = running(0.5)
             for entry in bench.entries[entries:]:
                 recorder.put(*entry)
             recorder.note(bench.gateway, now)
@@ -73,27 +70,23 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
     assert written > 50_000
 
 
-def test_the_loop_leaves_no_garbage() -> None:
-    """With its selector, ports, conditions and the CAN side; python-can's virtual interface in place of a socket."""
+def test_the_loop_leaves_no_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its ports, conditions and the CAN side; lines that fall silent and speak again, a process that is held up."""
     setup, layout = EVERYTHING
-    further = [each.make for each in setup.outputs]
-    gateway = Gateway(setup.escs, layout, 0, False, setup.canopen, further)
-    wires = [encode(LiveData(battery_voltage=n, operating_errors=n % 3), Layout.V4) for n in range(50)]  # fmt: skip
-    clock = [0]
-    with ExitStack() as ends:
-        escs = [ends.enter_context(PtyEsc()) for _ in setup.escs]
-        paths, can = [esc.path for esc in escs], CanConfig("virtual", "garbage")
-        loop = Loop(gateway, paths, can, clock=lambda: clock[0])
-        loop.open()
-        loop.begin()
-        try:
-            with collector_off():
-                for turn in range(600):
-                    for esc in escs:
-                        esc.write(wires[turn % 50] if turn % 90 else b"???")
-                    clock[0] += 10 * MS if turn % 200 else 300 * MS
-                    loop.turn()
-                assert garbage() == []
-        finally:
-            loop.end()
-    assert all(esc.counters.live > 400 for esc in gateway.escs)
+    world, further = World(2), [each.make for each in setup.outputs]
+    loop = loop_in(world, monkeypatch, setup.escs, layout, setup.canopen, further=further)
+    loop.open()
+    loop.begin()
+    for second in range(0, 8, 2):
+        for wire in world.wires:
+            begin = world.now + second * SECOND
+            wire.stream(begin, begin + SECOND, 10 * MS)
+            wire.put(b"???", [begin + SECOND] * 3)
+    run(loop, world, world.now + SECOND)
+    with collector_off():
+        for _ in range(3):
+            run(loop, world, world.now + 2 * SECOND)
+            world.now += 300 * MS
+        assert garbage() == []
+    loop.end()
+    assert all(esc.counters.live > 300 for esc in loop.gateway.escs)

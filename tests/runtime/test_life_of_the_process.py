@@ -7,16 +7,13 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
-from kontronik_can_gw.desk import pty
-from kontronik_can_gw.desk.pty import PtyEsc
+from vcan_tools import feeding
+
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 ENOUGH = 36_000
@@ -24,24 +21,6 @@ ENOUGH = 36_000
 
 LIMIT_S = 120
 """For what comes; nothing is judged by how long it takes."""
-
-
-@contextmanager
-def telemetry(*options: EscOptions) -> Iterator[list[str]]:
-    """ESCs on pseudo terminals; their paths."""
-    terminals, stopped = [PtyEsc() for _ in options], threading.Event()
-    simulated = [SimulatedEsc(one, seed=number) for number, one in enumerate(options)]
-    escs = list(zip(simulated, terminals, strict=True))
-    thread = threading.Thread(target=lambda: pty.run(escs, stop=stopped.is_set), daemon=True)
-    thread.start()
-    try:
-        yield [terminal.path for terminal in terminals]
-    finally:
-        stopped.set()
-        thread.join(LIMIT_S)
-        for terminal in terminals:
-            terminal.close()
-    assert [terminal.received for terminal in terminals] == [0, 0], "sent to an ESC"
 
 
 CONFIGURATION = """
@@ -64,11 +43,13 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
     captures = tmp_path / "captures"
     command = [*PROGRAM, "run", "-c", str(config), "--wait", "--record", str(captures)]
     with (
-        telemetry(EscOptions(faults=Faults(flipped_bits=0.0005)), EscOptions()) as ports,
+        feeding(tmp_path, 2) as escs,
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening,
         errors.open("w") as log,
     ):
-        config.write_text(CONFIGURATION.format(folder=tmp_path, ports=ports))
+        config.write_text(CONFIGURATION.format(folder=tmp_path, ports=[esc.path for esc in escs]))
+        for esc in escs:
+            esc.on = True
         listening.bind(manager["NOTIFY_SOCKET"])
         listening.settimeout(LIMIT_S)
         process = subprocess.Popen(command, stderr=log, env=environment)
@@ -111,7 +92,7 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
     with open_input(captures) as found:
         list(found.frames())
         assert found.damage == []
-        assert "KOSMIK 120, firmware 4.17, V4 layout" in found.provenance["esc1"]
+        assert "KOSMIK 101, firmware 1.14, V4 layout" in found.provenance["esc1"]
         assert re.fullmatch(r".*\.dbc, layout [0-9A-F]{8}", found.provenance["DBC"])
 
 

@@ -26,19 +26,15 @@ def link_message(
     return struct.pack("=IHHII", 16 + len(body), kind, 0, 0, 0) + body
 
 
-def can_data(
-    state: int = 0,
-    bitrate: int = 250_000,
-    restart_ms: int = 100,
-    counters: tuple[int, int] = (0, 0),
-) -> bytes:
-    timing = struct.pack("=8I", bitrate, 875, *range(6))
-    parts = (
-        attribute(1, timing)
-        + attribute(4, struct.pack("=I", state))
-        + attribute(6, struct.pack("=I", restart_ms))
-    )
-    return parts + attribute(8, struct.pack("=HH", *counters))
+def can_data(state: int = 0) -> bytes:
+    """Of a controller with 125 kbit/s that is not restarted by itself, its error counters 130 and 7."""
+    parts = {
+        1: struct.pack("=8I", 125_000, 875, *range(6)),
+        4: struct.pack("=I", state),
+        6: bytes(4),
+        8: struct.pack("=HH", 130, 7),
+    }
+    return b"".join(attribute(kind, value) for kind, value in parts.items())
 
 
 LINK = link_message(can=can_data())
@@ -64,46 +60,40 @@ class FakeSocket:
         pass
 
 
-def monitor_of(*datagrams: bytes | int, name: str = "can0") -> tuple[LinkMonitor, FakeSocket]:
-    monitor, fake = LinkMonitor(name), FakeSocket(*datagrams)
+def monitor_of(*datagrams: bytes | int) -> tuple[LinkMonitor, FakeSocket]:
+    monitor, fake = LinkMonitor("can0"), FakeSocket(*datagrams)
     monitor.close()
     monitor._socket = fake  # type: ignore[assignment]
     return monitor, fake
 
 
-def heard(*datagrams: bytes | int, name: str = "can0") -> list[LinkFacts]:
-    return monitor_of(*datagrams, name=name)[0].take()
+def heard(*datagrams: bytes | int) -> list[LinkFacts]:
+    return monitor_of(*datagrams)[0].take()
 
 
 @pytest.mark.parametrize(
-    ("number", "state"),
+    ("number", "flags", "state", "runs"),
     [
-        (0, CanState.ERROR_ACTIVE),
-        (2, CanState.ERROR_PASSIVE),
-        (4, None),  # stopped
-        (77, None),
+        (0, 0x10041, CanState.ERROR_ACTIVE, True),
+        (2, 0x10041, CanState.ERROR_PASSIVE, True),
+        (3, 0x1, CanState.BUS_OFF, False),
+        (3, 0x41, CanState.BUS_OFF, False),
+        (3, 0x10001, CanState.BUS_OFF, False),
+        (4, 0x10041, None, True),  # stopped
+        (77, 0x10041, None, True),
     ],
 )
-def test_what_a_controller_reports(number: int, state: CanState | None) -> None:
-    data = can_data(state=number, bitrate=125_000, restart_ms=0, counters=(130, 7))
-    assert heard(link_message(can=data)) == [
-        LinkFacts(True, True, "can", state, 125_000, 0, (130, 7))
-    ]
-
-
-@pytest.mark.parametrize("flags", [0x1, 0x41, 0x10001])
-def test_a_controller_in_bus_off_is_up_and_does_not_run(flags: int) -> None:
-    (facts,) = heard(link_message(can=can_data(state=3), flags=flags))
-    assert (facts.up, facts.running, facts.state) == (True, False, CanState.BUS_OFF)
+def test_what_a_controller_reports(
+    number: int, flags: int, state: CanState | None, runs: bool
+) -> None:
+    """One in bus-off is up and does not run."""
+    expected = LinkFacts(True, True, "can", state, 125_000, 0, (130, 7), runs)
+    assert heard(link_message(can=can_data(number), flags=flags)) == [expected]
 
 
 def test_other_interfaces_are_none_of_ours_and_a_removed_one_is_gone() -> None:
-    datagram = (
-        link_message(name="can1")
-        + link_message()
-        + link_message(kind=17, name="eth0")
-        + link_message(kind=17)
-    )
+    others = link_message(name="can1") + link_message(kind=17, name="eth0")
+    datagram = others + link_message() + link_message(kind=17)
     assert [facts.exists for facts in heard(datagram)] == [True, False]
 
 

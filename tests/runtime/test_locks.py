@@ -64,9 +64,7 @@ def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
 
 
 @pytest.mark.parametrize("what", ["dbc", "canopen", "dronecan"])
-def test_a_second_gateway_with_the_same_node_or_messages_is_refused(
-    what: str,
-) -> None:
+def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -> None:
     tables = {
         "can": {"channel": CHANNEL},
         "dbc": {"enabled": what == "dbc"},

@@ -39,29 +39,14 @@ def store(tmp_path: Path) -> Iterator[ParameterStore]:
     made.close(PATIENCE)
 
 
-def wait_for(store: ParameterStore, count: int) -> list[tuple[str, str | None]]:
-    """Take ``count`` results as the loop does: only when the descriptor is readable."""
-    taken: list[tuple[str, str | None]] = []
-    while len(taken) < count:
-        assert select.select([store.fileno()], [], [], PATIENCE)[0], "no result came"
-        taken += store.results()
-    assert select.select([store.fileno()], [], [], 0)[0] == []
-    return taken
-
-
 def put(store: ParameterStore, name: str, data: bytes) -> str | None:
-    """Save one content and return its result."""
+    """Save one content and return its result, taken as the loop does: when the descriptor is readable."""
     assert store.save(name, data)
-    ((about, problem),) = wait_for(store, 1)
+    assert select.select([store.fileno()], [], [], PATIENCE)[0], "no result came"
+    ((about, problem),) = store.results()
+    assert select.select([store.fileno()], [], [], 0)[0] == []
     assert about == name
     return problem
-
-
-def mode(path: Path) -> int:
-    return stat.S_IMODE(path.stat().st_mode)
-
-
-# --- there and back
 
 
 def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterStore) -> None:
@@ -79,47 +64,16 @@ def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterSt
     assert again.close(0)
 
 
-@pytest.mark.parametrize(("there", "expected"), [(None, 0o700), (0o750, 0o750)])
 def test_files_are_the_owners_alone_and_a_folder_that_is_made_too(
-    tmp_path: Path, there: int | None, expected: int
+    tmp_path: Path, store: ParameterStore
 ) -> None:
-    folder = tmp_path / "a" / "b"
-    if there is not None:
-        folder.mkdir(parents=True)
-        folder.chmod(there)
-    store = ParameterStore(folder)
     before = os.umask(0)
     try:
         assert put(store, "esc1", OLD) is None
     finally:
         os.umask(before)
-        store.close(PATIENCE)
-    assert mode(folder) == expected
-    assert [(path.name, mode(path)) for path in folder.iterdir()] == [("esc1.params", 0o600)]
-
-
-# --- queue and results
-
-
-def test_a_slow_disk_holds_up_nobody_and_results_come_in_order(
-    store: ParameterStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reached, go, real = threading.Event(), threading.Event(), os.fsync
-
-    def fsync(fd: int) -> None:
-        reached.set()
-        assert go.wait(PATIENCE)
-        real(fd)
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    for number in range(10):
-        assert store.save(f"esc{number % 3}", numbered(number))
-    assert reached.wait(PATIENCE)  # the worker hangs in the first saving
-    assert store.results() == []
-    assert select.select([store.fileno()], [], [], 0)[0] == []
-    go.set()
-    assert wait_for(store, 10) == [(f"esc{number % 3}", None) for number in range(10)]
-    assert [number_of(store.load(f"esc{n}")[0]) for n in range(3)] == [9, 7, 8]
+    found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.rglob("*")}
+    assert found == {"params": 0o700, "esc1.params": 0o600}
 
 
 def test_a_system_without_a_thread_to_give_refuses_the_saving(
@@ -164,11 +118,12 @@ def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
-def test_a_file_that_cannot_be_read_now_is_left_alone(
+def test_a_file_that_cannot_be_read_now_is_left_alone_and_half_a_new_one_is_never_read(
     tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error of the disk that passes must not cost the settings."""
-    place(tmp_path, OLD)
+    folder = place(tmp_path, OLD)
+    (folder / "esc1.params.tmp").write_bytes(NEW)
 
     def fail(_path: Path) -> bytes:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
@@ -177,12 +132,6 @@ def test_a_file_that_cannot_be_read_now_is_left_alone(
         patched.setattr(Path, "read_bytes", fail)
         stored, reason = store.load("esc1")
     assert stored == Stored() and reason and reason.endswith("Input/output error")
-    assert store.load("esc1") == (decode(OLD), None)
-
-
-def test_a_left_over_temporary_file_is_never_read(tmp_path: Path, store: ParameterStore) -> None:
-    folder = place(tmp_path, OLD)
-    (folder / "esc1.params.tmp").write_bytes(NEW)
     assert store.load("esc1") == (decode(OLD), None)
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
 

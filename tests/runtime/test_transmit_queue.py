@@ -33,14 +33,6 @@ def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
     return len(taken)
 
 
-def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
-    queue.put_all([queued(n) for n in range(6)] + [slot(0x181 + n) for n in range(6)])
-    while len(queue):
-        assert send(queue, sent, 1) == 1
-    assert [frame.queued for frame in sent] == [True, False] * 6
-
-
 def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     queue, sent = TransmitQueue(), list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
@@ -81,11 +73,11 @@ STEPS = st.lists(st.one_of(PUTS, st.integers(0, 6)), max_size=80)
 
 
 @settings(deadline=None)  # a busy machine is no fault
-@given(STEPS)
+@given(STEPS, st.booleans())
 def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent(
-    steps: list[tuple[bool, int] | int],
+    steps: list[tuple[bool, int] | int], one_by_one: bool
 ) -> None:
-    """``steps``: put a (queued?, id) frame, or let the interface take so many frames."""
+    """``steps``: put a (queued?, id) frame, or let the interface take so many frames, at once or with turns broken off after each."""
     queue, sent = TransmitQueue(), list[CanFrame]()
     put: list[CanFrame] = []
     newest: dict[int, CanFrame] = {}  # slots that wait
@@ -98,7 +90,8 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
             queue.put_all([frame])
             continue
         before, both = len(sent), 0 < len(newest) < len(queue)
-        send(queue, sent, step)
+        for _ in range(step if one_by_one else 1):
+            send(queue, sent, 1 if one_by_one else step)
         now_sent = sent[before:]
         for frame in now_sent:
             if not frame.queued:

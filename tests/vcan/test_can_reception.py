@@ -4,10 +4,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+import pytest
 from raw_bus import EXTENDED, INVERTED, REMOTE, RawBus
-from vcan_tools import LIMIT_S, MARK, wait_for_delivery
+from vcan_tools import LIMIT_S, MARK, ip, wait_for_delivery
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.can_port import CanPort
@@ -85,6 +87,13 @@ def test_long_frames_leave_and_come_as_can_fd(vcan: str) -> None:
     with port_on(vcan, [], fd=True) as port, port_on(vcan, [long.key, 0x10], fd=True) as other:
         assert [port.send(frame) for frame in (long, short)] == [Sent.OK, Sent.OK]
         assert all_of(other, vcan) == [long, short]
+
+
+def test_an_interface_without_can_fd_is_refused_with_the_command_that_mends_it(vcan: str) -> None:
+    ip("link", "set", vcan, "down")
+    ip("link", "set", vcan, "mtu", "16")
+    with pytest.raises(RunError, match=f"ip link set {vcan} mtu 72"), port_on(vcan, [], fd=True):
+        pass
 
 
 def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(
