@@ -21,7 +21,7 @@ or COVERAGE_. Python finds no asammdf in there, which python-can imports where i
 
 Kept in mind in here: UML does not save the AVX-512 registers over a signal, so glibc and OpenSSL are told to leave
 them alone, and number crunchers with a dispatcher of their own, as numpy, must stay outside. /dev/kvm may be there
-and not work: QEMU always emulates. SIGKILL leaves UML's children behind: SIGTERM comes first, then the whole group.
+and not work: QEMU always emulates. SIGKILL leaves UML's children behind: SIGTERM comes first.
 """
 
 import argparse
@@ -37,8 +37,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import BinaryIO, NoReturn
 
@@ -55,7 +55,6 @@ TMPFS = ("/tmp", "/var/tmp", "/run", "/dev/shm")  # guest-init.sh mounts an empt
 
 UML_MEMORY_MIB = 512
 QEMU_MEMORY_MIB = 1024
-START_TIMEOUT_S = {"uml": 120.0, "qemu": 180.0}
 
 GLIBC_WITHOUT_AVX512 = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW"
 # CPUID leaf 7, EBX: the bits of AVX512 F, DQ, IFMA, PF, ER, CD, BW, VL
@@ -239,39 +238,12 @@ def pump(fd: int, to: BinaryIO) -> None:
                 to.flush()
 
 
-def guard(group: int, job: str) -> int:
-    """Forks a process that ends the VM when this one was killed outright; returns the fd to write to when all is well."""
-    read, write = os.pipe()
-    if os.fork():
-        os.close(read)
-        return write
-    try:
-        os.setsid()
-        os.dup2(os.open(os.devnull, os.O_RDWR), 1)
-        os.dup2(1, 2)
-        os.close(write)
-        if not os.read(read, 1):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(group, signal.SIGTERM)
-                time.sleep(0.5)
-                os.killpg(group, signal.SIGKILL)
-            shutil.rmtree(job, ignore_errors=True)
-    finally:
-        os._exit(0)
-
-
-def stop(process: subprocess.Popen[bytes]) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
-    if process.poll() is None:
-        process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(5)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, leave)
+UNDERTAKER = """
+cat >/dev/null
+kill -TERM -$0 && sleep 1 && kill -KILL -$0
+rm -rf "$1"
+"""
+"""A shell that outlives this process, however that ends: then what is left of the VM's processes, and its job folder, go."""
 
 
 def leave(number: int, _frame: FrameType | None) -> NoReturn:
@@ -297,40 +269,13 @@ def start_vm(
     )
 
 
-def wait_for_end(
-    process: "subprocess.Popen[bytes]", backend: str, job: str, timeout_s: float
-) -> str:
-    """Why it is not waited for any longer; nothing if it has ended."""
-    start, started = time.monotonic(), False
-    while True:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(max(0.0, start + timeout_s - time.monotonic()) if started else 0.1)
-            return ""
-        started = started or is_started(job)
-        elapsed_s = time.monotonic() - start
-        if elapsed_s >= timeout_s:
-            return f"no end within {timeout_s:g} s"
-        if not started and elapsed_s >= START_TIMEOUT_S[backend]:
-            return f"no start within {elapsed_s:.0f} s"
-
-
-def is_started(job: str) -> bool:
-    return os.path.exists(os.path.join(job, "started"))
-
-
-def read(job: str, name: str) -> str:
-    try:
-        with open(os.path.join(job, name), errors="replace") as file:
-            return file.read()
-    except OSError:
-        return ""
-
-
 def run_in_vm(
     backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
 ) -> tuple[int, bool]:
     """Returns the exit code, and whether the command was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
+    undertaker = None
+    result, started = Path(job, "rc"), Path(job, "started")
     try:
         write_job(job, backend, command, writable)
         pipes = [os.pipe() for _ in range(2)]
@@ -340,35 +285,40 @@ def run_in_vm(
         finally:
             for _, end in pipes:
                 os.close(end)
-        guard_fd = guard(process.pid, job)
+        undertaker = subprocess.Popen(
+            ["sh", "-c", UNDERTAKER, str(process.pid), job],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         pumps = [
             threading.Thread(target=pump, args=(end, to.buffer), daemon=True)
             for (end, _), to in zip(pipes, (sys.stdout, sys.stderr), strict=True)
         ]
+        for thread in pumps:
+            thread.start()
         try:
-            for thread in pumps:
-                thread.start()
-            late = wait_for_end(process, backend, job, timeout_s)
-        finally:
-            stop(process)
-            os.write(guard_fd, b".")
-            os.close(guard_fd)
+            process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            print(f"vm/run: {backend}: no end within {timeout_s:g} s", file=sys.stderr)
+            return TIMED_OUT, True
         for thread in pumps:
             thread.join(60)
-        code, started = read(job, "rc").strip(), is_started(job)
-        if code and not late:
-            return int(code), True
-        print(f"vm/run: {backend}: {late or 'the VM ended without a result'}", file=sys.stderr)
-        if late and started:
-            return TIMED_OUT, True
-        if not late:
-            print(*(read(job, name)[-4000:] for name in ("log", "klog")), file=sys.stderr)
-        return VM_FAILED, started
+        if result.exists() and result.read_text().strip():
+            return int(result.read_text()), True
+        print(f"vm/run: {backend}: the VM ended without a result", file=sys.stderr)
+        for file in map(Path, (f"{job}/log", f"{job}/klog")):
+            if file.exists():
+                print(file.read_text(errors="replace")[-4000:], file=sys.stderr)
+        return VM_FAILED, started.exists()
     except (OSError, subprocess.CalledProcessError) as error:
         print(f"vm/run: {backend}: {error}", file=sys.stderr)
         return VM_FAILED, False
     finally:
-        shutil.rmtree(job, ignore_errors=True)
+        if undertaker is None:
+            shutil.rmtree(job, ignore_errors=True)
+        else:
+            undertaker.communicate()
 
 
 # --- the command line
@@ -387,8 +337,7 @@ def installed() -> list[str]:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(usage=__doc__, add_help=True)
-    kinds, default = ("auto", *BACKENDS), os.environ.get("KCG_VM_BACKEND") or "auto"
-    parser.add_argument("--backend", choices=kinds, default=default)
+    parser.add_argument("--backend", choices=("auto", *BACKENDS), default="auto")
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")
@@ -426,10 +375,7 @@ def main() -> int:
         if code != VM_FAILED or started:
             return code
     if not vms:
-        print(
-            "vm/run: this kernel has no vcan and there is no VM: run tests/vm/setup.sh uml",
-            file=sys.stderr,
-        )
+        print("vm/run: no vcan here, and no VM: run tests/vm/setup.sh uml", file=sys.stderr)
     return VM_FAILED
 
 
