@@ -115,7 +115,6 @@ def loaded(bench: Bench, injection: Injection, seconds: float) -> None:
         time.sleep(seconds)
         others.terminate()
         others.wait()
-    bench.watch.settle(bench.stood_still)
     late = bench.watch.by_more - before
     bench.expect(late <= MAX_IN_CONTROLLER, f"{late} values were late")
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from encoding import Identity, info_values, live_values
+from feeder import Identity, info_values, live_values
 
 LIVE_NAMES = frozenset(live_values(Identity(), 0))
 INFO_NAMES = frozenset(info_values(Identity(), 0))
