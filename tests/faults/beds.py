@@ -56,7 +56,7 @@ def bench_of(
     ports = [
         PtyPort(folder / f"esc{i + 1}", identity, rate_hz) for i, identity in enumerate(identities)
     ]
-    known = table(("--esc", str(len(ports))), options.get("canopen", "") is not None, len(ports))
+    known = table(("--esc", str(len(ports))), options.get("canopen", True), len(ports))
     try:
         with Bench(near, far, ports, known, **options) as bench:
             bench.start()
@@ -74,7 +74,7 @@ def eight(_: Path) -> contextlib.AbstractContextManager[Bench]:
     """Slow ones: feeder and judge have the processor, too."""
     layouts = (Layout.V4, Layout.LEGACY)
     identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
-    return bench_of(identities, rate_hz=25, canopen=None)
+    return bench_of(identities, rate_hz=25, canopen=False)
 
 
 BUS: list[Bus] = []

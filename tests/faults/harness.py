@@ -166,8 +166,7 @@ class PtyPort(FedEsc):
 class Bench:
     """Everything that runs around one gateway.
 
-    ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen`` None: no nodes.
-    ``dbc``: another layout than the shipped one.
+    ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen``: with a node for each ESC.
     """
 
     said_instead: str | None = None
@@ -181,12 +180,10 @@ class Bench:
         table: Table,
         *,
         slack_ns: int = 60 * MS,
-        canopen: str | None = "self_start = true",
-        dbc: Path | None = None,
+        canopen: bool = True,
         store: Path | None = None,
         prefix: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
-        start_limit_s: float = 20,
     ) -> None:
         self.interface = interface
         self.watched = watched
@@ -196,8 +193,7 @@ class Bench:
         self.config = self.folder / "gateway.toml"
         self.prefix = tuple(prefix)
         self.environment = dict(environment or {})
-        self.start_limit_s = start_limit_s
-        self.config.write_text(self._configuration(canopen, dbc))
+        self.config.write_text(self._configuration(canopen))
         self.watch = BusWatch(watched, table, self.escs, slack_ns=slack_ns).start()
         self.feeder = Feeder(self.escs).start()
         self._gateway: Gateway | None = None
@@ -205,12 +201,11 @@ class Bench:
         self._received = 0
         self._excluded: list[list[tuple[int, int]]] = [[] for _ in escs]
 
-    def _configuration(self, canopen: str | None, dbc: Path | None) -> str:
+    def _configuration(self, canopen: bool) -> str:
         text = f'[can]\ninterface = "socketcan"\nchannel = "{self.interface}"\nbitrate = 1000000\n'
-        if canopen is not None:
-            text += f'[canopen]\nenabled = true\nnode_id = 1\nserial = 1050112\nstore = "{self.store}"\n{canopen}\n'
-        if dbc is not None:
-            text += f'[dbc]\nfile = "{dbc}"\n'
+        if canopen:
+            text += "[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nserial = 1050112\n"
+            text += f'store = "{self.store}"\n'
         for i, esc in enumerate(self.escs):
             text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{esc.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
         return text
@@ -230,7 +225,7 @@ class Bench:
         self._gateway = Gateway(self.config, self.prefix, self.environment)
         if wait:
             on = [i for i, esc in enumerate(self.escs) if esc.on]
-            self.wait_fresh(on, begin, self.start_limit_s)
+            self.wait_fresh(on, begin, 20)
             self.leave_out(range(len(self.escs)), begin - IN_FLIGHT_NS, time.monotonic_ns())
 
     def stop(self) -> int:

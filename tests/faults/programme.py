@@ -26,7 +26,6 @@ import can_faults  # noqa: F401  registers its faults, as the others do
 import process_faults  # noqa: F401
 import qemu_faults  # noqa: F401
 import serial_faults  # noqa: F401
-import traffic_faults  # noqa: F401
 from fault_report import FAILED, PAGE, Fault, Report, in_order, put
 from harness import Bench
 

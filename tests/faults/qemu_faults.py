@@ -54,7 +54,7 @@ def hampered_start(bench: MachineBench, injection: Injection, _n: int) -> None:
     with driver_away(), held(bench.uart.path):
         bench.start(wait=False)
         for words in (f"{bench.uart.path}: is in use", "CAN interface can0"):
-            bench.wait_log(words, seconds=bench.start_limit_s)
+            bench.wait_log(words, seconds=20)
         time.sleep(1)
     injection.cleared()
     injection.wait_recovery()
