@@ -37,7 +37,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import BinaryIO, NoReturn
@@ -61,18 +61,16 @@ GLIBC_WITHOUT_AVX512 = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW"
 OPENSSL_WITHOUT_AVX512 = ":~0xdc230000"
 
 
-def passed_on(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables that COMMAND gets where it does not simply inherit them; PATH with the folders of `ip` and `tc`."""
-    kept = {name: value for name, value in environment.items() if PASSED_ON.match(name)}
-    kept["PATH"] = with_sbin(kept.get("PATH", ""))
-    return kept
+def passed_on() -> dict[str, str]:
+    """The variables that COMMAND gets where it does not simply inherit them."""
+    return {name: value for name, value in os.environ.items() if PASSED_ON.match(name)}
 
 
-def with_sbin(path: str) -> str:
-    folders = path.split(os.pathsep) if path else []
-    return os.pathsep.join(
-        folders + [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders]
-    )
+def extend_path() -> None:
+    """By the folders of `ip` and `tc`."""
+    folders = os.environ.get("PATH", "").split(os.pathsep)
+    further = [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders]
+    os.environ["PATH"] = os.pathsep.join(filter(None, folders + further))
 
 
 # --- this kernel
@@ -90,7 +88,7 @@ def native_prefix() -> list[str] | None:
     rights = "--inh-caps=+net_admin,+net_raw --ambient-caps=+net_admin,+net_raw"
     ids = f"--reuid={os.getuid()} --regid={os.getgid()} --init-groups"
     as_root = f"sudo -n unshare --net setpriv {ids} {rights} env".split()
-    as_root += [f"{name}={value}" for name, value in passed_on(os.environ).items()] + with_lo
+    as_root += [f"{name}={value}" for name, value in passed_on().items()] + with_lo
     interface = f"vm{os.getpid()}"
     probe = ["sh", "-c", f"ip link add dev {interface} type vcan && ip link del {interface}"]
     for prefix in ([], namespace, as_root):
@@ -198,7 +196,7 @@ def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence
     with open(os.path.join(without, "asammdf.py"), "w") as file:
         file.write('raise ImportError("kept out of virtual machines by tests/vm/vm_run.py")\n')
     path = os.pathsep.join(filter(None, ("/run/job/without", os.environ.get("PYTHONPATH"))))
-    environment = passed_on(os.environ) | {
+    environment = passed_on() | {
         "VM_BACKEND": backend,
         "TMPDIR": "/tmp",
         "NO_COLOR": "1",
@@ -257,7 +255,6 @@ def start_vm(
         command, environment = uml_command(job, out, err), uml_host_environment(job)
     else:
         command, environment = qemu_command(job, out, err), {"TMPDIR": job}
-    environment |= {"PATH": with_sbin(os.environ.get("PATH", ""))}
     return subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -326,13 +323,10 @@ def run_in_vm(
 
 def installed() -> list[str]:
     """The kinds of VM that can be tried, the better one first."""
-    path = with_sbin(os.environ.get("PATH", ""))
     if not os.path.exists("/usr/bin/busybox"):
         return []
-    vms = ["uml"] if all(shutil.which(each, path=path) for each in ("linux.uml", "cc")) else []
-    return vms + (
-        ["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64", path=path) else []
-    )
+    vms = ["uml"] if shutil.which("linux.uml") and shutil.which("cc") else []
+    return vms + (["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64") else [])
 
 
 def arguments() -> argparse.Namespace:
@@ -354,9 +348,9 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = arguments()
+    extend_path()
     prefix = None
     if args.backend in ("auto", "native"):
-        os.environ["PATH"] = with_sbin(os.environ.get("PATH", ""))
         prefix = native_prefix()
         if prefix is None and args.backend == "native" and not args.which:
             print("vm/run: native: this kernel has no vcan, or not for us", file=sys.stderr)
