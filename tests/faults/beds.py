@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from encoding import Identity
 from fault_report import FAULTS, Fault
+from feeder import Identity
 from harness import Bench, PtyPort
 from signals import table_sent
 from slcan_adapters import Bus
@@ -26,6 +26,7 @@ table = functools.cache(table_sent)
 """Of the shipped layouts."""
 _numbers = itertools.count()
 MakesBench = Callable[[Path], contextlib.AbstractContextManager[Bench]]
+Injects = Callable[[Any, Any, Any], None]
 
 
 def run(command: str) -> None:
@@ -55,7 +56,7 @@ def bench_of(
     ports = [
         PtyPort(folder / f"esc{i + 1}", identity, rate_hz) for i, identity in enumerate(identities)
     ]
-    known = table(("--esc", str(len(ports))), options.get("canopen", "") is not None, len(ports))
+    known = table(("--esc", str(len(ports))), options.get("canopen", True), len(ports))
     try:
         with Bench(near, far, ports, known, **options) as bench:
             bench.start()
@@ -73,7 +74,7 @@ def eight(_: Path) -> contextlib.AbstractContextManager[Bench]:
     """Slow ones: feeder and judge have the processor, too."""
     layouts = (Layout.V4, Layout.LEGACY)
     identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
-    return bench_of(identities, rate_hz=25, canopen=None)
+    return bench_of(identities, rate_hz=25, canopen=False)
 
 
 BUS: list[Bus] = []
@@ -96,22 +97,13 @@ def adapters(_: Path) -> Iterator[Bench]:
         BUS[0].close()
 
 
-Injects = Callable[[Any, Any, Any], None]
-
-
 def fault(
-    area: str,
-    name: str,
-    limit_s: float | None,
-    *,
-    bed: MakesBench = two,
-    machine: str = "UML",
-    **further: Any,
+    area: str, name: str, limit_s: float | None, *, bed: MakesBench = two, **further: Any
 ) -> Callable[[Injects], Injects]:
     """Register a function as a fault; when its cause is ``cleared``, its recovery is waited for."""
 
     def register(inject: Injects) -> Injects:
-        FAULTS.append(Fault(machine, area, name, limit_s, inject, bed, **further))
+        FAULTS.append(Fault(area, name, limit_s, inject, bed, **further))
         return inject
 
     return register

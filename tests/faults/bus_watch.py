@@ -1,18 +1,17 @@
 """Judges every frame on a bus: a value is marked not available, or it is what an ESC sent a moment ago. Everything else is a wrong value.
 
-``Judge`` is pure: frames and times in. ``BusWatch`` reads a socket in a thread; times are the kernel's time stamps of the frames,
-brought to the monotonic clock, so what this process loses does not count.
+``Judge`` is pure: frames and times in. ``BusWatch`` reads a socket in a thread; times are monotonic nanoseconds at which it has read a
+frame, so what it loses itself counts against the gateway: never the other way.
 """
 
 import contextlib
 import select
 import socket
-import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Sequence
+from typing import NamedTuple, Self
 
 from feeder import CURRENT, SPEED, FedEsc
 from raw_bus import EXTENDED, FRAME, SO_RCVBUFFORCE
@@ -26,8 +25,6 @@ LOOKED_BACK = 3000
 """So many frames are searched to say where a wrong value comes from."""
 KEPT = 100
 
-_SO_TIMESTAMPNS = 35
-_STAMP = struct.Struct("=qq")
 _FOLLOWS = {"Speed": SPEED, "Current": CURRENT}
 
 
@@ -36,12 +33,6 @@ class Wrong(NamedTuple):
 
     at_ns: int
     what: str
-    since_ns: int | None = None
-    """Where it is right but old: when it was sent."""
-    excess_ns: int = 0
-    """And by how much it is too old."""
-    shown: tuple[int, int, int] | None = None
-    """And the ESC, the number of its live frame and which message it is."""
 
 
 class Fresh(NamedTuple):
@@ -68,9 +59,9 @@ class Said(NamedTuple):
     flags: int | None
     """The error bits, where the message has any and they hold."""
 
-    def wrong(self, why: str, *further: Any) -> Wrong:
+    def __str__(self) -> str:
         values = ", ".join(f"{name} {value:g}" for name, value, _ in self.present)
-        return Wrong(self.at_ns, f"{self.message.name}: {values}: {why}", *further)
+        return f"{self.message.name}: {values}"
 
     def is_of(self, values: dict[str, float]) -> bool:
         same = all(abs(values[name] - value) <= half for name, value, half in self.present)
@@ -87,11 +78,10 @@ class Judge:
         self.more_ns = 0
         """Slack besides, for a while: what a bus or an adapter holds nobody can take back."""
         self.by_more = 0
-        """Settled values that were right only because of it, and not because the machine stood still."""
-        self.wrong: list[Wrong] = []
-        """The newest ones, settled."""
+        """Values that were right only because of it."""
+        self.wrong: deque[Wrong] = deque(maxlen=KEPT)
+        """The newest ones."""
         self.wrong_count = 0
-        """Settled ones; see ``settle``."""
         self.values = 0
         """Frames with values that were compared and right."""
         self.marked = 0
@@ -101,9 +91,6 @@ class Judge:
         self.emergencies: list[Emergency] = []
         self.fresh: list[deque[Fresh]] = [deque(maxlen=5_000) for _ in escs]
         """The EscSpeed frames that were right."""
-        self.last_ns = 0
-        self._suspects: list[Wrong] = []
-        self._held: list[tuple[int, int, int]] = []  # sent, came, too old by: right because of it
         # CAN id -> number of the newest live frame that it has carried
         self._newest: dict[int, int] = {}
         self._bits: dict[str, tuple[Message, int]] = {}  # message name -> message, content
@@ -112,7 +99,6 @@ class Judge:
 
     def take(self, can_id: int, data: bytes, at_ns: int) -> None:
         """A classic frame with an 11-bit identifier that the gateway has sent."""
-        self.last_ns = at_ns
         bits = int.from_bytes(data, "little")
         if can_id - 0x700 in self._nodes and data == b"\0":
             self.boot_ups.append((at_ns, can_id - 0x700))
@@ -147,36 +133,9 @@ class Judge:
                 found = fresh
         return found
 
-    def silences(self, esc: int, begin_ns: int, end_ns: int) -> list[tuple[int, int]]:
-        """Begin and end of each time in which an ESC had sent something newer than what was on the bus.
-
-        (While it sends nothing, because it is off or its feeder is held up, the gateway cannot be silent.)
-        """
-        fed, shown, found = self.escs[esc], -1, []
-        for fresh in (*tuple(self.fresh[esc]), Fresh(end_ns, len(self.escs[esc].sent) - 1)):
-            since_ns = max(fed.left(shown + 1), begin_ns) if fresh.n > shown else fresh.at_ns
-            if fresh.at_ns > since_ns:
-                found.append((since_ns, fresh.at_ns))
-            shown = fresh.n
-        return found
-
-    def settle(self, stood_still: Callable[[int, int], int]) -> None:
-        """Decide on what came too late so far: the time in which the machine as a whole stood still does not count."""
-        held, self._held = self._held, []
-        self.by_more += sum(5 * stood_still(sent, at) < 4 * excess for sent, at, excess in held)
-        suspects, self._suspects = self._suspects, []
-        for each in suspects:
-            stood = 0 if each.since_ns is None else stood_still(each.since_ns, each.at_ns)
-            # short standstills between the long ones are not noted: four fifths have to be
-            if each.since_ns is not None and 5 * stood >= 4 * each.excess_ns:
-                if each.shown:
-                    esc, n, follows = each.shown
-                    self.escs[esc].seen[n] |= follows
-            else:
-                self.wrong_count += 1
-                still = f"; the machine stood still for {stood // MS} ms of it" if stood else ""
-                self.wrong.append(each._replace(what=each.what + still))
-                del self.wrong[:-KEPT]
+    def _is_wrong(self, at_ns: int, what: str) -> None:
+        self.wrong.append(Wrong(at_ns, what))
+        self.wrong_count += 1
 
     # --- judging
 
@@ -199,40 +158,34 @@ class Judge:
         fed, at_ns, can_id = self.escs[said.esc], said.at_ns, said.message.can_id
         limit_ns = TIMEOUT_NS + self.slack_ns
         n = newest = fed.newest(at_ns + MS)
-        while n >= 0 and at_ns - fed.left(n) <= limit_ns + self.more_ns:
+        while n >= 0 and at_ns - fed.sent[n] <= limit_ns + self.more_ns:
             if said.is_of(fed.values(n)):
                 break
             n -= 1
         else:
-            self._suspects.append(self._origin(said, n, newest))
+            self._is_wrong(at_ns, f"{said}: {self._origin(said, n, newest)}")
             return
         # where frames may come seconds late, several of them had these values: their order is not known
         if not self.more_ns:
             newer = self._newest.get(can_id, -1)
             if n < newer:
-                said_after = f"values of frame {n} after those of frame {newer}"
-                self._suspects.append(said.wrong(said_after))
+                self._is_wrong(at_ns, f"{said}: values of frame {n} after those of frame {newer}")
                 return
             self._newest[can_id] = n
         self.values += 1
-        if (excess := at_ns - fed.left(n) - limit_ns) > 0:
-            self._held.append((fed.sent[n], at_ns, excess))
+        self.by_more += at_ns - fed.sent[n] > limit_ns
         follows = _FOLLOWS.get(said.message.stem, 0)
         fed.seen[n] |= follows
         if follows == SPEED:
             self.fresh[said.esc].append(Fresh(at_ns, n))
 
-    def _origin(self, said: Said, older: int, newest: int) -> Wrong:
+    def _origin(self, said: Said, older: int, newest: int) -> str:
         """Where values come from that none of the newest frames had."""
         fed = self.escs[said.esc]
         for n in range(older, max(-1, newest - LOOKED_BACK), -1):
             if said.is_of(fed.values(n)):
-                age = said.at_ns - fed.left(n)
-                shown = said.esc, n, _FOLLOWS.get(said.message.stem, 0)
-                excess = age - TIMEOUT_NS - self.slack_ns
-                why = f"old: frame {n}, sent {age / SECOND:.3f} s before"
-                return said.wrong(why, fed.sent[n], excess, shown)
-        return said.wrong(f"never sent; newest frame {newest}")
+                return f"old: frame {n}, sent {(said.at_ns - fed.sent[n]) / SECOND:.3f} s before"
+        return f"never sent; newest frame {newest}"
 
     def _judge_info(self, said: Said) -> None:
         fed = self.escs[said.esc]
@@ -245,7 +198,7 @@ class Judge:
                     self._devices[said.esc] = int(values["device"])
                 return
             m -= 1
-        self._suspects.append(said.wrong(f"no info of the last 10 s; newest {newest}"))
+        self._is_wrong(said.at_ns, f"{said}: no info of the last 10 s; newest {newest}")
 
     def _judge_age(self, message: Message, at_ns: int) -> None:
         """The age of the data must not be told younger than what was sent last."""
@@ -255,23 +208,12 @@ class Judge:
             return
         fed = self.escs[message.esc]
         newest = fed.newest(at_ns + MS)
-        true_age = (at_ns - fed.left(newest)) / MS if newest >= 0 else 1e9
+        true_age = (at_ns - fed.sent[newest]) / MS if newest >= 0 else 1e9
         excess = int((true_age - age - 5) * MS) - self.slack_ns
-        sent = fed.sent[newest] if newest >= 0 else None
         if excess > self.more_ns:
             what = f"{message.name}: an age of {age} ms; the newest is {true_age:.0f} ms old"
-            self._suspects.append(Wrong(at_ns, what, sent, excess))
-        elif excess > 0 and sent is not None:
-            self._held.append((sent, at_ns, excess))
-
-
-def _both_clocks() -> tuple[int, int]:
-    """Monotonic and wall clock of one moment: not with another thread's turn in between."""
-    for _ in range(20):
-        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        if after - before < MS // 5:
-            break
-    return after, wall
+            self._is_wrong(at_ns, what)
+        self.by_more += 0 < excess <= self.more_ns
 
 
 class BusWatch(Judge):
@@ -299,14 +241,9 @@ class BusWatch(Judge):
             with contextlib.suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, option, 48 << 20)
                 break
-        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._socket.bind(("",))
         self._socket.settimeout(0.1)
-        now, wall = _both_clocks()
-        self._offsets = deque([wall - now], maxlen=8)
-        """Wall clock less monotonic clock, one for each time that it was set."""
         self._closed = False
-        self._latest_ns = 0
         self._thread = threading.Thread(target=self._run, name="bus watch", daemon=True)
 
     def start(self) -> Self:
@@ -318,52 +255,25 @@ class BusWatch(Judge):
             while not self._closed:
                 # an OSError: time out, or an interface went down or away; the socket is still good
                 with contextlib.suppress(OSError):
-                    received = self._socket.recvmsg(16, 64)
-                    self._received(*received)
+                    data, _, flags, address = self._socket.recvmsg(16)
+                    self._received(data, flags, address[0])
         except BaseException as error:
             self.failure = error
             raise
 
-    def _received(self, data: bytes, ancillary: list[Any], flags: int, address: Any) -> None:
-        if address[0] != self.interface or len(data) != FRAME.size:
+    def _received(self, data: bytes, flags: int, interface: str) -> None:
+        if interface != self.interface or len(data) != FRAME.size:
             return
-        at_ns = now = self.note_clocks()
-        for _, kind, content in ancillary:
-            if kind == _SO_TIMESTAMPNS and len(content) >= _STAMP.size:
-                seconds, rest = _STAMP.unpack(content[: _STAMP.size])
-                at_ns = self._monotonic(seconds * SECOND + rest, now)
-        self._latest_ns = at_ns
         can_id, size, content = FRAME.unpack(data)
         local = self._ignore_local and flags & socket.MSG_DONTROUTE
         if not local and not can_id & EXTENDED:
-            self.take(can_id & 0x7FF, content[:size], at_ns)
+            self.take(can_id & 0x7FF, content[:size], time.monotonic_ns())
 
-    def catch_up(self, seconds: float = 90) -> None:
-        """Wait until all that has come by now was judged: on a busy machine the judge may be seconds behind, which matters to nobody."""
-        now, deadline = time.monotonic_ns(), time.monotonic() + seconds
-        while (
-            self._latest_ns < now
-            and select.select([self._socket], [], [], 0)[0]
-            and time.monotonic() < deadline
-        ):
+    def catch_up(self) -> None:
+        """Wait until all that has come by now was judged."""
+        while self.failure is None and select.select([self._socket], [], [], 0)[0]:
             time.sleep(0.005)
         time.sleep(0.02)
-
-    def note_clocks(self) -> int:
-        """To be called before and after the wall clock is set; returns the monotonic time."""
-        now, wall = _both_clocks()
-        if abs(wall - now - self._offsets[-1]) > 50 * MS:
-            self._offsets.append(wall - now)
-        else:
-            self._offsets[-1] = wall - now  # as it drifts
-        return now
-
-    def _monotonic(self, stamp: int, now: int) -> int:
-        """A kernel's time stamp on the monotonic clock, whatever the wall clock was set to when it was made."""
-        for offset in reversed(self._offsets):
-            if self.last_ns - SECOND // 10 <= stamp - offset <= now + MS:
-                return stamp - offset
-        return now
 
     def close(self) -> None:
         self._closed = True

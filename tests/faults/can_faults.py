@@ -1,18 +1,23 @@
-"""Faults of the CAN interface and of the bus behind it. Each disturbs all ESCs; the serial side must go on."""
+"""Faults of the CAN interface and of the bus behind it, hostile or broken traffic on it, and many ESCs of which some are ill.
+
+What is wrong with the interface disturbs all ESCs, and the serial side must go on; by traffic and by others nobody is disturbed.
+"""
 
 import contextlib
+import random
 import subprocess
 import time
 from collections.abc import Iterator
 from functools import partial
 
-from beds import ADAPTER_RATE, BUS, adapters, fault, make_pair, run
+from beds import ADAPTER_RATE, BUS, adapters, eight, fault, make_pair, run
 from bus_watch import SECOND
-from harness import Bench, Injection
+from harness import Bench, Injection, PtyPort
 from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter
-from traffic_faults import still_answers
 
+CONFLICT = 0x8150
+traffic = partial(fault, "Traffic", limit_s=None, escs=[], settle_s=1)
 ACTIVE, PASSIVE = 1, 3
 BUS_OFF_LEFT = 0x8140
 MAX_IN_CONTROLLER = 6
@@ -23,6 +28,13 @@ HELD_NS = MAX_IN_CONTROLLER * 16 * 8 * SECOND // SLOW_BITS_PER_S
 FREE = "1gbit"
 on_cable = partial(fault, "CAN", limit_s=1.0)
 on_adapter = partial(fault, "CAN", bed=adapters, settle_s=1)
+
+
+def still_answers(bench: Bench) -> None:
+    """The node's SDO server is as before."""
+    with RawBus(bench.watched) as master:
+        found = master.read(1, 0x1000, 0)
+        bench.expect(found == 0, f"object 1000h is {found}")
 
 
 def back_up(injection: Injection) -> None:
@@ -115,7 +127,6 @@ def loaded(bench: Bench, injection: Injection, seconds: float) -> None:
         time.sleep(seconds)
         others.terminate()
         others.wait()
-    bench.watch.settle(bench.stood_still)
     late = bench.watch.by_more - before
     bench.expect(late <= MAX_IN_CONTROLLER, f"{late} values were late")
 
@@ -195,3 +206,124 @@ def unplugged(bench: Bench, injection: Injection, _n: int) -> None:
     near().up(ADAPTER_RATE)
     injection.wait_recovery()
     boot_ups(injection)
+
+
+# --- traffic
+
+
+def cangen(bench: Bench, words: str) -> None:
+    """Frames from the far end, however full its queue is."""
+    command = ["cangen", bench.watched, "-i", *words.split()]
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+
+
+REQUESTS = [
+    *map(bytes.fromhex, ("4000100000000000", "4021100000000000", "2110100104000000")),
+    *map(bytes.fromhex, ("A02110007F000000", "6000000000000000", "8000000000000000")),
+]
+
+
+@traffic("SDO floods")
+def sdo_flood(bench: Bench, injection: Injection, n: int) -> None:
+    """Requests without waiting for an answer: right ones, wrong ones, beginnings of transfers that nobody goes on with."""
+    generator = random.Random(7 + n)
+    with RawBus(bench.watched) as vandal:
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:
+            known = generator.random() < 0.8
+            request = generator.choice(REQUESTS) if known else generator.randbytes(8)
+            vandal.send(0x601 + generator.randrange(2), request)
+            time.sleep(0.001)
+        time.sleep(0.3)
+        vandal.send(0x601, REQUESTS[-1])
+    still_answers(bench)
+
+
+@traffic("SYNC at 1 kHz", rounds=[0])
+def sync(bench: Bench, injection: Injection, _n: int) -> None:
+    cangen(bench, "-g 1 -n 1500 -I 080 -L 0")
+    still_answers(bench)
+
+
+def conflict(
+    bench: Bench, injection: Injection, n: int, frames: tuple[tuple[int, str], ...]
+) -> None:
+    """Another node sends these frames, in turn as if it were node 1 and node 2: said once in the log, EMCY 8150h; ours go on."""
+    gateway = bench.gateway
+    node = 1 + n
+    if any("somebody else" in text and f"node {node}" in text for text in gateway.lines):
+        # the condition of before has to be over, or this is the same one
+        begun = gateway.log.count("somebody else")
+        bench.wait_until(lambda: gateway.log.count("nobody else") >= begun, 15, "it is over")
+    lines = len(gateway.lines)
+    with RawBus(bench.watched) as vandal:
+        for _ in range(50):
+            for can_id, data in frames:
+                vandal.send(can_id + node, bytes.fromhex(data))
+            time.sleep(0.01)
+    injection.wait_emergency(node, CONFLICT)
+    bench.wait_log("somebody else", lines)
+    said = len(gateway.lines) - lines
+    bench.expect(1 <= said <= 2 * len(frames), f"{said} lines in the log for one condition")
+    still_answers(bench)
+
+
+for name, frames in (
+    (
+        "another node sends with our identifiers",
+        ((0x687, "0000000000000000"), (0x180, "0000000000000000")),
+    ),
+    # its boot-up, heartbeat and answers; our node stays as it is
+    (
+        "a second node with our node-ID",
+        ((0x700, "00"), (0x700, "7F"), (0x580, "8000100000000405")),
+    ),
+):
+    traffic(name)(partial(conflict, frames=frames))
+
+
+# last: our identifiers are among them, and who has somebody else there waits until he is gone
+@traffic("random frames", rounds=[1000])
+def random_frames(bench: Bench, injection: Injection, count: int) -> None:
+    """All identifiers, lengths and contents, remote and 29-bit frames among them."""
+    for number, kind in ((8 * count, ""), (count, "-R"), (count, "-e")):
+        cangen(bench, f"-g 0.3 -n {number} -I r -L r -D r {kind}")
+    time.sleep(0.3)
+    still_answers(bench)
+
+
+# --- many ESCs
+
+
+NOISY, SILENT, UNPLUGGED = ILL = 0, 3, 6
+
+
+@fault(
+    "Many",
+    "eight ESCs, of which one is noisy, one silent, one unplugged",
+    None,
+    escs=ILL,
+    settle_s=1,
+    bed=eight,
+)
+def ill_among_well(bench: Bench, injection: Injection, n: int) -> None:
+    """The other five lose nothing, nor do the three what was whole."""
+    generator = random.Random(8 + n)
+
+    def noise(wire: bytes) -> tuple[bytes, bool]:
+        if generator.random() < 0.5:
+            return generator.randbytes(generator.randrange(1, 200)), False
+        return generator.randbytes(generator.randrange(200)) + wire, True
+
+    port = bench.escs[UNPLUGGED]
+    assert isinstance(port, PtyPort)
+    bench.escs[NOISY].mangle = noise
+    bench.escs[SILENT].on = False
+    for _ in range(3):
+        port.unplug()
+        time.sleep(0.7)
+        port.plug()
+        time.sleep(0.5)
+    bench.escs[NOISY].mangle = None
+    injection.cleared()
+    bench.escs[SILENT].on = True

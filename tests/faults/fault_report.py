@@ -12,7 +12,6 @@ from xml.etree import ElementTree as ET
 class Fault:
     """A fault of the programme. ``limit_s``: the longest recovery that is allowed; None: nothing may be disturbed at all."""
 
-    machine: str
     area: str
     name: str
     limit_s: float | None
@@ -24,6 +23,7 @@ class Fault:
     """Those that it disturbs, None: all of the bench."""
     settle_s: float = 0.5
     rounds: Sequence[Any] = range(2)
+    machine: str = "UML"
 
     def __str__(self) -> str:
         return f"{self.machine} {self.area}: {self.name}"
@@ -35,8 +35,9 @@ AREAS = ("Start", "Serial", "CAN", "Time", "Process", "Disk", "Traffic", "Many")
 GOOD, FAILED = "good", "failed"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
 BEGIN, END = "<!-- faults begin -->\n", "<!-- faults end -->\n"
-COLUMNS = "machine, fault|injected|recovered|worst recovery|wrong values|values lost|state"
-HEAD = f"| {COLUMNS.replace('|', ' | ')} |\n{'|---' * 7}|\n"
+HEAD = f"""| machine, fault | injected | recovered | worst recovery | wrong values | values lost | state |
+{"|---" * 7}|
+"""
 
 
 def in_order() -> list[Fault]:
@@ -55,41 +56,30 @@ class Row:
     worst_s: float = 0.0
     wrong: int = 0
     lost: int = 0
-    excused: int = 0
-    """Values not sent because the machine as a whole stood still; no loss of the gateway's."""
     transmitted: int = 0
     """Bytes that the gateway sent to an ESC."""
     notes: list[str] = field(default_factory=list)
     """What went wrong, for people."""
-    figures: dict[str, float] = field(default_factory=dict)
 
     @property
     def state(self) -> str:
         healed = self.injected > 0 and self.recovered == self.injected
         return FAILED if not healed or self.wrong or self.lost or self.transmitted else GOOD
 
-    @property
-    def recovery(self) -> str:
+    def __str__(self) -> str:
+        """A line of the page."""
         limit = self.limit_s
-        return "undisturbed" if limit is None else f"{self.worst_s:.2f} s (limit {limit:g} s)"
+        recovery = "undisturbed" if limit is None else f"{self.worst_s:.2f} s (limit {limit:g} s)"
+        counts = (self.injected, self.recovered, recovery, self.wrong, self.lost, self.state)
+        return f"| {self.fault} | {' | '.join(map(str, counts))} |"
 
     @property
-    def cells(self) -> list[str]:
-        """What the page shows, the fault first."""
-        counts = (self.injected, self.recovered, self.recovery, self.wrong, self.lost, self.state)
-        return [self.fault, *map(str, counts)]
-
-    @property
-    def line(self) -> str:
-        """For the terminal."""
-        text = f"{self.state:10} {self.fault}: {self.recovered} of {self.injected}, {self.recovery}"
-        text += f", wrong {self.wrong}, lost {self.lost}"
-        if self.excused:
-            text += f", {self.excused} not sent while the machine stood still"
+    def told(self) -> str:
+        """For the terminal: the line, and below it what went wrong."""
+        notes = list(self.notes[:8])
         if self.transmitted:
-            text += f", {self.transmitted} bytes sent to an ESC"
-        text += "".join(f"; {name} {value:g}" for name, value in self.figures.items())
-        return text + "".join(f"\n       {note}" for note in self.notes[:8])
+            notes.append(f"{self.transmitted} bytes sent to an ESC")
+        return "\n       ".join((str(self), *notes))
 
 
 class Report(dict[str, Row]):
@@ -112,20 +102,19 @@ class Report(dict[str, Row]):
         for row in self.values():
             case = ET.SubElement(suite, "testcase", classname="faults", name=row.fault)
             if row.state == FAILED:
-                ET.SubElement(case, "failure", message=row.line)
+                ET.SubElement(case, "failure", message=row.told)
         ET.ElementTree(suite).write(path)
 
 
-def shown(text: str) -> dict[str, list[str]]:
-    """The rows of a page by their fault."""
+def shown(text: str) -> dict[str, str]:
+    """The lines of a page by their fault."""
     lines = text.partition(BEGIN)[2].partition(END)[0].splitlines()[2:]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    return {row[0]: row for row in rows}
+    return {line.split(" | ")[0].removeprefix("| "): line for line in lines}
 
 
 def put(text: str, report: Report) -> str:
     """A page with the rows of a report in the place of older ones, in the order of the programme."""
-    rows = shown(text) | {row.fault: row.cells for row in report.values()}
-    listed = [f"| {' | '.join(rows[str(each)])} |\n" for each in in_order() if str(each) in rows]
+    rows = shown(text) | {row.fault: str(row) for row in report.values()}
+    listed = [f"{rows[str(each)]}\n" for each in in_order() if str(each) in rows]
     before, after = text.partition(BEGIN)[0], text.partition(END)[2]
     return "".join((before, BEGIN, HEAD, *listed, END, after))

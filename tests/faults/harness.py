@@ -15,21 +15,20 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Self
 
 from bus_watch import MS, SECOND, BusWatch
-from encoding import GEAR, POLE_PAIRS, Identity
 from fault_report import Fault, Row
-from feeder import CURRENT, SPEED, FedEsc, Feeder
+from feeder import CURRENT, GEAR, POLE_PAIRS, SPEED, FedEsc, Feeder, Identity
 from signals import Table
 
 from kontronik_can_gw.desk.pty import PtyEsc
 
 IN_FLIGHT_NS = 60 * MS
 """A frame that was handed over so shortly before a fault may be its victim."""
-STANDSTILL_NS = 8 * MS
 AHEAD = ("chrt", "-f", "10")
 """The gateway goes before the bench's own processes, with which it shares a processor here."""
 
@@ -105,13 +104,14 @@ class Gateway(LoggedProcess):
             "threads": int(status["Threads"]),
         }
 
-
-def growth(before: dict[str, int], after: dict[str, int], rss_kib: int) -> list[str]:
-    """What a gateway has more of than before, memory above so much."""
-    limits = before | {"rss": before["rss"] + rss_kib}
-    return [
-        f"{name} {before[name]} -> {after[name]}" for name in before if after[name] > limits[name]
-    ]
+    def growth(self, before: dict[str, int], rss_kib: int) -> list[str]:
+        """What it has more of than before, memory above so much."""
+        limits, after = before | {"rss": before["rss"] + rss_kib}, self.figures()
+        return [
+            f"{each} {before[each]} -> {after[each]}"
+            for each in before
+            if after[each] > limits[each]
+        ]
 
 
 class PtyPort(FedEsc):
@@ -139,11 +139,10 @@ class PtyPort(FedEsc):
     def unplug(self) -> None:
         """The terminal hangs up, the link goes."""
         with self._lock:
-            pty, self._pty = self._pty, None
-            if pty is not None:
-                pty.check()
-                self._received += pty.received
-                pty.close()
+            if self._pty is not None:
+                self._received += self._pty.check()
+                self._pty.close()
+                self._pty = None
 
     def plug(self, other: bool = False) -> None:
         """A new terminal behind the same link; ``other``: certainly under another number than the one before."""
@@ -157,8 +156,7 @@ class PtyPort(FedEsc):
     def received(self) -> int:
         with self._lock:
             if self._pty is not None:
-                self._pty.check()
-                return self._received + self._pty.received
+                self._received += self._pty.check()
             return self._received
 
     def close(self) -> None:
@@ -168,8 +166,7 @@ class PtyPort(FedEsc):
 class Bench:
     """Everything that runs around one gateway.
 
-    ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen`` None: no nodes.
-    ``dbc``: another layout than the shipped one.
+    ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen``: with a node for each ESC.
     """
 
     said_instead: str | None = None
@@ -183,12 +180,10 @@ class Bench:
         table: Table,
         *,
         slack_ns: int = 60 * MS,
-        canopen: str | None = "self_start = true",
-        dbc: Path | None = None,
+        canopen: bool = True,
         store: Path | None = None,
         prefix: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
-        start_limit_s: float = 20,
     ) -> None:
         self.interface = interface
         self.watched = watched
@@ -198,8 +193,7 @@ class Bench:
         self.config = self.folder / "gateway.toml"
         self.prefix = tuple(prefix)
         self.environment = dict(environment or {})
-        self.start_limit_s = start_limit_s
-        self.config.write_text(self._configuration(canopen, dbc))
+        self.config.write_text(self._configuration(canopen))
         self.watch = BusWatch(watched, table, self.escs, slack_ns=slack_ns).start()
         self.feeder = Feeder(self.escs).start()
         self._gateway: Gateway | None = None
@@ -207,12 +201,11 @@ class Bench:
         self._received = 0
         self._excluded: list[list[tuple[int, int]]] = [[] for _ in escs]
 
-    def _configuration(self, canopen: str | None, dbc: Path | None) -> str:
+    def _configuration(self, canopen: bool) -> str:
         text = f'[can]\ninterface = "socketcan"\nchannel = "{self.interface}"\nbitrate = 1000000\n'
-        if canopen is not None:
-            text += f'[canopen]\nenabled = true\nnode_id = 1\nserial = 1050112\nstore = "{self.store}"\n{canopen}\n'
-        if dbc is not None:
-            text += f'[dbc]\nfile = "{dbc}"\n'
+        if canopen:
+            text += "[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nserial = 1050112\n"
+            text += f'store = "{self.store}"\n'
         for i, esc in enumerate(self.escs):
             text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{esc.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
         return text
@@ -232,7 +225,7 @@ class Bench:
         self._gateway = Gateway(self.config, self.prefix, self.environment)
         if wait:
             on = [i for i, esc in enumerate(self.escs) if esc.on]
-            self.wait_fresh(on, begin, self.start_limit_s)
+            self.wait_fresh(on, begin, 20)
             self.leave_out(range(len(self.escs)), begin - IN_FLIGHT_NS, time.monotonic_ns())
 
     def stop(self) -> int:
@@ -306,21 +299,6 @@ class Bench:
         lines = self._gateway.lines[-6:] if self._gateway is not None else []
         return f"the gateway's last lines: {' | '.join(lines) or 'none'}"
 
-    def stood_still(self, begin_ns: int, end_ns: int) -> int:
-        """Nanoseconds of that time in which the whole machine stood still: none where it has a time of its own."""
-        return 0
-
-    def running_s(self, begin_ns: int, end_ns: int) -> float:
-        """Seconds of that time in which the machine did not stand still."""
-        return (end_ns - begin_ns - self.stood_still(begin_ns, end_ns)) / SECOND
-
-    def longest_silence_s(self, escs: Sequence[int] | range, begin_ns: int) -> float:
-        """How long at most the gateway was silent of one of these ESCs since then."""
-        self.watch.catch_up()
-        now = time.monotonic_ns()
-        silences = [each for esc in escs for each in self.watch.silences(esc, begin_ns, now)]
-        return max((end - begin for begin, end in silences), default=0) / SECOND
-
     # --- accounts
 
     def leave_out(self, escs: Sequence[int] | range, begin_ns: int, end_ns: int) -> None:
@@ -332,8 +310,6 @@ class Bench:
         """Note in a row how many values that were sent since the last account, outside of all faults, never came; when and which."""
         until_ns = time.monotonic_ns() - 150 * MS
         self.watch.catch_up()
-        self.forgive(until_ns)
-        self.watch.settle(self.stood_still)
         losses = []
         for index, fed in enumerate(self.escs):
             last = fed.newest(until_ns)
@@ -343,10 +319,6 @@ class Bench:
                     continue
                 if any(begin <= at <= end for begin, end in self._excluded[index]):
                     continue
-                following = fed.sent[n + 1] if n + 1 < len(fed.sent) else at + SECOND // 20
-                if self.stood_still(at - 5 * MS, following + 5 * MS) >= STANDSTILL_NS:
-                    row.excused += 1
-                    continue
                 seen = {0: "nothing", SPEED: "only EscSpeed"}.get(fed.seen[n], "only EscCurrent")
                 losses.append((at, f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came"))
             self._accounted[index] = max(self._accounted[index], last + 1)
@@ -354,16 +326,17 @@ class Bench:
         row.lost += len(losses)
         return losses
 
-    def forgive(self, until_ns: int) -> None:
-        """What was sent until then and may be missing on this bench counts as seen."""
-
-    def inject(self, fault: Fault, row: Row, given: Any) -> None:
-        """One injection of a fault, noted in the row. NotRecovered, and what else it raises, is noted too and raised again."""
-        self.check_alive()
-        self.account(row)  # of before; nobody's fault is the programme's too
-        injection = Injection(self, fault, row)
+    def inject(self, fault: Fault, row: Row, given: Any) -> bool:
+        """One injection of a fault, noted in the row; True if the bench is still good."""
         row.injected += 1
-        failed = True
+        try:
+            self.check_alive()
+            self.account(row)  # of before; nobody's fault is the programme's too
+        except NotRecovered as error:
+            row.notes.append(str(error))
+            return False
+        injection = Injection(self, fault, row)
+        good = False
         try:
             fault.inject(self, injection, given)
             if injection.cleared_ns is not None and injection.recovered_ns is None:
@@ -371,21 +344,23 @@ class Bench:
             injection.leave_out_until(injection.recovered_ns or time.monotonic_ns())
             time.sleep(fault.settle_s)
             self.check_alive()
-            failed = False
+            good = True
         except NotRecovered as error:
             row.notes.append(str(error))
-            raise
-        finally:
-            if failed:
-                injection.leave_out_until(time.monotonic_ns())
-            injection.note_values(self.account(row))
-            received, self._received = self._received, sum(esc.received() for esc in self.escs)
-            row.transmitted += max(0, self._received - received)
-            if fault.limit_s is not None and injection.recovery_s > fault.limit_s:
-                row.notes.append(f"recovered only after {injection.recovery_s:.2f} s")
-            elif not failed:
-                row.recovered += 1
-            row.worst_s = max(row.worst_s, injection.recovery_s)
+        except Exception as error:
+            traceback.print_exc()
+            row.notes.append(repr(error))
+        if not good:
+            injection.leave_out_until(time.monotonic_ns())
+        injection.note_values(self.account(row))
+        received, self._received = self._received, sum(esc.received() for esc in self.escs)
+        row.transmitted += max(0, self._received - received)
+        if fault.limit_s is not None and injection.recovery_s > fault.limit_s:
+            row.notes.append(f"recovered only after {injection.recovery_s:.2f} s")
+        else:
+            row.recovered += good
+        row.worst_s = max(row.worst_s, injection.recovery_s)
+        return good
 
     def close(self) -> None:
         """End the gateway and everything else; the folder stays for a look at it as long as the machine lives."""
@@ -434,7 +409,7 @@ class Injection:
     def healed_at(self, at_ns: int) -> None:
         """Something else that had to heal too was good at that time."""
         assert self.cleared_ns is not None
-        self.recovery_s = max(self.recovery_s, self.bench.running_s(self.cleared_ns, at_ns))
+        self.recovery_s = max(self.recovery_s, (at_ns - self.cleared_ns) / SECOND)
 
     def wait_boot_up(self, node: int) -> None:
         """Wait for a boot-up message of a node since the injection."""
@@ -470,7 +445,7 @@ class Injection:
         watch, row = self.bench.watch, self.row
         wrong = watch.wrong_count - self._wrong
         row.wrong += wrong
-        for each in watch.wrong[-min(wrong, 3) :] if wrong else ():
+        for each in list(watch.wrong)[-min(wrong, 3) :] if wrong else ():
             row.notes.append(f"wrong value {after(each.at_ns)} after the injection: {each.what}")
         if losses:
             when = "; ".join(f"{after(at)} {what}" for at, what in losses[:4])

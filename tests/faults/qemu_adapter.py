@@ -1,8 +1,7 @@
-"""A serial adapter on a played USB whose wire has real bits: the kernel's vhci_hcd (USB/IP) plugs it in, the driver ftdi_sio serves it.
+"""A serial adapter on a played USB: the kernel's vhci_hcd (USB/IP) plugs it in, the driver ftdi_sio serves it.
 
-What is put on its wire is a sequence of levels, made with the sender's baud rate and parity; it is sampled with the rate and parity
-that the driver has set, so wrong parity, framing errors and breaks come out as they do on hardware. Only root may plug, and only
-on a kernel with vhci_hcd: the machine of tests/vm.
+It says of what it passes on whether parity or stop bits were wrong or the line at break, as the chip does. Only root may plug, and
+only on a kernel with vhci_hcd: the machine of tests/vm.
 """
 
 import contextlib
@@ -11,11 +10,9 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
-
-from qemu_machine import wait_until
+from typing import Any, NamedTuple
 
 VHCI = Path("/sys/devices/platform/vhci_hcd.0")
 FULL_SPEED = 2
@@ -28,19 +25,21 @@ _DEVICE_TO_HOST, _VENDOR_OR_CLASS = 0x80, 0x60
 _GET_STATUS, _GET_DESCRIPTOR, _GET_CONFIGURATION = 0, 6, 8
 _DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
 
-# --- the wire of a UART
+
+def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
+    """Wait until something holds. AssertionError when it does not come."""
+    begin = time.monotonic()
+    while not condition():
+        if time.monotonic() - begin > seconds:
+            raise AssertionError(f"{what}: not within {seconds} s")
+        time.sleep(0.01)
 
 
 class Line(NamedTuple):
-    """How a UART is set; always eight data bits and one stop bit."""
+    """How the chip's UART is set; always eight data bits and one stop bit."""
 
     baud: int = 115_200
     parity: str = "E"
-
-    @property
-    def bits(self) -> int:
-        """Bit times of a byte."""
-        return 10 + (self.parity != "N")
 
 
 ESC_LINE = Line()
@@ -49,55 +48,6 @@ STATUS_OVERRUN, STATUS_PARITY, STATUS_FRAMING, STATUS_BREAK = 0x02, 0x04, 0x08, 
 MODEM_STATUS, LINE_STATUS = 0x01, 0x60
 FIFO_SIZE = 384
 """Received bytes, two of status with each packet among them, that the chip holds while nobody reads."""
-
-
-def levels(data: bytes, line: Line) -> list[int]:
-    """The wire's level in each bit time of the sender, with the line idle before and after."""
-    wire = [1]
-    for byte in data:
-        ones = byte.bit_count() & 1
-        parity = {"N": [], "E": [ones], "O": [ones ^ 1]}[line.parity]
-        wire += [0, *(byte >> i & 1 for i in range(8)), *parity, 1]
-    return wire + [1] * 12
-
-
-def sampled(wire: list[int], sent_at: int, line: Line) -> Iterator[tuple[int, int]]:
-    """(byte, error) as a UART set to ``line`` reads a wire whose levels last 1/``sent_at`` s."""
-    ratio = sent_at / line.baud  # of the sender's bit times in one of ours
-    stop_bit = line.bits - 1
-    end, position = len(wire), 0.0
-
-    def level(offset: float) -> int:
-        index = int(position + offset * ratio)
-        return wire[index] if index < end else 1
-
-    def skip(unwanted: int) -> float:
-        """The next change of the level."""
-        at = int(position)
-        while at < end and wire[at] == unwanted:
-            at += 1
-        return max(float(at), position)
-
-    while (position := skip(1)) < end:
-        if level(0.5):  # shorter than half a bit: no start
-            position = int(position) + 1.0
-            continue
-        byte = sum(level(1.5 + i) << i for i in range(8))
-        odd = byte.bit_count() & 1
-        error = 0
-        if line.parity != "N" and level(9.5) != (odd if line.parity == "E" else odd ^ 1):
-            error = STATUS_PARITY
-        stop = level(stop_bit + 0.5)
-        if not stop:
-            all_low = not byte and not (line.parity != "N" and level(9.5))
-            error = STATUS_BREAK if all_low else STATUS_FRAMING
-        yield byte, error
-        position += (stop_bit + 0.5) * ratio
-        if not stop:  # a UART waits for the line to be idle again
-            position = skip(0)
-
-
-# --- the adapter
 
 
 def descriptors(strings: Sequence[str]) -> dict[int, bytes]:
@@ -170,43 +120,15 @@ class SerialAdapter:
 
     # --- the wire
 
-    def put(self, data: bytes, line: Line = ESC_LINE) -> None:
-        """Bytes from an ESC whose UART is set to ``line``."""
-        if line == self.line:
-            # the usual case, and slow to work out: what comes out is what went in
-            self._pass_on(data, 0)
-        else:
-            self._sample(levels(data, line), line.baud)
-
-    def hold_low(self, seconds: float) -> None:
-        """A break: the line at 0 for so long."""
-        bits = int(seconds * self.line.baud)
-        self._sample([1] + [0] * bits + [1] * 12, self.line.baud)
-
-    def flip(self, data: bytes, bit: int) -> None:
-        """A frame in which one bit time (of the sender, from 1) has the wrong level."""
-        wire = levels(data, ESC_LINE)
-        wire[bit] ^= 1
-        self._sample(wire, ESC_LINE.baud)
-
     def waiting(self) -> int:
         """Bytes that wait until the host asks for them."""
         with self._lock:
             return sum(len(packet) for packet in self._ready)
 
-    def _sample(self, wire: list[int], sent_at: int) -> None:
-        run = bytearray()
-        for byte, error in sampled(wire, sent_at, self.line):
-            if error:  # has a packet of its own: the line status counts for the whole of one
-                self._pass_on(bytes(run), 0)
-                self._pass_on(bytes([byte]), error)
-                run.clear()
-            else:
-                run.append(byte)
-        self._pass_on(bytes(run), 0)
-
-    def _pass_on(self, data: bytes, error: int) -> None:
-        """Packets to the host, as soon as it asks; nothing happens while unplugged."""
+    def put(self, data: bytes, error: int = 0) -> None:
+        """Bytes from the ESC, and what was wrong with them: packets to the host, as soon as it asks; nothing happens while unplugged."""
+        if self.line != ESC_LINE:
+            data, error = bytes(len(data)), STATUS_FRAMING
         with self._lock:
             for at in range(0, len(data) if self.plugged else 0, 62):
                 packet = data[at : at + 62]

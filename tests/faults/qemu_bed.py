@@ -1,68 +1,114 @@
-"""The bench on emulated hardware: an ESC on its 16550A, one on a played adapter whose wire has real bits, two CAN controllers."""
+"""The bench on emulated hardware: an ESC on a played USB adapter, one on a 16550A UART, two CAN controllers.
+
+What the machine has is told by /sys, ioctl and ``ip``: tests/vm/vm_run.py says what is plugged in.
+"""
 
 import contextlib
+import fcntl
+import json
 import os
-import pickle
-import random
-import re
 import select
+import struct
 import subprocess
-import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
+from beds import table
 from bus_watch import MS
-from encoding import Identity
-from feeder import CURRENT, SPEED, FedEsc
-from harness import Bench, LoggedProcess
-from qemu_adapter import ESC_LINE, Line, SerialAdapter
-from qemu_machine import AS_SET, can_up, line_setting, serial_ports, wait_until
-from signals import table_of
+from feeder import FedEsc, Identity
+from harness import Bench
+from qemu_adapter import SerialAdapter, wait_until
 
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
 
+WIRE, UART = 0, 1
 SLACK_NS = 400 * MS
 RATE_HZ = 10
 INFO_EVERY = 20
-TOLD_S = 0.05
-"""Until the metronome has told of the last standstill."""
+KVASER = Path("/sys/bus/pci/drivers/kvaser_pci")
+BITRATE = 1_000_000
+_TIOCGICOUNT = 0x545D
+
+
+# --- serial ports
+
+
+class LineCounts(NamedTuple):
+    """What a driver has counted on a line, of struct serial_icounter_struct."""
+
+    framing: int
+    overrun: int
+    parity: int
+    breaks: int
+
+
+@contextlib.contextmanager
+def beside(device: str) -> Iterator[int]:
+    """A port opened beside whoever has it, as root may; its settings are not touched."""
+    fd = os.open(device, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def line_counts(device: str) -> LineCounts:
+    with beside(device) as fd:
+        return LineCounts(*struct.unpack("=20i", fcntl.ioctl(fd, _TIOCGICOUNT, bytes(80)))[6:10])
+
+
+AS_SET = termios.B115200, termios.CS8 | termios.PARENB, 0
+"""How the gateway sets a port: 8E1, without echo. Until then the kernel echoes on a new one, as a USB port is at each plug-in."""
+
+
+def line_setting(device: str) -> tuple[int, int, int]:
+    """How a port is set, read from the kernel: speed, what stands for 8E1, echo."""
+    with beside(device) as fd:
+        _, _, control, local, _, speed, _ = termios.tcgetattr(fd)
+    frame = termios.CSIZE | termios.PARENB | termios.PARODD | termios.CSTOPB
+    return speed, control & frame, local & termios.ECHO
+
+
+@contextlib.contextmanager
+def held(device: str) -> Iterator[int]:
+    """A port that another program has open, without echo."""
+    with beside(device) as fd:
+        mode = termios.tcgetattr(fd)
+        mode[3] &= ~(termios.ECHO | termios.ECHONL | termios.ICANON)
+        termios.tcsetattr(fd, termios.TCSANOW, mode)
+        yield fd
+
+
+def serial_ports() -> set[str]:
+    return {str(path) for path in Path("/dev").glob("ttyUSB*")}
 
 
 class FarPort(FedEsc):
     """An ESC at the far end of QEMU's serial port.
 
-    QEMU keeps what comes while the port is closed, and delivers it at the next opening: no UART does. So this ESC is silent
-    until the process that ``reader`` names has the port open.
+    QEMU keeps what comes while the port is closed, and delivers it at the next opening: no UART does. So this ESC is silent unless
+    ``is_open`` says that the gateway has the port open.
     """
 
-    def __init__(self, identity: Identity, reader: Callable[[], int | None]) -> None:
+    def __init__(self, identity: Identity, is_open: Callable[[str], bool]) -> None:
         super().__init__(identity, RATE_HZ, INFO_EVERY)
         self.path = self.device = "/dev/ttyS1"
-        self._reader = reader
-        self._known: int | None = None  # the process that has it open
-        self._is_set = False
+        self._is_open = is_open
+        self._received = 0
         self._fd = os.open("/dev/virtio-ports/com1", os.O_RDWR | os.O_NONBLOCK)
-        self._transmitted = 0  # by the machine
-        self._before_set = 0  # bytes sent until the port was set: what the kernel may have echoed
+        with held(self.device):
+            pass  # it stays without echo
         self._stop = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
 
     def write(self, data: bytes) -> bool:
-        reader = self._reader()
-        if reader is None:
-            return False
-        if self._known != reader:
-            if not self._is_open(reader):
-                return False
-            self._known = reader
-        self._is_set = self._is_set or line_setting(self.device) == AS_SET
-        if not self._is_set:
-            self._before_set += len(data)
-        return self.put(data)
+        return self._is_open(self.device) and self.put(data)
 
     def put(self, data: bytes, seconds: float = 1.0) -> bool:
         """Bytes to the port; whether it took all of them within the time."""
@@ -74,21 +120,14 @@ class FarPort(FedEsc):
                 time.sleep(0.002)
         return done == len(data)
 
-    def _is_open(self, process: int) -> bool:
-        with contextlib.suppress(OSError):
-            for fd in os.listdir(f"/proc/{process}/fd"):
-                if os.readlink(f"/proc/{process}/fd/{fd}") == self.device:
-                    return True
-        return False
-
     def _listen(self) -> None:
         while not self._stop:
             if select.select([self._fd], [], [], 0.2)[0]:
                 with contextlib.suppress(BlockingIOError):
-                    self._transmitted += len(os.read(self._fd, 4096))
+                    self._received += len(os.read(self._fd, 4096))
 
     def received(self) -> int:
-        return max(0, self._transmitted - self._before_set)
+        return self._received
 
     def close(self) -> None:
         self._stop = True
@@ -97,40 +136,19 @@ class FarPort(FedEsc):
 
 
 class WirePort(FedEsc):
-    """A played adapter. ``send`` is how a frame gets onto the wire; setting it to another of the methods is the fault."""
+    """An ESC on a played adapter; ``error``: what the adapter says of the frames' bytes."""
 
     def __init__(self, identity: Identity) -> None:
         super().__init__(identity, RATE_HZ, INFO_EVERY)
         self.adapter = SerialAdapter("ESC0002")
-        self.send: Callable[[bytes], bool] = self.clean
-        self._random = random.Random(1)
+        self.error = 0
         self.device = ""
         self.plug()
         self.path = self.device
 
     def write(self, data: bytes) -> bool:
-        return self.send(data)
-
-    def clean(self, data: bytes) -> bool:
-        self.adapter.put(data)
+        self.adapter.put(data, self.error)
         return self.adapter.plugged
-
-    def silent(self, data: bytes) -> bool:
-        return False
-
-    def flipped(self, data: bytes) -> bool:
-        """One bit time of the frame, start, parity and stop bits among them, has the wrong level."""
-        self.adapter.flip(data, self._random.randrange(1, len(data) * ESC_LINE.bits + 1))
-        return False
-
-    def at(self, line: Line) -> Callable[[bytes], bool]:
-        """As an ESC sends whose UART is set otherwise."""
-
-        def send(data: bytes) -> bool:
-            self.adapter.put(data, line)
-            return False
-
-        return send
 
     def unplug(self) -> None:
         """Returns when its device file is gone."""
@@ -152,113 +170,62 @@ class WirePort(FedEsc):
         self.unplug()
 
 
-_METRONOME = """
-import time
-step, last = 0.03, time.monotonic_ns()
-while True:
-    time.sleep(step)
-    now = time.monotonic_ns()
-    if now - last > 3e9 * step:
-        print(last + int(1e9 * step), now, flush=True)
-    last = now
-"""
+# --- CAN interfaces
 
 
-class Metronome(LoggedProcess):
-    """A process that only wakes up, and notes when it could not: then nothing could run, the gateway neither."""
-
-    def __init__(self) -> None:
-        python = [sys.executable, "-S", "-E", "-c", _METRONOME]
-        super().__init__(["chrt", "-f", "20", *python], keep_out=True)
-
-    def stood_still(self, begin_ns: int, end_ns: int) -> int:
-        """Nanoseconds of that time in which nothing ran."""
-        total = 0
-        for words in reversed(self.out):
-            begin, end = map(int, words.split())
-            if end < begin_ns:
-                break
-            total += max(0, min(end, end_ns) - max(begin, begin_ns))
-        return total
+def can_up(name: str) -> None:
+    for settings in ("down", "txqueuelen 100", f"up type can bitrate {BITRATE} restart-ms 100"):
+        subprocess.run(["ip", "link", "set", name, *settings.split()], check=True)
 
 
-class MachineBench(Bench):
-    """Two ESCs on two kinds of port, and a gateway on the first controller; the second one watches.
+def receive_overruns(name: str) -> int:
+    command = ["ip", "-s", "-j", "link", "show", name]
+    shown = subprocess.run(command, check=True, capture_output=True).stdout
+    return int(json.loads(shown)[0]["stats64"]["rx"]["over_errors"])
 
-    The machine is so slow that two frames are often read at once: then the newer one goes to the bus. A value that was replaced by one
-    sent at most SLACK_NS later is not lost. What the gateway sends by the clock it sends four times more slowly than by the shipped
-    DBC, and its CANopen nodes stay PRE-OPERATIONAL, for speed's sake.
-    """
 
-    def __init__(self, folder: Path) -> None:
-        self._gateway = None  # the feeder asks before it is set
-        self.uart = FarPort(Identity(1, Layout.V4), self._reader)
-        self.wire = WirePort(Identity(2, Layout.LEGACY, Device.JIVEPRO, 12))
-        for name in ("can0", "can1"):
-            can_up(name)
-        super().__init__(
-            "can0",
-            "can1",
-            [self.uart, self.wire],
-            pickle.loads((folder / "sent.table").read_bytes()),
-            slack_ns=SLACK_NS,
-            dbc=folder / "slow.dbc",
-            canopen="",
-            start_limit_s=120,
-        )
-        self._metronome = Metronome()
-
-    def _reader(self) -> int | None:
-        """The gateway's process."""
-        if self._gateway is None or self._gateway.process.poll() is not None:
-            return None
-        return self._gateway.process.pid
-
-    def stood_still(self, begin_ns: int, end_ns: int) -> int:
-        return self._metronome.stood_still(begin_ns, end_ns)
-
-    def running_s(self, begin_ns: int, end_ns: int) -> float:
-        time.sleep(TOLD_S)
-        return super().running_s(begin_ns, end_ns)
-
-    def close(self) -> None:
-        super().close()
-        self._metronome.kill()
-
-    def forgive(self, until_ns: int) -> None:
-        time.sleep(TOLD_S)
-        both = SPEED | CURRENT
-        for esc, accounted in zip(self.escs, self._accounted, strict=True):
-            newer = 0
-            for n in range(esc.newest(time.monotonic_ns()), accounted - 1, -1):
-                sent = esc.sent[n]
-                if esc.seen[n] == both:
-                    newer = sent
-                elif esc.whole[n] and sent <= until_ns and newer and newer - sent <= SLACK_NS:
-                    esc.seen[n] = both
+def pci_slot(interface: str) -> str:
+    return Path("/sys/class/net", interface, "device").resolve().name
 
 
 @contextlib.contextmanager
-def machine(folder: Path) -> Iterator[MachineBench]:
-    """The bed; ``folder`` has what ``prepare`` made."""
-    with MachineBench(folder) as bench:
+def driver_away() -> Iterator[None]:
+    """The first controller is taken from its driver, so its interface is gone; at the end it is back and up."""
+    slot = pci_slot("can0")
+    (KVASER / "unbind").write_text(slot)
+    yield
+    (KVASER / "bind").write_text(slot)
+    wait_until(Path("/sys/class/net/can0").exists, 3, "can0")
+    can_up("can0")
+
+
+# --- the bench
+
+
+class MachineBench(Bench):
+    """Two ESCs on two kinds of port, and a gateway on the first controller; the second one watches."""
+
+    def __init__(self) -> None:
+        self._gateway = None  # the feeder asks before it is set
+        self.wire = WirePort(Identity(2, Layout.LEGACY, Device.JIVEPRO, 12))
+        self.uart = FarPort(Identity(1, Layout.V4), self._has_open)
+        for name in ("can0", "can1"):
+            can_up(name)
+        known = table(("--esc", "2"), True, 2)
+        super().__init__("can0", "can1", [self.wire, self.uart], known, slack_ns=SLACK_NS)
+
+    def _has_open(self, device: str) -> bool:
+        """Whether the gateway has this file open."""
+        gateway = self._gateway
+        with contextlib.suppress(OSError):
+            folder = f"/proc/{gateway.process.pid}/fd" if gateway else "/nowhere"
+            return any(os.readlink(f"{folder}/{fd}") == device for fd in os.listdir(folder))
+        return False
+
+
+@contextlib.contextmanager
+def machine(_: Path) -> Iterator[MachineBench]:
+    """The bed."""
+    with MachineBench() as bench:
         bench.start()
         yield bench
-
-
-def prepare(folder: Path) -> None:
-    """Make what would take long in the emulated machine: the shipped layout with cycle times below a second made four times as long,
-    a table of what it sends, and byte code."""
-
-    def slower(found: re.Match[str]) -> str:
-        cycle = int(found[2])
-        return f"{found[1]}{cycle * 4 if cycle < 1000 else cycle};"
-
-    command = [sys.executable, "-m", "kontronik_can_gw", "dbc", "--esc", "2"]
-    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    text = re.sub(r'(BA_ "GenMsgCycleTime" BO_ \d+ )(\d+);', slower, text)
-    (folder / "slow.dbc").write_text(text)
-    (folder / "sent.table").write_bytes(pickle.dumps(table_of(text, 2)))
-    here = Path(__file__).resolve().parent
-    sources = [str(here.parents[1] / "kontronik_can_gw"), str(here)]
-    subprocess.run([sys.executable, "-m", "compileall", "-q", *sources], check=False)

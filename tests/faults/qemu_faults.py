@@ -1,12 +1,12 @@
 """The faults of the emulated machine: real drivers for the UART, for a USB adapter and for the CAN controllers.
 
-ESC 1 is on the 16550A, ESC 2 on the played adapter; the gateway is on can0, the judge on can1. What a CAN bus does to a driver
+ESC 1 is on the played adapter, ESC 2 on the 16550A; the gateway is on can0, the judge on can1. What a CAN bus does to a driver
 is in can_faults.py, with the kernel's slcan driver.
 """
 
 import fcntl
-import itertools
 import os
+import random
 import signal
 import termios
 import time
@@ -14,22 +14,29 @@ from functools import partial
 
 from beds import fault
 from harness import Injection
-from qemu_adapter import ESC_LINE, FRESH_LINE, Line
-from qemu_bed import MachineBench, machine
-from qemu_machine import (
+from qemu_adapter import (
+    ESC_LINE,
+    FRESH_LINE,
+    STATUS_BREAK,
+    STATUS_FRAMING,
+    STATUS_PARITY,
+)
+from qemu_bed import (
     AS_SET,
-    controller_registers,
-    driver_back,
-    hold,
+    UART,
+    WIRE,
+    MachineBench,
+    driver_away,
+    held,
     line_counts,
     line_setting,
-    pci_bind,
+    machine,
     pci_slot,
     receive_overruns,
 )
 from raw_bus import RawBus
+from serial_faults import Mangle, bit_errors, gone, line_break, mangled, parity, slow_stream
 
-UART, WIRE = 0, 1
 PORT_LIMIT_S = 2.0
 """By the issue: after a port's return."""
 CAN_LIMIT_S = 1.0 + 0.5
@@ -37,21 +44,18 @@ CAN_LIMIT_S = 1.0 + 0.5
 RECEIVE_OVERRUN = 0x8110
 on_machine = partial(fault, machine="QEMU", bed=machine)
 serial = partial(on_machine, "Serial", limit_s=PORT_LIMIT_S)
+on_wire = partial(serial, escs=[WIRE])
 
 
 @on_machine("Start", "interface missing and port in use at the start", 3.0, rounds=[0])
 def hampered_start(bench: MachineBench, injection: Injection, _n: int) -> None:
     """Both come later: the gateway has to wait for each by itself."""
     bench.stop()
-    slot = pci_slot("can0")
-    pci_bind(slot, False)
-    held = hold(bench.uart.path)
-    bench.start(wait=False)
-    for words in (f"{bench.uart.path}: is in use", "CAN interface can0"):
-        bench.wait_log(words, seconds=bench.start_limit_s)
-    time.sleep(1)
-    os.close(held)
-    driver_back(slot)
+    with driver_away(), held(bench.uart.path):
+        bench.start(wait=False)
+        for words in (f"{bench.uart.path}: is in use", "CAN interface can0"):
+            bench.wait_log(words, seconds=20)
+        time.sleep(1)
     injection.cleared()
     injection.wait_recovery()
     injection.wait_boot_up(1)
@@ -60,102 +64,68 @@ def hampered_start(bench: MachineBench, injection: Injection, _n: int) -> None:
 # --- serial ports
 
 
-@serial("USB adapter in use by another program at its return", escs=[WIRE])
+@on_wire("USB adapter in use by another program at its return")
 def busy_at_return(bench: MachineBench, injection: Injection, _n: int) -> None:
     """The first of its port: what comes and goes is summed up later on."""
     wire = bench.wire
     wire.unplug()
     # until echo is off: what that program would echo is not the gateway's doing
-    wire.send = wire.silent
+    wire.on = False
     wire.plug()
-    held = hold(wire.device)
-    try:
-        fcntl.ioctl(held, termios.TIOCEXCL)
-        wire.send = wire.clean
+    with held(wire.device) as fd:
+        fcntl.ioctl(fd, termios.TIOCEXCL)
+        wire.on = True
         time.sleep(1.5)
-    finally:
-        os.close(held)
     injection.cleared()
     injection.wait_recovery()
     bench.wait_log(f"{wire.device}: is in use")
 
 
-@serial("USB adapter pulled and put back", escs=[WIRE], rounds=(0.0, 0.3, 1.0, 6.0))
-def replug(bench: MachineBench, injection: Injection, pause: float) -> None:
-    bench.wire.unplug()
-    time.sleep(pause)
-    bench.wire.plug()
-    injection.cleared()
+on_wire("USB adapter pulled and put back", rounds=(0.0, 0.3, 1.0, 6.0))(gone)
 
 
-@serial("USB adapter back under another ttyUSB number", escs=[WIRE])
+@on_wire("USB adapter back under another ttyUSB number")
 def renumbered(bench: MachineBench, injection: Injection, _n: int) -> None:
     """And back under its first one: while another program has not let go of the old one, its number stays taken."""
     before = bench.wire.device
-    held = hold(before)
-    try:
+    with held(before):
         bench.wire.unplug()
         bench.wire.plug()
         injection.cleared()
         bench.expect(bench.wire.device != before, f"the adapter is {before} again")
         injection.wait_recovery()
-    finally:
-        os.close(held)
 
 
 def misread(
-    bench: MachineBench, injection: Injection, _n: int, line: Line, counters: tuple[str, ...]
+    bench: MachineBench, injection: Injection, n: int, how: Mangle, error: int, counter: str
 ) -> None:
-    """An ESC that sends by other settings for a while; the driver has to count it."""
+    """What the line makes of the bytes, as in User Mode Linux, and here the chip says so: the driver has to count it."""
     wire = bench.wire
+
+    def flagged(data: bytes) -> tuple[bytes, bool]:
+        came, whole = how(data)
+        wire.error = 0 if whole else error
+        return came, whole
+
     before = line_counts(wire.device)
-    wire.send = wire.at(line)
-    time.sleep(1.5)
-    wire.send = wire.clean
-    injection.cleared()
-    injection.wait_recovery()
+    mangled(bench, injection, n, flagged, readable=not injection.escs)
+    wire.error = 0
     after = line_counts(wire.device)
-    counted = any(getattr(after, name) > getattr(before, name) for name in counters)
-    bench.expect(counted, f"no {counters} counted: {after}")
+    counted = getattr(after, counter) > getattr(before, counter)
+    bench.expect(counted, f"no {counter} counted: {after}")
 
 
-for name, line, counters in (
-    ("8N1 stream on the 8E1 line", Line(parity="N"), ("framing", "parity")),
-    ("9600 baud stream", FRESH_LINE, ("framing", "breaks")),
+for name, how, error, counter in (
+    ("8N1 stream on the 8E1 line", parity, STATUS_PARITY, "parity"),
+    ("9600 baud stream", slow_stream, STATUS_FRAMING, "framing"),
+    ("bit errors on the line", bit_errors, STATUS_PARITY, "parity"),
+    ("break", line_break, STATUS_BREAK, "breaks"),
 ):
-    serial(name, escs=[WIRE])(partial(misread, line=line, counters=counters))
-
-
-@serial("bit errors on the line, each tenth frame", escs=[], rounds=[0])
-def bit_errors(bench: MachineBench, injection: Injection, _n: int) -> None:
-    """Only the frames that were hit may be missing."""
-    wire = bench.wire
-    sent = itertools.count(1)
-
-    def sometimes(data: bytes) -> bool:
-        return wire.clean(data) if next(sent) % 10 else wire.flipped(data)
-
-    before = line_counts(wire.device)
-    wire.send = sometimes
-    time.sleep(6)
-    wire.send = wire.clean
-    time.sleep(0.3)
-    after = line_counts(wire.device)
-    errors = after.parity + after.framing - before.parity - before.framing
-    bench.expect(errors >= 3, f"no errors counted: {before} {after}")
-
-
-@serial("break, 0.3 s", escs=[WIRE])
-def line_break(bench: MachineBench, injection: Injection, _n: int) -> None:
-    wire = bench.wire
-    before = line_counts(wire.device).breaks
-    wire.send = wire.silent
-    wire.adapter.hold_low(0.3)
-    time.sleep(0.3)
-    wire.send = wire.clean
-    injection.cleared()
-    injection.wait_recovery()
-    bench.expect(line_counts(wire.device).breaks > before, "no break counted")
+    escs, limit_s = ([], None) if how is bit_errors else ([WIRE], PORT_LIMIT_S)
+    line = partial(how, random.Random(name))
+    on_machine("Serial", name, limit_s, escs=escs)(
+        partial(misread, how=line, error=error, counter=counter)
+    )
 
 
 @on_machine("Serial", "all ports are set to 8E1, without echo", None, escs=[], rounds=[0])
@@ -206,14 +176,13 @@ def overrun(bench: MachineBench, injection: Injection, _n: int) -> None:
 def reset_by_other(bench: MachineBench, injection: Injection, index: int) -> None:
     """As a getty does that root starts on the gateway's port. QEMU's far end goes on as before: there it is the setting that is judged."""
     injection.escs = [index]
-    port = (bench.uart, bench.wire)[index]
+    port = (bench.wire, bench.uart)[index]
     said = len(bench.gateway.lines)
-    fd = hold(port.device)
-    mode = termios.tcgetattr(fd)
-    mode[2] &= ~termios.PARENB
-    mode[4] = mode[5] = termios.B9600
-    termios.tcsetattr(fd, termios.TCSANOW, mode)
-    os.close(fd)
+    with held(port.device) as fd:
+        mode = termios.tcgetattr(fd)
+        mode[2] &= ~termios.PARENB
+        mode[4] = mode[5] = termios.B9600
+        termios.tcsetattr(fd, termios.TCSANOW, mode)
     if index == WIRE:
         line = bench.wire.adapter.line
         bench.expect(line == FRESH_LINE, f"the chip: {line}")
@@ -233,13 +202,11 @@ def reset_by_other(bench: MachineBench, injection: Injection, index: int) -> Non
 )
 def rebound(bench: MachineBench, injection: Injection, pause: float) -> None:
     """The interface is gone, and another one with the same name comes."""
-    slot = pci_slot("can0")
-    pci_bind(slot, False)
-    # else can1 keeps what came last until its next interrupt
-    with RawBus("can1") as other:
-        other.send(0x7FF)
-    time.sleep(pause)
-    driver_back(slot)
+    with driver_away():
+        # else can1 keeps what came last until its next interrupt
+        with RawBus("can1") as other:
+            other.send(0x7FF)
+        time.sleep(pause)
     injection.cleared()
     injection.wait_recovery()
     injection.wait_boot_up(1)
@@ -249,7 +216,8 @@ def rebound(bench: MachineBench, injection: Injection, pause: float) -> None:
 def fifo_overrun(bench: MachineBench, injection: Injection, _n: int) -> None:
     """Its interrupts are masked while the bus sends more than 64 bytes: the driver counts it, the node says EMCY 8110h."""
     time.sleep(1.2)  # the node says it once a second at most
-    registers = controller_registers(pci_slot("can0"))
+    # the SJA1000's, for pread and pwrite of single bytes
+    registers = os.open(f"/sys/bus/pci/devices/{pci_slot('can0')}/resource1", os.O_RDWR)
     interrupt_enable = 4
     before = receive_overruns("can0")
     enabled = os.pread(registers, 1, interrupt_enable)

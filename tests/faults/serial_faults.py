@@ -7,10 +7,11 @@ import random
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 from beds import fault
-from encoding import Identity
-from harness import Bench, Injection, PtyPort, growth
+from feeder import Identity
+from harness import Bench, Injection, PtyPort
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.states import Device
@@ -74,7 +75,7 @@ def permission(bench: Bench, injection: Injection, _n: int) -> None:
 
 @on_first("port gone and back", rounds=(0.05, 0.3, 0.7, 4))
 def gone(bench: Bench, injection: Injection, pause: float) -> None:
-    port = port_of(bench)
+    port: Any = bench.escs[0]
     port.unplug()
     if pause > 1:
         lost(bench)
@@ -260,7 +261,7 @@ def cycles(bench: Bench, injection: Injection, times: int) -> None:
         if i == times // 5:
             before = bench.gateway.figures()
     time.sleep(0.5)
-    grown = growth(before, bench.gateway.figures(), 1024)
+    grown = bench.gateway.growth(before, 1024)
     bench.expect(not grown, f"the gateway has more than before: {grown}")
 
 

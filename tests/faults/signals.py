@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from encoding import Identity, info_values, live_values
+from feeder import Identity, info_values, live_values
 
 LIVE_NAMES = frozenset(live_values(Identity(), 0))
 INFO_NAMES = frozenset(info_values(Identity(), 0))
@@ -99,16 +99,10 @@ def _message(message: Any, count: int) -> Message:
     )
 
 
-def table_of(text: str, escs: int) -> Table:
-    """The table of all messages of a DBC's text."""
-    import cantools.database
-
-    database: Any = cantools.database.load_string(text, "dbc", strict=True)
-    return {message.frame_id: _message(message, escs) for message in database.messages}
-
-
 def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:
     """Of what ``kontronik-can-gw dbc`` prints, of the nodes too if there are any; in this process, as a start takes long in a VM."""
+    import cantools.database
+
     from kontronik_can_gw.cli import main
 
     found: Table = {}
@@ -116,5 +110,6 @@ def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             assert main(["dbc", *words, *options]) == 0
-        found |= table_of(printed.getvalue(), escs)
+        database: Any = cantools.database.load_string(printed.getvalue(), "dbc", strict=True)
+        found |= {message.frame_id: _message(message, escs) for message in database.messages}
     return found

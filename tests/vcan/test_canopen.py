@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import canopen
-from encoding import Identity
+from feeder import Identity
 from vcan_tools import EDS, LIMIT_S, canopen_table, chain, wait_for
 
 from kontronik_can_gw.esc.kontronik.codec import Layout

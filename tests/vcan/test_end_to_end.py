@@ -4,7 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from encoding import Identity
+from feeder import Identity
 from vcan_tools import chain, wait_for
 
 from kontronik_can_gw.esc.kontronik.codec import Layout

@@ -21,7 +21,7 @@ or COVERAGE_. Python finds no asammdf in there, which python-can imports where i
 
 Kept in mind in here: UML does not save the AVX-512 registers over a signal, so glibc and OpenSSL are told to leave
 them alone, and number crunchers with a dispatcher of their own, as numpy, must stay outside. /dev/kvm may be there
-and not work: QEMU always emulates. SIGKILL leaves UML's children behind: SIGTERM comes first, then the whole group.
+and not work: QEMU always emulates. SIGKILL leaves UML's children behind: SIGTERM comes first.
 """
 
 import argparse
@@ -37,8 +37,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from types import FrameType
 from typing import BinaryIO, NoReturn
 
@@ -55,25 +55,22 @@ TMPFS = ("/tmp", "/var/tmp", "/run", "/dev/shm")  # guest-init.sh mounts an empt
 
 UML_MEMORY_MIB = 512
 QEMU_MEMORY_MIB = 1024
-START_TIMEOUT_S = {"uml": 120.0, "qemu": 180.0}
 
 GLIBC_WITHOUT_AVX512 = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW"
 # CPUID leaf 7, EBX: the bits of AVX512 F, DQ, IFMA, PF, ER, CD, BW, VL
 OPENSSL_WITHOUT_AVX512 = ":~0xdc230000"
 
 
-def passed_on(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables that COMMAND gets where it does not simply inherit them; PATH with the folders of `ip` and `tc`."""
-    kept = {name: value for name, value in environment.items() if PASSED_ON.match(name)}
-    kept["PATH"] = with_sbin(kept.get("PATH", ""))
-    return kept
+def passed_on() -> dict[str, str]:
+    """The variables that COMMAND gets where it does not simply inherit them."""
+    return {name: value for name, value in os.environ.items() if PASSED_ON.match(name)}
 
 
-def with_sbin(path: str) -> str:
-    folders = path.split(os.pathsep) if path else []
-    return os.pathsep.join(
-        folders + [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders]
-    )
+def extend_path() -> None:
+    """By the folders of `ip` and `tc`."""
+    folders = os.environ.get("PATH", "").split(os.pathsep)
+    further = [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders]
+    os.environ["PATH"] = os.pathsep.join(filter(None, folders + further))
 
 
 # --- this kernel
@@ -91,7 +88,7 @@ def native_prefix() -> list[str] | None:
     rights = "--inh-caps=+net_admin,+net_raw --ambient-caps=+net_admin,+net_raw"
     ids = f"--reuid={os.getuid()} --regid={os.getgid()} --init-groups"
     as_root = f"sudo -n unshare --net setpriv {ids} {rights} env".split()
-    as_root += [f"{name}={value}" for name, value in passed_on(os.environ).items()] + with_lo
+    as_root += [f"{name}={value}" for name, value in passed_on().items()] + with_lo
     interface = f"vm{os.getpid()}"
     probe = ["sh", "-c", f"ip link add dev {interface} type vcan && ip link del {interface}"]
     for prefix in ([], namespace, as_root):
@@ -199,7 +196,7 @@ def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence
     with open(os.path.join(without, "asammdf.py"), "w") as file:
         file.write('raise ImportError("kept out of virtual machines by tests/vm/vm_run.py")\n')
     path = os.pathsep.join(filter(None, ("/run/job/without", os.environ.get("PYTHONPATH"))))
-    environment = passed_on(os.environ) | {
+    environment = passed_on() | {
         "VM_BACKEND": backend,
         "TMPDIR": "/tmp",
         "NO_COLOR": "1",
@@ -239,39 +236,12 @@ def pump(fd: int, to: BinaryIO) -> None:
                 to.flush()
 
 
-def guard(group: int, job: str) -> int:
-    """Forks a process that ends the VM when this one was killed outright; returns the fd to write to when all is well."""
-    read, write = os.pipe()
-    if os.fork():
-        os.close(read)
-        return write
-    try:
-        os.setsid()
-        os.dup2(os.open(os.devnull, os.O_RDWR), 1)
-        os.dup2(1, 2)
-        os.close(write)
-        if not os.read(read, 1):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(group, signal.SIGTERM)
-                time.sleep(0.5)
-                os.killpg(group, signal.SIGKILL)
-            shutil.rmtree(job, ignore_errors=True)
-    finally:
-        os._exit(0)
-
-
-def stop(process: subprocess.Popen[bytes]) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
-    if process.poll() is None:
-        process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(5)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, leave)
+UNDERTAKER = """
+cat >/dev/null
+kill -TERM -$0 && sleep 1 && kill -KILL -$0
+rm -rf "$1"
+"""
+"""A shell that outlives this process, however that ends: then what is left of the VM's processes, and its job folder, go."""
 
 
 def leave(number: int, _frame: FrameType | None) -> NoReturn:
@@ -285,7 +255,6 @@ def start_vm(
         command, environment = uml_command(job, out, err), uml_host_environment(job)
     else:
         command, environment = qemu_command(job, out, err), {"TMPDIR": job}
-    environment |= {"PATH": with_sbin(os.environ.get("PATH", ""))}
     return subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -297,40 +266,13 @@ def start_vm(
     )
 
 
-def wait_for_end(
-    process: "subprocess.Popen[bytes]", backend: str, job: str, timeout_s: float
-) -> str:
-    """Why it is not waited for any longer; nothing if it has ended."""
-    start, started = time.monotonic(), False
-    while True:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(max(0.0, start + timeout_s - time.monotonic()) if started else 0.1)
-            return ""
-        started = started or is_started(job)
-        elapsed_s = time.monotonic() - start
-        if elapsed_s >= timeout_s:
-            return f"no end within {timeout_s:g} s"
-        if not started and elapsed_s >= START_TIMEOUT_S[backend]:
-            return f"no start within {elapsed_s:.0f} s"
-
-
-def is_started(job: str) -> bool:
-    return os.path.exists(os.path.join(job, "started"))
-
-
-def read(job: str, name: str) -> str:
-    try:
-        with open(os.path.join(job, name), errors="replace") as file:
-            return file.read()
-    except OSError:
-        return ""
-
-
 def run_in_vm(
     backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
 ) -> tuple[int, bool]:
     """Returns the exit code, and whether the command was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
+    undertaker = None
+    result, started = Path(job, "rc"), Path(job, "started")
     try:
         write_job(job, backend, command, writable)
         pipes = [os.pipe() for _ in range(2)]
@@ -340,35 +282,40 @@ def run_in_vm(
         finally:
             for _, end in pipes:
                 os.close(end)
-        guard_fd = guard(process.pid, job)
+        undertaker = subprocess.Popen(
+            ["sh", "-c", UNDERTAKER, str(process.pid), job],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         pumps = [
             threading.Thread(target=pump, args=(end, to.buffer), daemon=True)
             for (end, _), to in zip(pipes, (sys.stdout, sys.stderr), strict=True)
         ]
+        for thread in pumps:
+            thread.start()
         try:
-            for thread in pumps:
-                thread.start()
-            late = wait_for_end(process, backend, job, timeout_s)
-        finally:
-            stop(process)
-            os.write(guard_fd, b".")
-            os.close(guard_fd)
+            process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            print(f"vm/run: {backend}: no end within {timeout_s:g} s", file=sys.stderr)
+            return TIMED_OUT, True
         for thread in pumps:
             thread.join(60)
-        code, started = read(job, "rc").strip(), is_started(job)
-        if code and not late:
-            return int(code), True
-        print(f"vm/run: {backend}: {late or 'the VM ended without a result'}", file=sys.stderr)
-        if late and started:
-            return TIMED_OUT, True
-        if not late:
-            print(*(read(job, name)[-4000:] for name in ("log", "klog")), file=sys.stderr)
-        return VM_FAILED, started
+        if result.exists() and result.read_text().strip():
+            return int(result.read_text()), True
+        print(f"vm/run: {backend}: the VM ended without a result", file=sys.stderr)
+        for file in map(Path, (f"{job}/log", f"{job}/klog")):
+            if file.exists():
+                print(file.read_text(errors="replace")[-4000:], file=sys.stderr)
+        return VM_FAILED, started.exists()
     except (OSError, subprocess.CalledProcessError) as error:
         print(f"vm/run: {backend}: {error}", file=sys.stderr)
         return VM_FAILED, False
     finally:
-        shutil.rmtree(job, ignore_errors=True)
+        if undertaker is None:
+            shutil.rmtree(job, ignore_errors=True)
+        else:
+            undertaker.communicate()
 
 
 # --- the command line
@@ -376,19 +323,15 @@ def run_in_vm(
 
 def installed() -> list[str]:
     """The kinds of VM that can be tried, the better one first."""
-    path = with_sbin(os.environ.get("PATH", ""))
     if not os.path.exists("/usr/bin/busybox"):
         return []
-    vms = ["uml"] if all(shutil.which(each, path=path) for each in ("linux.uml", "cc")) else []
-    return vms + (
-        ["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64", path=path) else []
-    )
+    vms = ["uml"] if shutil.which("linux.uml") and shutil.which("cc") else []
+    return vms + (["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64") else [])
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(usage=__doc__, add_help=True)
-    kinds, default = ("auto", *BACKENDS), os.environ.get("KCG_VM_BACKEND") or "auto"
-    parser.add_argument("--backend", choices=kinds, default=default)
+    parser.add_argument("--backend", choices=("auto", *BACKENDS), default="auto")
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")
@@ -405,9 +348,9 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = arguments()
+    extend_path()
     prefix = None
     if args.backend in ("auto", "native"):
-        os.environ["PATH"] = with_sbin(os.environ.get("PATH", ""))
         prefix = native_prefix()
         if prefix is None and args.backend == "native" and not args.which:
             print("vm/run: native: this kernel has no vcan, or not for us", file=sys.stderr)
@@ -426,10 +369,7 @@ def main() -> int:
         if code != VM_FAILED or started:
             return code
     if not vms:
-        print(
-            "vm/run: this kernel has no vcan and there is no VM: run tests/vm/setup.sh uml",
-            file=sys.stderr,
-        )
+        print("vm/run: no vcan here, and no VM: run tests/vm/setup.sh uml", file=sys.stderr)
     return VM_FAILED
 
 

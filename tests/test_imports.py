@@ -1,7 +1,7 @@
-"""What the running gateway has imported: the real ``run`` command on a stand-in of a CAN interface, looked at when it has sent values.
+"""What a gateway has imported: the real ``run`` command on a stand-in of a CAN interface, looked at when it has sent values.
 
 A gateway on a small board pays for each library in time and memory, and libraries bring others: python-can brings asammdf where it is
-installed. So what may be there is listed.
+installed. So what may be there is listed. And cantools, which comes without python-can, is whole for who asks for more of it.
 """
 
 import os
@@ -30,13 +30,19 @@ NEVER = {"tkinter", "curses", "multiprocessing", "unittest", "pydoc", "doctest",
 NEVER |= {"sqlite3", "email"}
 """Of the standard library."""
 NODES = '[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nstore = "store"\n'
-CONFIGURATIONS = {
-    "DBC": ("", CANTOOLS),
-    "CANopen only": (f"[dbc]\nenabled = false\n{NODES}", set[str]()),
-    "DBC and CANopen": (NODES, CANTOOLS),
-    "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS),
-    "status": ('[statistics]\nfile = "status.json"\n', CANTOOLS),
+CANOPEN = {"kontronik_can_gw.canopen", "kontronik_can_gw.runtime.store"}
+RECORDER = {
+    f"kontronik_can_gw.{name}"
+    for name in ("capture.setup", "runtime.recorder", "runtime.recorded_gateway")
 }
+CONFIGURATIONS = {
+    "DBC": ("", CANTOOLS, set[str]()),
+    "CANopen only": (f"[dbc]\nenabled = false\n{NODES}", set[str](), CANOPEN),
+    "DBC and CANopen": (NODES, CANTOOLS, CANOPEN),
+    "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS, RECORDER),
+    "status": ('[statistics]\nfile = "status.json"\n', CANTOOLS, set[str]()),
+}
+"""Tables, the libraries that come with them, and of our own modules those that are there only with some of the tables."""
 
 AT_THE_END = """
 import atexit, sys
@@ -104,17 +110,6 @@ def _until_values(peer: socket.socket, esc: PtyEsc) -> None:
     raise AssertionError("no values came")
 
 
-ONLY_WITH = {
-    "canopen": ("kontronik_can_gw.canopen", "kontronik_can_gw.runtime.store"),
-    "[record]": (
-        "kontronik_can_gw.capture.setup",
-        "kontronik_can_gw.runtime.recorder",
-        "kontronik_can_gw.runtime.recorded_gateway",
-    ),
-}
-"""Of our own modules, those that are there only where this stands in the configuration."""
-
-
 def surplus(modules: set[str], allowed: set[str]) -> set[str]:
     """Modules that are neither of the standard library nor allowed."""
     libraries = {name.partition(".")[0] for name in modules}
@@ -131,13 +126,12 @@ def surplus(modules: set[str], allowed: set[str]) -> set[str]:
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Path) -> None:
-    tables, further = CONFIGURATIONS[name]
+    tables, further, own = CONFIGURATIONS[name]
     modules = imported(tmp_path, tables)
     assert "kontronik_can_gw.runtime.loop" in modules
     assert surplus(modules, ALWAYS | further) == set()
     assert modules & NEVER == set()
-    for key, own in ONLY_WITH.items():
-        assert [module for module in own if (module in modules) != (key in tables)] == []
+    assert modules & (CANOPEN | RECORDER) == own
 
 
 def test_the_list_can_fail(tmp_path: Path) -> None:
@@ -147,3 +141,35 @@ def test_the_list_can_fail(tmp_path: Path) -> None:
     )
     found = surplus(modules, ALWAYS | CANTOOLS)
     assert {"rich", "kontronik_can_gw.desk.recordings.layouts"} <= found
+
+
+LEAN = "import sys; from kontronik_can_gw.lean import without_asammdf\n"
+DATABASE = f"{LEAN}with without_asammdf(): import cantools.database\n"
+WHOLE = f"""{DATABASE}
+import cantools
+before = cantools.database
+from cantools import Error, database
+print('can' in sys.modules, hasattr(cantools, 'nothing_of_this_name'), Error.__name__)
+print(cantools.tester.Tester.__name__, before is cantools.database, 'can' in sys.modules)
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (WHOLE, "True False Error\nTester True True"),
+        (f"import cantools; before = cantools\n{DATABASE}print(before is cantools)", "True"),
+        (
+            f"{LEAN}with without_asammdf(): import can\nprint('asammdf' in sys.modules); import asammdf",
+            "False",
+        ),
+    ],
+    ids=[
+        "cantools is whole for who asks for more",
+        "a cantools that is there already stays",
+        "asammdf can be imported afterwards",
+    ],
+)
+def test_libraries_come_alone_and_whole(code: str, said: str) -> None:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, said), done.stderr
