@@ -46,7 +46,8 @@ def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_err
 @pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "candump", "blf", "mf4-log"])
 def test_nothing_to_convert_leaves_nothing(tmp_path: Path, form: str) -> None:
     source, is_table = tmp_path / "other.log", form in ("csv", "jsonl", "parquet")
-    source.write_text("(1700000000.000000) can0 123#00\n" if is_table else "\n")
+    empty = "base hex  timestamps absolute\n"
+    source.write_text("(1700000000.000000) can0 123#00\n" if is_table else empty)
     said = refused(1, "convert", source, tmp_path / "out", "--to", form)
     assert f"{source}: nothing in it can be converted" in said
     assert "--dbc" in said or not is_table

@@ -23,11 +23,17 @@ from recordings import (
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.convert import _table_writer
-from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table, distinct, fields_of_values
+from kontronik_can_gw.desk.recordings.fields import (
+    Choice,
+    Field,
+    Kind,
+    Table,
+    distinct,
+    fields_of_values,
+)
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.stream import EscStream
