@@ -18,7 +18,6 @@ from log_files import (
 )
 
 from kontronik_can_gw.desk.recordings.log_input import log_format
-from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 
 FORMATS = sorted(READERS)
@@ -113,12 +112,6 @@ def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
         path = tmp_path / f"{format_}.bin"
         write_log(path, format_, some_frames(5))
         assert log_format(path.read_bytes()) == format_
-    rubbish = tmp_path / "rubbish.txt"
-    rubbish.write_text("no log\n")
-    with pytest.raises(UserError, match="is no capture, no CAN log"):
-        opened(rubbish)
-    with pytest.raises(RunError, match="there is no such file"):
-        opened(tmp_path / "missing.log")
 
 
 def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:

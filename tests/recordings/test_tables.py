@@ -18,7 +18,6 @@ from recordings import (
     WALL_NS,
     capture_bytes,
     convert,
-    dump_bytes,
 )
 
 from kontronik_can_gw.config.keys import shipped
@@ -117,27 +116,6 @@ def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_p
         assert "e0: KOSMIK 200, firmware 1.2, V4 layout, at /dev/ttyUSB0" in mdf.header.comment
         assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
         assert 0 <= mdf.header.start_time.timestamp() - WALL_NS / 1e9 < 0.1
-
-
-def _rows(tmp_path: Path, *options: object) -> Cells:
-    source = tmp_path / "dump"
-    source.write_bytes(dump_bytes())
-    assert convert(source, tmp_path / "out.jsonl", "--force", *options) == 0
-    return read_jsonl(tmp_path / "out.jsonl")
-
-
-def test_signals_are_chosen_by_name_in_the_given_order(tmp_path: Path) -> None:
-    rows = _rows(tmp_path, "--signals", "OperatingState, battery_*,BatteryVoltage")
-    names = ["operating_state", "battery_voltage", "battery_current", "battery_power"]
-    assert list(rows[0]) == ["Time", *names]
-
-
-def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Path) -> None:
-    every = _rows(tmp_path)
-    assert _rows(tmp_path, "--from", "1", "--until", "2.5") == [
-        row for row in every if 1 <= row["Time"] <= 2.5
-    ]
-    assert _rows(tmp_path, "--from", "0", "--until", "0") == every[:1]
 
 
 def test_names_that_are_there_twice_get_their_message_in_front() -> None:
