@@ -23,8 +23,8 @@ from kontronik_can_gw.desk.recordings.convert import (
     to_log,
     to_table,
 )
+from kontronik_can_gw.desk.recordings.fields import Choice
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
-from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.errors import RunError, UserError
 
 

@@ -169,11 +169,6 @@ class Player(Output):
         return Frames(taken, 0, sure)
 
     @property
-    def has_rows(self) -> bool:
-        """True where rows are complete."""
-        return bool(self._state.rows)
-
-    @property
     def is_full(self) -> bool:
         """True where rows must be taken before more is played."""
         return bool(self._state.rows + KCG.MAX_ROWS > self._state.room)

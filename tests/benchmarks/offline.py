@@ -42,9 +42,9 @@ def convert(
 ) -> Run:
     """One conversion. ``live``: of the 16 values of live data."""
     from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
+    from kontronik_can_gw.desk.recordings.fields import Choice
     from kontronik_can_gw.desk.recordings.inputs import open_input
     from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
-    from kontronik_can_gw.desk.recordings.tables.rows import Choice
     from kontronik_can_gw.esc.kontronik.fields import LiveData
 
     if form == "parquet":

@@ -205,7 +205,7 @@ class Judge:
         self.count: Counter[str] = Counter()
         self._now = -1
         self._pdos = _canopen_database()
-        self._flags = _flags()
+        self._flags = flags()
 
     def given(self, now: int, index: int, arrivals: Arrivals | None) -> None:
         """An input of an ESC; None: its port is lost."""
@@ -333,7 +333,7 @@ def _dbc_of(configuration: str) -> Database:
 
 
 @cache
-def _flags() -> dict[str, tuple[str, int]]:
+def flags() -> dict[str, tuple[str, int]]:
     """Names of the shipped flags, in the order of their bits; each has a word of the sheet's row in it."""
     found: dict[str, tuple[str, int]] = {}
     for message, word, bits in (

@@ -4,7 +4,7 @@
 
 Makes a capture of so many minutes without waiting, converts it by the real command as a process of its own, converts the CAN logs back,
 reads every file by pandas, json, pyarrow, python-can, asammdf and cantools, and compares every value of every row with what the simulated
-ESC meant (hour_truth.py); of what only the gateway knows (rates, counters, states) with the first table.
+ESC meant (hour_truth.py); of what only the gateway knows (rates, counters, states, energy) with the first table.
 Exits with 1 and the first differences where anything is not equal.
 """
 
@@ -24,27 +24,16 @@ if __name__ == "__main__":
     tests = Path(__file__).resolve().parents[1]
     sys.path[:0] = [str(tests.parent), str(tests), str(tests / "capture")]
 
+import can
 import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
-from hour_truth import (
-    MS,
-    OPERATING_ERRORS,
-    SECOND,
-    SELFTEST_ERRORS,
-    Floats,
-    Times,
-    Truth,
-    value_name,
-)
+from hour_truth import MS, SECOND, Floats, Times, Truth, value_name
 from pyarrow import parquet  # type: ignore[import-untyped]
 
 ROWS = 20_000
-SLACK = 1e-7
-"""cantools multiplies by 0.001 what is compared with the float nearest to the decimal; no signal is finer than 0.001."""
+SLACK = 6e-7
+"""A table has six decimals; what cantools multiplies is nearer still."""
 LOGS = {"log": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4": "mf4-log"}
-FLAGS = {*OPERATING_ERRORS, *SELFTEST_ERRORS}
-BESIDE_FLAGS = ("operating_state", "operating_state_raw", "power_stage_temperature", "variant", "firmware_main", "device_raw")  # fmt: skip
-"""Where all of these that a message has are not available, its flags are not either."""
 
 
 @dataclass
@@ -129,22 +118,20 @@ def table_of(path: Path, truth: Truth) -> tuple[Times, Times | None, dict[str, F
     return whole.pop("Time"), whole.pop("Utc", None), whole
 
 
-def check_table(truth: Truth, seen: dict[str, Floats], path: Path) -> Verdict:
-    """A table of the recording. ``seen``: of the first one, what the truth does not know."""
+def check_table(truth: Truth, known: dict[str, Floats], path: Path) -> Verdict:
+    """A table of the recording. ``known``: its columns, filled by the truth, and of the first table with what the truth does not know."""
     times, wall, values = table_of(path, truth)
     verdict = Verdict()
     verdict.compare("Time", times, truth.row_ns - truth.row_ns[0], 500)
     # text cuts at a microsecond, Parquet keeps nanoseconds
     tolerance = 0 if path.suffix == ".parquet" else 999
     verdict.compare("Utc", wall, truth.wall_ns(truth.row_ns), tolerance)
-    wanted = truth.rows()
-    if not seen:
-        seen |= {name: column for name, column in values.items() if name not in wanted}
-    wanted |= seen
-    for name in sorted(wanted.keys() ^ values.keys()):
-        verdict.problems.append(f"{name}: is {'missing' if name in wanted else 'too much'}")
-    for name in wanted.keys() & values.keys():
-        verdict.compare(name, values[name], wanted[name])
+    if not known:
+        known |= values | truth.columns()
+    for name in sorted(known.keys() ^ values.keys()):
+        verdict.problems.append(f"{name}: is {'missing' if name in known else 'too much'}")
+    for name in known.keys() & values.keys():
+        verdict.compare(name, values[name], known[name], SLACK)
     return verdict
 
 
@@ -153,8 +140,6 @@ def check_table(truth: Truth, seen: dict[str, Floats], path: Path) -> Verdict:
 
 def check_log(truth: Truth, path: Path) -> Verdict:
     """A log of all frames: ids, bytes, times as they were handed to the interface, by python-can (MF4: by asammdf below it)."""
-    import can
-
     options: dict[str, Any] = {"relative_timestamp": False} if path.suffix == ".asc" else {}
     times, ids, data = [], [], []
     with can.LogReader(path, **options) as reader:
@@ -174,72 +159,53 @@ def check_log(truth: Truth, path: Path) -> Verdict:
     return verdict
 
 
-class Decoded:
-    """The frames that were handed to the interface, by cantools; equal ones are decoded once."""
+def decoded(truth: Truth, can_id: int) -> pd.DataFrame:
+    """What cantools reads in the frames of one id: ``ns``, when each was sent, and a column for each value."""
+    rows = np.flatnonzero(truth.sent_ids == can_id)
+    message = truth.database.get_message_by_frame_id(can_id)
+    payloads, at = np.unique(truth.sent_data[rows], return_inverse=True)
+    found = [message.decode_simple(int(bits).to_bytes(8, "little")) for bits in payloads.tolist()]
 
-    def __init__(self, truth: Truth) -> None:
-        self._truth = truth
-        self.frames = {
-            can_id: self._table(can_id, np.flatnonzero(truth.sent_ids == can_id))
-            for can_id in np.unique(truth.sent_ids).tolist()
-        }
-        """By id: when they were sent, and a column for each value (alive counters by their signal's name)."""
-
-    def _table(self, can_id: int, rows: Times) -> tuple[Times, dict[str, Floats]]:
-        message = self._truth.database.get_message_by_frame_id(can_id)
-        unique, at = np.unique(self._truth.sent_data[rows], return_inverse=True)
-        found = [message.decode_simple(int(bits).to_bytes(8, "little")) for bits in unique.tolist()]
-        columns = {}
-        for signal in (one.name for one in message.signals):
-            name = signal if signal.endswith("Alive") else value_name(signal)
-            of_it = [self._number(name, values[signal]) for values in found]
-            columns[name] = np.array(of_it, np.float64)[at]
-        return self._truth.sent_ns[rows], columns
-
-    def _number(self, name: str, value: Any) -> float:
-        text = str(value)
-        if text in ("NotAvailable", "Error"):
+    def number(name: str, value: Any) -> float:
+        if str(value) in ("NotAvailable", "Error"):
             return np.nan
-        return self._truth.texts[name][text.casefold()] if hasattr(value, "value") else float(value)
+        return truth.texts[name][str(value).casefold()] if hasattr(value, "value") else float(value)
 
-    def check_sent(self, _: Path) -> Verdict:
-        """Every signal of every frame against what the ESC meant."""
-        verdict = Verdict()
-        for times, columns in self.frames.values():
-            wanted = self._truth.frames(times)
-            for name, values in columns.items():
-                if name.endswith("Alive"):
-                    verdict.compare(name, np.diff(values) % 15, np.ones(len(values) - 1))
-                elif name in FLAGS:  # a flag has no code for not available
-                    verdict.compare(name, values, np.nan_to_num(wanted[name]))
-                elif name in wanted:
-                    verdict.compare(name, values, wanted[name], SLACK)
-        return verdict
-
-    def check_table(self, path: Path) -> Verdict:
-        """The CSV of a CAN log: in each row the newest value of each signal while it is fresh."""
-        times, _, values = table_of(path, self._truth)
-        verdict = Verdict()
-        begun = times + self._truth.sent_ns[0]
-        until = np.append(begun[1:], 1 << 62) - 1500  # its own microsecond
-        for can_id, (sent, columns) in self.frames.items():
-            cycle = self._truth.database.get_message_by_frame_id(can_id).cycle_time
-            # three cycles, at least 250 ms; a second where it comes with telemetry only
-            life = max(250, 3 * cycle) * MS if cycle else SECOND
-            at = np.searchsorted(sent, until, "right") - 1
-            fresh = (at >= 0) & (begun - sent[np.maximum(at, 0)] <= life)
-            beside = [columns[name] for name in BESIDE_FLAGS if name in columns]
-            valid = ~np.all(np.isnan(beside), axis=0) if beside else np.full(len(sent), True)
-            for name, column in columns.items():
-                if name not in values:
-                    continue
-                shown = np.where(valid, column, np.nan) if name in FLAGS else column
-                newest = np.where(fresh, shown[np.maximum(at, 0)], np.nan)
-                verdict.compare(name, values[name], newest, SLACK)
-        return verdict
+    columns = {}
+    for signal in found[0]:
+        name = value_name(signal)
+        columns[name] = np.array([number(name, values[signal]) for values in found])[at]
+    return pd.DataFrame({"ns": truth.sent_ns[rows], "sent_ns": truth.sent_ns[rows]} | columns)
 
 
-# --- bytes
+def check_back(truth: Truth, path: Path) -> Verdict:
+    """The CSV of a CAN log: in each row the newest value of each signal while it is fresh."""
+    times, _, values = table_of(path, truth)
+    verdict = Verdict()
+    begun = times + truth.sent_ns[0]
+    until = pd.DataFrame({"ns": np.append(begun[1:], 1 << 62) - 1500})  # its own microsecond
+    flags = {value_name(flag) for flag in truth.flags}
+    for can_id in np.unique(truth.sent_ids).tolist():
+        newest = pd.merge_asof(until, decoded(truth, can_id), on="ns")
+        cycle = truth.database.get_message_by_frame_id(can_id).cycle_time
+        # three cycles, at least 250 ms; a second where it comes with telemetry only
+        life = max(250, 3 * cycle) * MS if cycle else SECOND
+        newest = newest.where(begun - newest.pop("sent_ns") <= life)
+        for name in values.keys() & newest.keys():
+            got, wanted = values[name], newest[name].to_numpy()
+            if name in flags:  # a flag has no code for not available
+                wanted = np.where(np.isnan(got), np.nan, wanted)
+            verdict.compare(name, got, wanted, SLACK)
+    return verdict
+
+
+# --- frames and bytes
+
+
+def check_frames(truth: Truth, _: Path) -> Verdict:
+    """Every signal of every frame against what the ESC meant."""
+    found = truth.judged_frames()
+    return Verdict(found.count["values"], found.wrong)
 
 
 def check_bytes(truth: Truth, path: Path) -> Verdict:
@@ -273,18 +239,18 @@ class Step:
 
 def steps_of(folder: Path, truth: Truth) -> list[Step]:
     """All that is done with the capture."""
-    convert, decoded, seen = ["convert", str(truth.path)], Decoded(truth), dict[str, Floats]()
-    table, log = partial(check_table, truth, seen), partial(check_log, truth)
+    convert, known = ["convert", str(truth.path)], dict[str, Floats]()
+    table = partial(check_table, truth, known)
+    log, back = partial(check_log, truth), partial(check_back, truth)
     steps = [
         *(Step(f"convert to {form}", convert, folder / f"hour.{form}", table) for form in READERS),
-        Step("the CAN frames", convert, folder / "sent.log", decoded.check_sent),
         Step("convert to bin", convert, folder / "esc1.bin", partial(check_bytes, truth)),
+        Step("the CAN frames", convert, folder / "sent.log", partial(check_frames, truth)),
     ]
     for form, to in LOGS.items():
         made, of_log = folder / f"hour.{form}", folder / f"of_{form}.csv"
         steps.append(Step(f"convert to {form}", [*convert, "--to", to], made, log))
-        back = ["convert", str(made)]
-        steps.append(Step(f"convert {form} to csv", back, of_log, decoded.check_table))
+        steps.append(Step(f"convert {form} to csv", ["convert", str(made)], of_log, back))
     return steps
 
 

@@ -12,9 +12,9 @@ from capture_bench import START, Bench, made
 from kontronik_can_gw.capture.format import Entry, Kind, block, data_payload, json_payload
 from kontronik_can_gw.desk.recordings import bytes_input
 from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
+from kontronik_can_gw.desk.recordings.fields import Choice
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.recording import PlayedBlock
-from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.native import load
 

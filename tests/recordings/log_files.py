@@ -28,15 +28,19 @@ READERS = {
 
 
 def some_frames(count: int, seed: int = 1, fd: bool = False) -> list[Item]:
-    """Frames of both id lengths, times in whole microseconds, rising."""
+    """Frames of both id lengths, times in whole microseconds, rising; here and there a long pause."""
     chance = random.Random(seed)
     now = 0
     items = []
     for _ in range(count):
-        now += chance.randrange(1, 20_000) * 1000
+        now += chance.randrange(1, 20_000) * 1000 * chance.choice((1,) * 30 + (1000,))
         extended = chance.random() < 0.3
         is_fd = fd and chance.random() < 0.3
-        size = chance.choice((0, 1, 8, 12, 20, 64)) if is_fd else chance.randrange(9)
+        size = (
+            chance.choice((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64))
+            if is_fd
+            else chance.randrange(9)
+        )
         can_id = chance.randrange(1 << 29) if extended else chance.randrange(1 << 11)
         items.append(
             (now, CanFrame(can_id, chance.randbytes(size), extended, is_fd), chance.random() < 0.5)

@@ -5,12 +5,9 @@ from pathlib import Path
 import can
 import pytest
 from command_line import run
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from log_files import (
     READERS,
     SUFFIX,
-    Item,
     at_wall,
     message_of,
     opened,
@@ -20,8 +17,7 @@ from log_files import (
     write_log,
 )
 
-from kontronik_can_gw.desk.recordings.can_logs.log import log_format
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.desk.recordings.log_input import log_format
 from kontronik_can_gw.frames import CanFrame
 
 FORMATS = sorted(READERS)
@@ -29,11 +25,17 @@ WITH_FD = sorted(set(FORMATS) - {"trc"})
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_python_can_reads_what_is_written(tmp_path: Path, format_: str) -> None:
-    items = some_frames(300, fd=format_ in WITH_FD)
+def test_what_is_written_is_read_by_python_can_and_by_us(tmp_path: Path, format_: str) -> None:
     path = tmp_path / f"log{SUFFIX[format_]}"
-    write_log(path, format_, items)
-    assert read_by_library(path, format_) == at_wall(items)
+    for seed in range(3 if format_ == "mf4" else 12):
+        items = some_frames(100, seed, fd=format_ in WITH_FD)
+        write_log(path, format_, items)
+        assert read_by_library(path, format_) == at_wall(items)
+        if format_ == "mf4":  # whose times are floats
+            continue
+        assert read_log(path) == (at_wall(items), [])
+        write_log(path, format_, items, None)
+        assert read_log(path) == (items, [])
 
 
 @pytest.mark.parametrize("format_", FORMATS)
@@ -51,37 +53,6 @@ def test_what_python_can_writes_is_read(tmp_path: Path, format_: str) -> None:
         shift = found[0][0] - items[0][0]
         found = [(time_ns - shift, *rest) for time_ns, *rest in found]  # type: ignore[misc]
     assert max(abs(a[0] - b[0]) for a, b in zip(found, items, strict=True)) <= 1000
-
-
-ITEM = st.builds(
-    lambda us, extended, can_id, fd, data, received: (
-        us * 1000,
-        CanFrame(can_id if extended else can_id & 0x7FF, data if fd else data[:8], extended, fd),
-        received,
-    ),
-    st.integers(0, 10**11),
-    st.booleans(),
-    st.integers(0, (1 << 29) - 1),
-    st.booleans(),
-    st.sampled_from((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64)).flatmap(
-        lambda n: st.binary(min_size=n, max_size=n)
-    ),
-    st.booleans(),
-)
-
-
-@pytest.mark.parametrize("format_", ["candump", "asc", "blf", "trc"])
-@settings(
-    deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(items=st.lists(ITEM, min_size=1, max_size=20))
-def test_any_frames_come_back(tmp_path: Path, format_: str, items: list[Item]) -> None:
-    items.sort(key=lambda item: item[0])
-    if format_ == "trc":
-        items = [item for item in items if not item[1].fd]
-    path = tmp_path / f"any{SUFFIX[format_]}"
-    write_log(path, format_, items, None)
-    assert read_log(path) == (items, [])
 
 
 def test_a_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
@@ -140,13 +111,7 @@ def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
     for format_ in FORMATS:
         path = tmp_path / f"{format_}.bin"
         write_log(path, format_, some_frames(5))
-        assert log_format(path.read_bytes(), ".bin") == format_
-    rubbish = tmp_path / "rubbish.txt"
-    rubbish.write_text("no log\n")
-    with pytest.raises(UserError, match="is no capture, no CAN log"):
-        opened(rubbish)
-    with pytest.raises(RunError, match="there is no such file"):
-        opened(tmp_path / "missing.log")
+        assert log_format(path.read_bytes()) == format_
 
 
 def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:

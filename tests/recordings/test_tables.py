@@ -13,21 +13,27 @@ import pyarrow as pa  # type: ignore[import-untyped]
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from pyarrow import parquet
 from recordings import (
     WALL_NS,
     capture_bytes,
     convert,
-    dump_bytes,
 )
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.convert import _table_writer
-from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table, distinct, fields_of_values
+from kontronik_can_gw.desk.recordings.fields import (
+    Choice,
+    Field,
+    Kind,
+    Table,
+    distinct,
+    fields_of_values,
+)
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.stream import EscStream
@@ -111,27 +117,6 @@ def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_p
         assert "e0: KOSMIK 200, firmware 1.2, V4 layout, at /dev/ttyUSB0" in mdf.header.comment
         assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
         assert 0 <= mdf.header.start_time.timestamp() - WALL_NS / 1e9 < 0.1
-
-
-def _rows(tmp_path: Path, *options: object) -> Cells:
-    source = tmp_path / "dump"
-    source.write_bytes(dump_bytes())
-    assert convert(source, tmp_path / "out.jsonl", "--force", *options) == 0
-    return read_jsonl(tmp_path / "out.jsonl")
-
-
-def test_signals_are_chosen_by_name_in_the_given_order(tmp_path: Path) -> None:
-    rows = _rows(tmp_path, "--signals", "OperatingState, battery_*,BatteryVoltage")
-    names = ["operating_state", "battery_voltage", "battery_current", "battery_power"]
-    assert list(rows[0]) == ["Time", *names]
-
-
-def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Path) -> None:
-    every = _rows(tmp_path)
-    assert _rows(tmp_path, "--from", "1", "--until", "2.5") == [
-        row for row in every if 1 <= row["Time"] <= 2.5
-    ]
-    assert _rows(tmp_path, "--from", "0", "--until", "0") == every[:1]
 
 
 def test_names_that_are_there_twice_get_their_message_in_front() -> None:

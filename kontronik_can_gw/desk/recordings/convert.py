@@ -13,9 +13,8 @@ from typing import IO, TYPE_CHECKING, Any, Self
 from kontronik_can_gw.errors import RunError
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.desk.recordings.fields import Table
+    from kontronik_can_gw.desk.recordings.fields import Choice, Table
     from kontronik_can_gw.desk.recordings.recording import Input
-    from kontronik_can_gw.desk.recordings.tables.rows import Choice
 
 TABLES = ("csv", "jsonl", "parquet")
 LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
@@ -97,14 +96,19 @@ class Output:
 
 def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> str | None:
     """To a table."""
-    from kontronik_can_gw.desk.recordings.tables.rows import rows_of
+    from kontronik_can_gw.desk.recordings.fields import Table
+    from kontronik_can_gw.desk.recordings.recording import part_of
 
-    table, blocks = rows_of(recording, choice)
-    if table is None:
+    found = part_of(recording.blocks(choice.columns), choice.start_ns, choice.end_ns)
+    if found is None:
         return None
+    origin_ns, blocks = found
+    fields = [recording.fields[index] for index in choice.columns]
+    has_utc = recording.wall_ns(origin_ns) is not None
+    table = Table(fields, has_utc, origin_ns, recording.provenance)
     count, last_ns = _write_all(_table_writer(out.open(), form, table), blocks, out)
-    lasted = last_ns - table.origin_ns
-    return f"{_many(count, 'row')} of {_many(len(choice.columns), 'value')}, up to {lasted / 1e9:.3f} s"
+    lasted = last_ns - origin_ns
+    return f"{_many(count, 'row')} of {_many(len(fields), 'value')}, up to {lasted / 1e9:.3f} s"
 
 
 def _table_writer(file: IO[bytes], form: str, table: "Table") -> Any:
@@ -127,17 +131,13 @@ def to_log(
 ) -> str | None:
     """To a log of CAN frames (a format of can_logs), from ``start_ns`` to ``end_ns`` after the recording's first frame."""
     from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
-    from kontronik_can_gw.desk.recordings.recording import time_at
-    from kontronik_can_gw.desk.recordings.tables.rows import cut, first_of
+    from kontronik_can_gw.desk.recordings.recording import part_of
 
-    first, batches = first_of(filter(len, recording.batches()))
-    if first is None:
+    found = part_of(recording.batches(), start_ns, end_ns)
+    if found is None:
         return None
-    origin_ns = time_at(first, 0)
+    origin_ns, batches = found
     wall_ns = recording.wall_ns(origin_ns)
-    first, batches = first_of(cut(batches, start_ns, end_ns, origin_ns))
-    if first is None:
-        return None
     known = wall_ns, origin_ns, recording.channel, recording.provenance
     writer = CanLogWriter(out.open(), form, *known)
     count, last_ns = _write_all(writer, batches, out)

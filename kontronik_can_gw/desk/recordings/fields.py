@@ -1,12 +1,15 @@
-"""What a table has: its fields beside the time, and what is known of where it came from."""
+"""What a table has: its fields beside the time, those that are wanted, and what is known of where it came from."""
 
+import fnmatch
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from enum import Enum
 from typing import Any
 
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps, values_of_esc
 from kontronik_can_gw.esc.values import Value as EscValue
@@ -138,3 +141,47 @@ def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | No
     """Index of the first field with a value of values.py; None where there is none."""
     places = (i for i, one in enumerate(fields) if (one.source, one.esc) == (source, esc))
     return next(places, None)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of a recording is wanted. Times in ns since its start, ``end_ns`` included."""
+
+    columns: Sequence[int]
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    @classmethod
+    def of(cls, fields: Sequence[Field], names: Sequence[str] = (), **times: Any) -> "Choice":
+        """The fields with one of these names (with * and ?). UserError for a name that fits none.
+
+        Case, underscores and dots do not matter, nor ``Percent`` at the end. With several ESCs a name may be that of a value alone; of
+        a CAN log it may be the signal's.
+        """
+        chosen: dict[int, None] = {} if names else dict.fromkeys(range(len(fields)))
+        problems = []
+        known = [
+            {_plain(one.name), _plain(one.name.rpartition(".")[2]), _plain(one.signal)} - {""}
+            for one in fields
+        ]
+        for name in names:
+            wanted = _plain(name)
+            forms = {wanted, wanted.removesuffix("percent")} - {""}
+            found = [
+                index
+                for index, called in enumerate(known)
+                if any(fnmatch.filter(called, form) for form in forms)
+            ]
+            if not found:
+                shown = {_plain(one.name): one.name for one in reversed(fields)}
+                close = get_close_matches(wanted, shown, 1, 0.5)
+                more = f" Did you mean {shown[close[0]]}?" if close else ""
+                problems.append(f"--signals {name}: no such signal.{more}")
+            chosen |= dict.fromkeys(found)
+        if problems:
+            raise UserError(*problems)
+        return cls([*chosen], **times)
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "").replace(".", "")

@@ -9,10 +9,9 @@ from pathlib import Path
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.bytes_input import UART_MAGIC, BytesInput
-from kontronik_can_gw.desk.recordings.can_logs.log import NAMES, SUFFIXES, log_format
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.recordings.log_input import CanLogInput
+from kontronik_can_gw.desk.recordings.log_input import CanLogInput, log_format
 from kontronik_can_gw.desk.recordings.recording import Input
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -36,19 +35,15 @@ def open_input(path: Path, layout: BusLayout | None = None) -> Input:
             head = file.read(_HEAD)
     except OSError as error:
         raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
-    if not head:
+    if not head.strip():
         raise UserError(f"{path}: is empty")
     if MAGIC in head or path.suffix == SUFFIX:
         return CaptureInput([path], layout)
-    if (found := log_format(head, path.suffix)) is not None:
+    if (found := log_format(head)) is not None:
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         return CanLogInput(path, layout, found)
     if UART_MAGIC in head:
         return BytesInput(path, layout)
-    if (called := SUFFIXES.get(path.suffix.lower())) is not None:
-        raise UserError(
-            f"{path}: is no {NAMES[called]}, whatever its name says, and no other recording"
-        )
     raise UserError(
         f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_HEAD // 1024} kB"
     )

@@ -1,12 +1,12 @@
-"""Frames as a CAN tool logged them, as a recording."""
+"""Frames as a CAN tool logged them, as a recording; the format of a log is found out by its content."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.can_logs.log import reader_of
+from kontronik_can_gw.desk.recordings.can_logs import text
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -19,6 +19,34 @@ _BATCH = 256
 _BACK_NS = 10 * SECOND_NS
 _AHEAD_NS = 86_400 * SECOND_NS
 """A step of time that is larger must be confirmed by the frame after it, or it is a damaged time."""
+_HEAD_LINES = 2000
+_BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
+_TEXTS: dict[str, tuple[Callable[[bytes], object], type[text.TextReader]]] = {
+    "candump": (text.candump_line, text.CandumpReader),
+    "asc": (text.asc_line, text.AscReader),
+    "trc": (text.trc_line, text.TrcReader),
+}
+"""What matches a line of a format, and what reads it."""
+
+
+def log_format(head: bytes) -> str | None:
+    """The format of a log by its first bytes; None: no log."""
+    for magic, found in _BEGINNINGS.items():
+        if head.startswith(magic):
+            return found
+    for line in head.removeprefix(b"\xef\xbb\xbf").split(b"\n", _HEAD_LINES)[:_HEAD_LINES]:
+        for found, (is_line, _) in _TEXTS.items():
+            if is_line(line):
+                return found
+    return None
+
+
+def _reader_of(format_: str) -> type[text.LogReader]:
+    if format_ in _TEXTS:
+        return _TEXTS[format_][1]
+    from kontronik_can_gw.desk.recordings.can_logs import library
+
+    return library.BlfReader if format_ == "blf" else library.Mf4Reader
 
 
 class CanLogInput(Input):
@@ -34,7 +62,7 @@ class CanLogInput(Input):
             self._file = self._path.open("rb")
         except OSError as error:
             raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
-        self._reader = reader_of(self._format)(self._file)
+        self._reader = _reader_of(self._format)(self._file)
 
     def batches(self) -> Iterator[list[TimedFrame]]:
         frames = self.frames()

@@ -76,10 +76,8 @@ class PlayedInput(Input):
         return super().blocks(chosen) if found is None else self._played(*found)
 
     def _played(self, gateway: Gateway, player: "Player") -> Iterator[Block]:
-        is_first = True
         for _ in self._play(gateway, player):
-            if player.is_full or (is_first and player.has_rows):
-                is_first = False
+            if player.is_full:
                 yield from self._timed(player.take_rows())
         yield from self._timed(player.take_rows(final=True))
 

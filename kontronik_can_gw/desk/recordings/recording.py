@@ -2,9 +2,9 @@
 
 from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
-from itertools import groupby, islice
+from itertools import chain, groupby, islice, takewhile
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -21,6 +21,8 @@ LATEST_NS = 1 << 62
 """No time of a recording, and no Unix time (2116), is later: it is damaged."""
 ROWS = 1024
 """Rows that Python makes a block of."""
+_DISORDER_NS = 1_000_000_000
+"""How far frames of several interfaces may stand out of order."""
 
 
 class Sample(NamedTuple):
@@ -190,3 +192,25 @@ def between(items: Any, low_ns: int, high_ns: int) -> Any:
         return [one for one in items if low_ns <= one.time_ns <= high_ns]
     begin = bisect_left(items.times, low_ns)
     return items.part(begin, max(begin, bisect_right(items.times, high_ns)))
+
+
+def part_of(
+    items: Iterable[Any], start_ns: int | None, end_ns: int | None
+) -> tuple[int, Iterator[Any]] | None:
+    """What of Blocks, or of batches of frames, is from one time after their begin to another, both included (None: no limit).
+
+    With the time at which they begin. None where there is nothing.
+    """
+    filled = filter(len, items)
+    if (first := next(filled, None)) is None:
+        return None
+    origin_ns = time_at(first, 0)
+    low = -LATEST_NS if start_ns is None else origin_ns + start_ns
+    high = LATEST_NS if end_ns is None else origin_ns + end_ns
+    wanted = takewhile(
+        lambda some: time_at(some, 0) <= high + _DISORDER_NS, chain((first,), filled)
+    )
+    part = filter(len, (between(some, low, high) for some in wanted))
+    if (first := next(part, None)) is None:
+        return None
+    return origin_ns, chain((first,), part)

@@ -9,8 +9,7 @@ from itertools import pairwise
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
-from kontronik_can_gw.desk.recordings.recording import Block
-from kontronik_can_gw.desk.recordings.tables.rows import LATEST_NS
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Block
 from kontronik_can_gw.desk.report.decimate import Decimator
 from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight
 from kontronik_can_gw.desk.report.events import Event, Events, Number
