@@ -13,7 +13,7 @@ import pytest
 from command_line import refused, run
 from recordings import candump_log, convert, dump_bytes
 
-from kontronik_can_gw.cli.progress import watched
+from kontronik_can_gw.cli.desk import watched
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
