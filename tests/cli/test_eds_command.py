@@ -84,9 +84,9 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
 def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
     """Byte for byte: encoded by the canopen library, and as an SDO upload gives it."""
     node = shipped_canopen([5]).nodes([EscSettings()]).nodes[0]
-    text = command("--node-id", 5)[1]
-    dictionary = imported(text)
-    assert "LSS_SerialNumber" not in text  # there is none to look for
+    made = command("--node-id", 5)[1]
+    dictionary = imported(made)
+    assert "LSS_SerialNumber" not in made  # there is none to look for
     assert (dictionary.node_id, dictionary.bitrate) == (5, 500_000)
     found = values(dictionary)
     assert len(found) > 100
