@@ -22,7 +22,7 @@ from email.utils import formatdate
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cli.service_files import PLAIN, planned
+from kontronik_can_gw.cli.service import PLAIN, planned
 from kontronik_can_gw.native.objects import shared_object
 
 HERE = Path(__file__).resolve().parent

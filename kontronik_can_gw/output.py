@@ -162,7 +162,7 @@ class OutputSetup(Protocol):
         """What ``check`` shows, in short: lines of up to 78 characters that begin with the output's name in 10 columns."""
 
     def lines(self) -> list[str]:
-        """What ``check -v`` shows."""
+        """What ``check --json`` has: facts a line each."""
 
 
 OUTPUTS = ("dronecan",)

@@ -60,10 +60,8 @@ def number_from(
     what: str = "number of seconds",
     *,
     kind: Callable[[str], float] = float,
-    problem: str | None = None,
 ) -> Callable[[str], float]:
-    """An argparse type: a number within a range. ``kind``: ``int`` for whole ones; ``problem``: what is said of another text."""
-    said = f"is not a {what}, {low:g} to {high:g}" if problem is None else problem
+    """An argparse type: a number within a range. ``kind``: ``int`` for whole ones."""
 
     def read(text: str) -> float:
         try:
@@ -71,7 +69,7 @@ def number_from(
         except ValueError:
             value = float("nan")
         if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} {said}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {what}, {low:g} to {high:g}")
         return value
 
     return read

@@ -1,7 +1,8 @@
 """``check``: says in short whether a configuration can be used and what it sends, without opening anything."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +12,15 @@ from kontronik_can_gw.cli.common import say, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.assemble import Loaded, load_configuration
 from kontronik_can_gw.config.export import as_toml
-from kontronik_can_gw.dbc.prepare import is_mute, reporter
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.printable import printable_json
-from kontronik_can_gw.signals.packer import float_of
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 _EXAMPLE_PORT = "_EXAMPLE-"
 """In the port of the configuration that ``init`` writes."""
 OPTIONS = (
     CONFIG,
-    (
-        option("-v --verbose", "every key in effect, message, and signal with its source"),
-        JSON,
-    ),
+    (option("-v --verbose", "every key in effect, and what describe shows of the messages"), JSON),
 )
 EPILOG = (
     "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot: "
@@ -59,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
         say(f"warning: {warning}")
     for line in summary(shown, loaded, nodes):
         show(line)
-    for line in details(shown, loaded) if args.verbose else ():
+    for line in details(loaded) if args.verbose else ():
         show(line)
     return 0
 
@@ -78,7 +72,8 @@ def summary(shown: dict[str, Any], loaded: Loaded, nodes: Nodes | None) -> Itera
     )
     yield f"  CAN       {can.channel} ({can.interface}), {rate}"
     if config.dbc.enabled:
-        ids = sorted((each["id"] for each in shown["messages"]), key=lambda each: (len(each), each))
+        keys = sorted((each.extended, each.can_id) for each in loaded.layout.messages)
+        ids = [f"{can_id:0{8 if extended else 3}X}h" for extended, can_id in keys]
         span = f", {' to '.join(dict.fromkeys((ids[0], ids[-1])))}" if ids else ""
         yield f"  DBC       {_counted(len(ids), 'message')}{span}, layout {shown['layout']}"
         yield f"            {shown['dbc']}"
@@ -94,6 +89,20 @@ def summary(shown: dict[str, Any], loaded: Loaded, nodes: Nodes | None) -> Itera
     yield f"  bus load  {load:.1%}, {frames:.0f} frames/s: ESCs at 100 Hz, worst stuffing, no SDO"
 
 
+def details(loaded: Loaded) -> Iterator[str]:
+    """Every key in effect, what further outputs send, messages and signals as ``describe`` has them."""
+    from kontronik_can_gw.desk.describe.markdown import markdown  # not at each start of the service
+    from kontronik_can_gw.desk.describe.tables import dbc
+    from kontronik_can_gw.desk.recordings.layouts import BusLayout
+
+    yield from ("", *as_toml(loaded.config).splitlines())
+    for output in loaded.outputs:
+        yield from ("", *output.lines())
+    if loaded.database is not None:
+        bus = BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
+        yield from ("", *markdown("What is sent", [], dbc(bus, loaded.escs)).splitlines())
+
+
 def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
@@ -101,7 +110,7 @@ def _counted(number: int, what: str) -> str:
 def document(
     path: Path, loaded: Loaded, nodes: Nodes | None, warnings: list[str]
 ) -> dict[str, Any]:
-    """What ``--json`` prints, and text is made of: every message and signal too. What is sent on change is counted by its cycle."""
+    """What ``--json`` prints, and text is made of. What is sent on change is counted by its cycle."""
     config, layout = loaded.config, loaded.layout
     can = config.can
     load = layout.bus_load(can.bitrate, can.data_bitrate)
@@ -114,93 +123,16 @@ def document(
         "file": str(path),
         "mistakes": [],
         "warnings": warnings,
+        "configuration": tomllib.loads(as_toml(config)),
         "escs": [{"name": e.name, "port": e.port, "protocol": e.protocol} for e in config.esc],
         "can": {"interface": can.interface, "channel": can.channel, "bitrate": can.bitrate},
         "bus_load": load,
         "frames_per_second": frames,
         "dbc": layout.file,
         "layout": layout.fingerprint,
-        "messages": list(messages(layout, [esc.name for esc in loaded.escs])),
         "outputs": {output.name: output.lines() for output in loaded.outputs},
         "canopen_nodes": [
             None if node.node_id == UNCONFIGURED else node.node_id
             for node in (nodes.nodes if nodes else ())
         ],
     }
-
-
-def messages(layout: Layout, esc_names: list[str]) -> Iterator[dict[str, Any]]:
-    """Each message with its id, when it is sent, and of each signal the source and what is lost."""
-    for message in layout.messages:
-        signals = {}
-        for signal in message.signals:
-            lost = list(signal.notes)
-            if is_mute(signal) and (found := reporter(message, signal)) is not None:
-                lost.append(f"{found.name} reports the loss")
-            signals[signal.name] = {"source": _source(signal, esc_names), "lost": "; ".join(lost)}
-        can_id = f"{message.can_id:0{8 if message.extended else 3}X}h"
-        yield {"name": message.name, "id": can_id, "sent": _timing(message), "signals": signals}
-
-
-def details(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
-    """The effective configuration, each message and signal with its source and what is lost, and each output's own lines."""
-    config, layout = loaded.config, loaded.layout
-    yield ""
-    yield f"# effective configuration of {config.file}"
-    yield from as_toml(config).split("\n")
-    if config.dbc.enabled:
-        yield f"# messages of {layout.node} by {layout.file}"
-        yield from table(shown["messages"])
-        yield ""
-    for output in loaded.outputs:
-        yield f"# {output.title}"
-        yield from shown["outputs"][output.name]
-        yield ""
-
-
-def table(found: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """Message, id, cycle, signal, source and losses in columns."""
-    rows: list[Sequence[str]] = [("message", "id", "sent", "signal", "source", "lost")]
-    for message in found:
-        first = (message["name"], message["id"], message["sent"])
-        for name, signal in message["signals"].items():
-            rows.append((*first, name, signal["source"], signal["lost"]))
-            first = ("", "", "")
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        yield "  ".join(map(str.ljust, row, widths)).rstrip()
-
-
-def _held(signal: SignalPlan, raw: int) -> str:
-    """The physical value of raw bits, or their text in the value table."""
-    if signal.is_float:
-        value = float_of(raw, signal.length)
-        return f"{value * float(signal.factor) + float(signal.offset):g} {signal.unit}".rstrip()
-    return (
-        signal.texts.get(raw)
-        or f"{float(raw * signal.factor + signal.offset):.10g} {signal.unit}".rstrip()
-    )
-
-
-def _timing(message: MessagePlan) -> str:
-    """Send type, cycle and minimum distance of a message, in words."""
-    words = {
-        f"every {message.cycle_ns // MS} ms": message.cycle_ns,
-        "with each frame": SendType.EVENT in message.send_type,
-        "on change": SendType.ON_CHANGE in message.send_type,
-        f">= {message.delay_ns // MS} ms": message.delay_ns,
-    }
-    return ", ".join(text for text, applies in words.items() if applies)
-
-
-def _source(signal: SignalPlan, esc_names: list[str]) -> str:
-    """What a signal shows."""
-    if signal.unbound:
-        return f"(nothing: always {_held(signal, signal.constant)})"
-    if signal.source is None:
-        text = str(signal.constant) if signal.role is Role.CONSTANT else ""
-        return f"({signal.role.value}{' ' + text if text else ''})"
-    unit = f" {signal.source.unit}" if signal.source.unit else ""
-    prefix = f"{esc_names[signal.esc]}." if signal.esc is not None and len(esc_names) > 1 else ""
-    page = f" page {signal.page}" if signal.page is not None else ""
-    return f"{prefix}{signal.source.name}{unit}{page}"

@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, option
-from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.cli.progress import watched
+from kontronik_can_gw.cli.desk import given_layout, watched
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
     FORMATS,

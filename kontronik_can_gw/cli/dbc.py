@@ -8,7 +8,7 @@ from pathlib import Path
 from kontronik_can_gw.canopen.dbc import pdo_text, waiting_for_lss
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
-from kontronik_can_gw.cli.output import write_output
+from kontronik_can_gw.cli.desk import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.output_keys import DbcConfig

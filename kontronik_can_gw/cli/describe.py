@@ -5,9 +5,8 @@ from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cli.arguments import OUTPUT, option
-from kontronik_can_gw.cli.bus_layout import bus_layout
 from kontronik_can_gw.cli.common import announced_config, load_all
-from kontronik_can_gw.cli.output import write_output
+from kontronik_can_gw.cli.desk import bus_layout, write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
 from kontronik_can_gw.desk.describe.markdown import Table, markdown

@@ -15,8 +15,8 @@ from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.config.parse import load
+from kontronik_can_gw.desk.doctor import Finding, Findings, count
 from kontronik_can_gw.desk.doctor.can import check_can
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings, count
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.ports import check_port
 from kontronik_can_gw.desk.doctor.service import Unit, check_folder, check_service, unit_of

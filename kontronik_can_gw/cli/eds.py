@@ -13,7 +13,7 @@ from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.storage import VERIFY
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all
-from kontronik_can_gw.cli.output import write_output
+from kontronik_can_gw.cli.desk import write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import LAYOUT, option
-from kontronik_can_gw.cli.bus_layout import bus_layout
 from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.native.export_c import EXAMPLE, MARK, exported

@@ -8,8 +8,8 @@ from pathlib import Path
 from threading import Event
 
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
-from kontronik_can_gw.cli.bus_layout import bus_layout, given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
+from kontronik_can_gw.cli.desk import bus_layout, given_layout
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.watch import once, watch
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input

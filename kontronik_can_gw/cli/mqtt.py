@@ -11,11 +11,11 @@ from threading import Event
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.cli.arguments import LAYOUT, option
-from kontronik_can_gw.cli.bus_layout import bus_layout
 from kontronik_can_gw.cli.common import (
     logging_to_stderr,
     stopping_on_signals,
 )
+from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.config.keys import Config, MqttConfig
 from kontronik_can_gw.config.kinds import BROKER
 from kontronik_can_gw.desk.mqtt.messages import Publisher, Topics

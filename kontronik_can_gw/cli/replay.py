@@ -8,9 +8,8 @@ from threading import Event
 
 from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
-from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.cli.terminals import terminals
+from kontronik_can_gw.cli.desk import given_layout, terminals
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.played import PlayedInput

@@ -4,10 +4,8 @@ import argparse
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
-from kontronik_can_gw.cli.bus_layout import given_layout
 from kontronik_can_gw.cli.common import say
-from kontronik_can_gw.cli.output import write_output
-from kontronik_can_gw.cli.progress import watched
+from kontronik_can_gw.cli.desk import given_layout, watched, write_output
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.report.flight import Flight, needed_columns
 from kontronik_can_gw.desk.report.page import render

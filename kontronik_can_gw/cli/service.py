@@ -13,15 +13,23 @@ import subprocess
 import sys
 import sysconfig
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.init import example
-from kontronik_can_gw.cli.service_files import NAME, UNITS, planned
 from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import RunError, UserError
 
+NAME = "kontronik-can-gw"
+PLAIN = Path(__file__).parents[1] / "service"
+"""The files as they are."""
+_PROGRAM = f"/usr/bin/{NAME}"
+"""The program in them."""
+_KINDS = ("", "-mqtt", "-metrics")
+"""The gateway's service, and those that may stand by it."""
+UNITS = "etc/systemd/system"
 _WANTS = f"{UNITS}/multi-user.target.wants"
 _BOOTED = Path("/run/systemd/system")
 """Exists where systemd runs (sd_booted)."""
@@ -86,6 +94,23 @@ def main(args: argparse.Namespace) -> int:
     except OSError as error:
         raise RunError(f"{error.filename}: {error.strerror}") from None
     return 0
+
+
+def planned(program: str) -> Iterator[tuple[str, str]]:
+    """Path below the root and text of each file."""
+    for kind in _KINDS:
+        text = _plain(f"{NAME}{kind}.service").replace(_PROGRAM, program)
+        yield f"{UNITS}/{NAME}{kind}.service", text
+        own = text.replace("/gateway.toml", "/%i.toml")  # what an instance has of its own
+        own = re.sub(r"(?m)^(StateDirectory|RuntimeDirectory)=.*", r"\g<0>-%i", own)
+        yield f"{UNITS}/{NAME}{kind}@.service", own
+    yield f"etc/sysusers.d/{NAME}.conf", _plain("sysusers.conf")
+    yield f"etc/tmpfiles.d/{NAME}.conf", _plain("tmpfiles.conf")
+    yield f"etc/udev/rules.d/70-{NAME}.rules", _plain("udev.rules")
+
+
+def _plain(name: str) -> str:
+    return (PLAIN / name).read_text(encoding="utf-8")
 
 
 # --- install

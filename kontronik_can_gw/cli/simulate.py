@@ -12,7 +12,7 @@ from threading import Event
 from kontronik_can_gw.cli import discard_output
 from kontronik_can_gw.cli.arguments import number_from, option
 from kontronik_can_gw.cli.common import stopping_on_signals
-from kontronik_can_gw.cli.terminals import terminals
+from kontronik_can_gw.cli.desk import terminals
 from kontronik_can_gw.desk.pty import run
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.esc.kontronik.simulator import (

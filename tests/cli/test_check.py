@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from command_line import refused, run, written
 
-from kontronik_can_gw.cli import arguments, init
+from kontronik_can_gw.cli import arguments
 
 LEAST = '[[esc]]\nport = "/dev/ttyUSB0"\n'
 
@@ -20,43 +20,27 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]
     return tmp_path / "gateway.toml", tmp_path / "etc.toml"
 
 
-def test_the_summary_fits_a_screen_and_says_what_is_sent(tmp_path: Path) -> None:
-    file = written(tmp_path / "g.toml", f"{LEAST}pole_pairs = 7\n[canopen]\nenabled = true\n")
-    done = run("check", file)
-    assert (done.code, done.err) == (0, "")
-    lines = done.out.splitlines()
-    assert lines[0] == f"{file}: can be used, no warnings"
-    assert all(
-        len(line) <= 80 for line in lines if str(tmp_path) not in line and ".dbc" not in line
-    )
-    for said in ("esc1: 7 pole pairs", "13 messages, 680h to 6D9h", "node 1, 4 TPDOs", "9.4%"):
-        assert said in done.out
-    assert run("check", "-c", file).out == done.out
-    assert run("check", "-v", file).out.startswith(done.out)
-    assert "not allowed with argument -c" in refused(2, "check", "-c", file, file)
-
-
-def test_the_port_of_the_example_is_a_warning(tmp_path: Path) -> None:
-    done = run("check", written(tmp_path / "g.toml", init.example()))
-    assert done.code == 0
-    (line,) = done.err.splitlines()
-    assert "port of esc1" in line and "is the example's" in line
-    assert "1 warning\n" in done.out
-
-
-def test_json_has_messages_and_warnings_or_the_mistakes(tmp_path: Path) -> None:
+def test_json_has_keys_and_warnings_or_the_mistakes(tmp_path: Path) -> None:
     done = run("check", "--json", written(tmp_path / "g.toml", LEAST))
     found = json.loads(done.out)
     assert (done.code, done.err, found["mistakes"], found["warnings"]) == (0, "", [], [])
     assert found["escs"] == [{"name": "esc1", "port": "/dev/ttyUSB0", "protocol": "kontronik"}]
-    speed = next(each for each in found["messages"] if each["name"] == "EscSpeed")
-    assert speed["id"] == "688h"
-    assert speed["signals"]["BatteryVoltage"] == {"source": "battery_voltage V", "lost": ""}
+    assert found["configuration"]["esc"][0]["telemetry_timeout_ms"] == 250
     assert 0.05 < found["bus_load"] < 0.1
 
     done = run("check", "--json", written(tmp_path / "g.toml", f"{LEAST}pole_pair = 7\nx = 1\n"))
     assert (done.code, done.err) == (2, "")
     assert [".pole_pair" in line for line in json.loads(done.out)["mistakes"]] == [True, False]
+
+
+def test_the_details_are_the_keys_in_effect_and_the_tables_of_describe(tmp_path: Path) -> None:
+    file = written(tmp_path / "g.toml", f"{LEAST}[dronecan]\nenabled = true\n")
+    found = run("check", "-v", file).out.splitlines()
+    assert found[: len(short := run("check", file).out.splitlines())] == short
+    assert "telemetry_timeout_ms = 250" in found
+    assert any(line.startswith("node asks an allocator") for line in found), found
+    rows = [line for line in run("describe", "-c", file).out.splitlines() if "Battery" in line]
+    assert len(rows) > 3 and set(rows[:3]) <= set(found)
 
 
 @pytest.mark.parametrize("command", ["check", "doctor", "run"])
@@ -110,21 +94,22 @@ def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another
     assert fingerprint() != first
 
 
-def test_a_configuration_in_a_closed_folder_is_there(tmp_path: Path) -> None:
-    """Within this process, so that root can lay its rights down for the moment: root may look everywhere."""
-    closed = tmp_path / "closed"
-    closed.mkdir()
-    file = written(closed / "gateway.toml", LEAST)
-    run("check", file)  # imports what it needs, while that can be read
-    closed.chmod(0)
+@pytest.mark.parametrize(("code", "words"), [(2, "check"), (1, "decode gateway.toml")])
+def test_what_may_not_be_read_is_one_line(
+    places: tuple[Path, Path], code: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within this process, so that root can lay its rights down for the moment: root may read everything."""
+    own, _ = places
+    monkeypatch.setattr(arguments, "CONFIG_PLACES", (own,))
+    written(own, LEAST)
+    run(*words.split())  # imports what it needs, while that can be read
+    own.parent.chmod(0)
     user = os.geteuid()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(arguments, "CONFIG_PLACES", (file, tmp_path / "etc.toml"))
-        if user == 0:
-            os.seteuid(65534)
-        try:
-            said = refused(2, "check")
-        finally:
-            os.seteuid(user)
-            closed.chmod(0o700)
-    assert said == f"{file}: cannot be read: Permission denied."
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        said = refused(code, *words.split())
+    finally:
+        os.seteuid(user)
+        own.parent.chmod(0o700)
+    assert "Permission denied" in said

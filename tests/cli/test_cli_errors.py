@@ -212,15 +212,6 @@ def test_the_lines_that_replace_removed_options_are_accepted() -> None:
         parse(tomllib.loads(f'[{table}]\n{number}\n[[esc]]\nport = "a"\n'), "")
 
 
-def test_a_published_recording_is_replayed_instead() -> None:
-    said = refused(2, "mqtt", "a.log", "--broker", "x")
-    replay, publish = re.findall(r"kontronik-can-gw ((?:replay|mqtt)[^,(]*)", said)
-    assert publish == "mqtt --channel vcan0 --broker HOST."
-    for line in (replay, publish):
-        make_parser([line.split()[0]]).parse_args(line.split())
-    assert "(a CAN log: canplayer -I a.log vcan0=can0)" in said
-
-
 # --- CAN adapters
 
 

@@ -7,11 +7,10 @@ from typing import Any
 
 import canopen
 import pytest
-from command_line import run
+from command_line import run, written
 
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.objects import BINDINGS
-from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -26,17 +25,12 @@ def command(*words: object) -> tuple[object, str, str]:
     return done.code, done.data.decode("ascii"), done.err
 
 
-def configuration(
-    folder: Path, canopen_lines: str = "enabled = true", left: str = "", right: str = ""
-) -> Path:
-    file = folder / "gateway.toml"
-    file.write_text(
-        '[can]\ninterface = "virtual"\nbitrate = 250000\n[dbc]\nenabled = false\n'
-        f'[canopen]\nstore = "kept"\n{canopen_lines}\n'
-        f'[[esc]]\nname = "left"\nport = "/dev/ttyUSB0"\n{left}\n'
-        f'[[esc]]\nname = "right"\nport = "/dev/ttyUSB1"\n{right}\n'
+def configuration(folder: Path, *more: str) -> Path:
+    """A file with an EDS of the user's."""
+    head = ("[dbc]", "enabled = false", "[canopen]", "enabled = true", 'eds = "mine.eds"')
+    return written(
+        folder / "gateway.toml", "\n".join([*head, *more, "[[esc]]", 'port = "/dev/ttyUSB0"'])
     )
-    return file
 
 
 def imported(text: str) -> Any:
@@ -62,15 +56,14 @@ def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
     assert (tmp_path / "out.eds").read_bytes() == command()[1].encode() == EDS.read_bytes()
     mine = EDS.read_bytes().replace(b"ProductName=KONTRONIK ESC gateway", b"ProductName=my ESC")
     (tmp_path / "mine.eds").write_bytes(mine)
-    file = configuration(tmp_path, 'enabled = true\neds = "mine.eds"')
+    file = configuration(tmp_path)
     assert command("-c", file)[1].encode() == mine
-    file = configuration(tmp_path, 'enabled = true\neds = "mine.eds"\ncia402_mirrors = false')
+    file = configuration(tmp_path, "cia402_mirrors = false")
     assert command("-c", file)[1].encode() == without(mine, range(0x6000, 0x6800))
 
 
 @pytest.mark.parametrize(
-    ("output", "named"),
-    [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf"), ("a;b.dcf", "mine_1.dcf")],
+    ("output", "named"), [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf")]
 )
 def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
     tmp_path: Path, output: str, named: str
@@ -79,7 +72,7 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
         b"FileName=kontronik_esc.eds\r\n", b"filename = old.eds\r\nLastEDS=older.eds\r\n"
     )
     (tmp_path / "mine.eds").write_bytes(lines)
-    file = configuration(tmp_path, 'enabled = true\neds = "mine.eds"')
+    file = configuration(tmp_path)
     assert command("-c", file, "--node-id", 1, "-o", tmp_path / output)[0] == 0
     head = (tmp_path / output).read_text("ascii").partition("[DeviceInfo]")[0]
     assert re.findall("(?im)^(filename|lasteds) ?= ?(.*)", head) == [
@@ -88,46 +81,12 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
     ]
 
 
-def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_master_stored(
-    tmp_path: Path,
-) -> None:
-    file = configuration(
-        tmp_path,
-        "enabled = true\nnode_id = 20\nvendor_id = 0x123\nserial = 1000\nself_start = true",
-        right='pole_pairs = 7\ngear = "5/2"\ncell_count = 12\ntelemetry_timeout_ms = 400',
-    )
-    (tmp_path / "kept").mkdir()
-    stored = Stored(
-        33,
-        {0x101700: bytes.fromhex("F401"), 0x180003: bytes.fromhex("E803"), 0x1A0000: b"\x01"},
-        {0x210006: bytes.fromhex("FF000000")},
-    )
-    (tmp_path / "kept" / "right.params").write_bytes(encode(stored))
-    code, text, said = command("-c", file, "--node-id", 33)
-    assert (code, said) == (0, "")
-    dictionary = imported(text)
-    assert (dictionary.node_id, dictionary.bitrate) == (33, 250_000)
-    assert "NodeName=right\r\n" in text
-    assert "LSS_SerialNumber=0x000003E9\r\n" in text
-    found = values(dictionary)
-    assert [found[0x1018, sub] for sub in (1, 4)] == [0x123, 1001]
-    assert [found[0x2100, sub] for sub in range(1, 9)] == [7, 5, 2, 400, 0, 0xFF, 12, 5]
-    assert [found[0x2101, sub] for sub in (1, 2, 3, 4)] == [33, 33, 250_000, 250_000]
-    communication = {(0x1017, 0): 500, (0x1800, 3): 1000, (0x1A00, 0): 1, (0x1F80, 0): 0}
-    communication |= {(0x1014, 0): 0xA1, (0x1200, 1): 0x621, (0x1803, 1): 0x400004A1}
-    assert {key: found[key] for key in communication} == communication
-
-    of_left = values(imported(command("-c", file, "--node-id", "0x14")[1]))
-    assert (of_left[0x1018, 4], of_left[0x1017, 0], of_left[0x2100, 1]) == (1000, 1000, 1)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["gateway.toml", "kept"]
-
-
 def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
     """Byte for byte: encoded by the canopen library, and as an SDO upload gives it."""
     node = shipped_canopen([5]).nodes([EscSettings()]).nodes[0]
-    written = command("--node-id", 5)[1]
-    dictionary = imported(written)
-    assert "LSS_SerialNumber" not in written  # there is none to look for
+    made = command("--node-id", 5)[1]
+    dictionary = imported(made)
+    assert "LSS_SerialNumber" not in made  # there is none to look for
     assert (dictionary.node_id, dictionary.bitrate) == (5, 500_000)
     found = values(dictionary)
     assert len(found) > 100

@@ -11,10 +11,9 @@ from dbc_bench import compiled, gateway_with, packed, refused
 from packer_oracle import UNITS
 
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.cli import check
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.names import protection
-from kontronik_can_gw.dbc.prepare import unreported
+from kontronik_can_gw.dbc.prepare import is_mute, reporter, unreported
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -166,10 +165,8 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
         read |= dict(theirs.decode_simple(packed(plan, gateway), decode_choices=False))
     expected = {"BatteryVoltage": 44.42, "Torque": -512.5, "Warm": 15, "Gear": 5}
     assert read == expected | {"Ratio": 1.5, "Cool": -2}
-    rows = check.messages(layout, ["esc1"])
-    said = {name: s["source"] for row in rows for name, s in row["signals"].items()}
-    for name, value in {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}.items():
-        assert said[name] == f"(nothing: always {value})"
+    unbound = {s.name for plan in layout.messages for s in plan.signals if s.unbound}
+    assert unbound == {"Torque", "Warm", "Ratio", "Cool"}
     assert [line for line in layout.warnings if "sent once" in line] == [
         "my_car.dbc: sent once at the start, without a cycle and a value that changes: Motor_21"
     ]
@@ -343,7 +340,7 @@ STATES = signal("OperatingState", "8|8@1+") + 'VAL_ 256 OperatingState 7 "MotorO
 
 
 @pytest.mark.parametrize(
-    ("beside", "reporter"),
+    ("beside", "name"),
     [
         ("", None),
         (signal("BatteryVoltage", "8|16@1+", "V", "0.01,0"), None),
@@ -362,17 +359,16 @@ STATES = signal("OperatingState", "8|8@1+") + 'VAL_ 256 OperatingState 7 "MotorO
         (STATES + START + start_of("OperatingState", 7), None),
     ],
 )
-def test_check_names_the_signal_that_reports_the_loss_and_warns_where_there_is_none(
-    beside: str, reporter: str | None
+def test_the_signal_that_reports_the_loss_is_known_and_a_warning_where_there_is_none(
+    beside: str, name: str | None
 ) -> None:
     layout = compiled(FLAG + beside)
-    (row,) = [
-        line for line in check.table([*check.messages(layout, ["esc1"])]) if "Undervoltage" in line
-    ]
-    assert ("reports the loss" in row) == (reporter is not None)
-    assert reporter is None or f"{reporter} reports the loss" in row
+    (message,) = layout.messages
+    (flag,) = [signal for signal in message.signals if signal.name == "Undervoltage"]
+    found = reporter(message, flag)
+    assert is_mute(flag) and (found.name if found else None) == name
     warned = unreported(layout, silent=False)
-    assert len(warned) == (reporter is None)
+    assert len(warned) == (name is None)
     assert all('on_loss = "silent"' in line and "Undervoltage" in line for line in warned)
     assert not unreported(layout, silent=True)
 

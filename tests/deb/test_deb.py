@@ -22,7 +22,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from kontronik_can_gw.cli.service_files import planned
+from kontronik_can_gw.cli.service import planned
 
 PROJECT = make_deb.PROJECT
 LEFT_OUT = {"wrapt", "markdown-it-py", "pygments", "argparse-addons", "crccheck"}

@@ -5,7 +5,7 @@ import stat
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.desk.doctor.findings import Finding
+from kontronik_can_gw.desk.doctor import Finding
 from kontronik_can_gw.desk.doctor.machine import Machine
 
 DIALOUT = 20

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from doctor_trees import Tree, grave, only
 
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings
+from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.service import check_folder, check_service, unit_of
 

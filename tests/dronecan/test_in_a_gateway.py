@@ -41,26 +41,33 @@ BO_ {number} Voltage: 8 Gw
 
 
 def checked(
-    folder: Path, more: str, *, dbc: str = "enabled = false", kbit: int = 1000, poles: int = 7
+    folder: Path,
+    more: str,
+    *how: str,
+    dbc: str = "enabled = false",
+    kbit: int = 1000,
+    poles: int = 7,
 ) -> tuple[object, str, str]:
     text = TOML.format(more=more, dbc=dbc, bitrate=kbit * 1000)
     text += ESC.format("left", 7) + ESC.format("right", poles)
     (folder / "a.toml").write_text(text)
-    done = run("check", "-c", folder / "a.toml", "-v")
+    done = run("check", "-c", folder / "a.toml", *how)
     return done.code, done.out, done.err
 
 
 def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
-    code, out, err = checked(tmp_path, "node_id = 42\nfirst_index = 4\nextended_hz = 10")
+    more = "node_id = 42\nfirst_index = 4\nextended_hz = 10"
+    code, out, err = checked(tmp_path, more, "--json")
     assert (code, err) == (0, "")
-    lines = out.splitlines()
+    found = json.loads(out)
+    lines = found["outputs"]["dronecan"]
     (node,) = [line for line in lines if line.startswith("node 42, kontronik_can_gw, unique id")]
     assert node.endswith("left is esc_index 4, right is esc_index 5")
-    assert "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V" in out
-    assert "rpm is motor_speed, at most 131071" in out
+    assert "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V" in "".join(lines)
+    assert "rpm is motor_speed, at most 131071" in "".join(lines)
     # 2 x (50 x (8, 8, 3 bytes) + 10 x 8 bytes + 8 + 6 bytes) + 8 bytes, 29 bits, worst stuffing
     bits = 2 * (50 * (160 + 160 + 110) + 10 * 160 + 160 + 140) + 160
-    assert f"bus load  {bits / 1e6:.1%}, 325 frames/s" in out
+    assert (found["bus_load"], found["frames_per_second"]) == (pytest.approx(bits / 1e6), 325)
 
 
 @pytest.mark.parametrize(

@@ -201,6 +201,29 @@ def _log(suffix: str) -> Callable[[bytes], list[str]]:
     return form
 
 
+def configuration(data: bytes) -> list[str]:
+    """A line for each key in effect."""
+    tables = json.loads(data)["configuration"]
+    escs = {f"esc {number}": esc for number, esc in enumerate(tables.pop("esc"), 1)}
+    return [
+        f"{name}.{key} = {json.dumps(value, ensure_ascii=False)}"
+        for name, table in {**tables, **escs}.items()
+        for key, value in table.items()
+    ]
+
+
+def signals(data: bytes) -> list[str]:
+    """A line for each message, and for each signal: what it shows, and its meaning."""
+    found = json.loads(data)
+    lines = []
+    for message in found.get("messages", ()):
+        lines.append(" ".join(f"{key}={message[key]}" for key in message if key != "meaning"))
+        for each in (s for s in found["signals"] if s["message"] == message["name"]):
+            keys = ("signal", "esc", "shows", "unit", "page", "meaning")
+            lines.append("  ".join(["", *(str(each[key]) for key in keys if each[key])]))
+    return lines
+
+
 FORMS: dict[str, Callable[[bytes], list[str]]] = {
     "dbc": dbc,
     "dbc short": dbc_short,
@@ -212,6 +235,8 @@ FORMS: dict[str, Callable[[bytes], list[str]]] = {
     "columns": lambda data: [
         re.sub(" {2,}", "  ", line) for line in data.decode("utf-8").splitlines()
     ],
+    "configuration": configuration,
+    "signals": signals,
     "size": lambda data: [f"{len(data)} bytes, {zlib.crc32(data):08X}"],
     "log": _log(".log"),
     "asc": _log(".asc"),

@@ -16,7 +16,7 @@ import pytest
 from command_line import refused
 from recordings import candump_log, dump_bytes
 
-from kontronik_can_gw.cli.progress import watched
+from kontronik_can_gw.cli.desk import watched
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 

@@ -13,7 +13,6 @@ import pyarrow as pa  # type: ignore[import-untyped]
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from pyarrow import parquet
 from recordings import (
     WALL_NS,

@@ -7,7 +7,7 @@ import pytest
 from command_line import Done, refused, run
 
 from kontronik_can_gw.cli import service
-from kontronik_can_gw.cli.service_files import planned
+from kontronik_can_gw.cli.service import planned
 from kontronik_can_gw.errors import UserError
 
 UNITS = "etc/systemd/system"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.cli.service_files import planned
+from kontronik_can_gw.cli.service import planned
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 BESIDE = tuple(

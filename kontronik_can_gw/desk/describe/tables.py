@@ -13,6 +13,7 @@ from typing import Any
 from kontronik_can_gw.canopen.dbc_names import pascal_case
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import TABLES, shipped
+from kontronik_can_gw.dbc.prepare import is_mute, reporter
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
@@ -66,7 +67,7 @@ def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
     comment = next((each.comment for each in bus.database.buses if each.comment), "")
     file = f"{PurePath(bus.layout.file).name}, messages of {bus.layout.node}."
     signals = [
-        {"message": plan.name, **_signal(signal, of_file[signal.name], escs)}
+        {"message": plan.name, **_signal(plan, signal, of_file[signal.name], escs)}
         for plan, copy in plans
         for of_file in [{sent: signal for signal, sent in copy.signals()}]
         for signal in plan.signals
@@ -99,7 +100,9 @@ def _message(plan: MessagePlan, message: Any) -> Row:
     }
 
 
-def _signal(plan: SignalPlan, signal: Any, escs: Sequence[EscSettings]) -> Row:
+def _signal(
+    message: MessagePlan, plan: SignalPlan, signal: Any, escs: Sequence[EscSettings]
+) -> Row:
     """A signal. ``min`` and ``max`` are those of the DBC, else of what can be sent; ``shows``: the value, or the role of the bits."""
     flag = plan.length == 1 and not plan.signed and plan.factor == 1 and plan.offset == 0
     codes: tuple[int | None, int | None] = plan.not_available, plan.error
@@ -109,7 +112,12 @@ def _signal(plan: SignalPlan, signal: Any, escs: Sequence[EscSettings]) -> Row:
     low, high = sorted(float(raw * plan.factor + plan.offset) for raw in limits)
     kind = "float" if plan.is_float else "signed" if plan.signed else "unsigned"
     choices = {int(value): str(word) for value, word in (signal.choices or {}).items()}
-    notes = [f"{note[:1].upper()}{note[1:]}." for note in plan.notes]
+    lost = list(plan.notes)
+    if is_mute(plan) and (found := reporter(message, plan)) is not None:
+        lost.append(f"{found.name} reports the loss")
+    if plan.role is Role.CONSTANT or plan.unbound:
+        lost.append(f"{'bound to nothing: ' if plan.unbound else ''}always raw {plan.constant}")
+    notes = [f"{note[:1].upper()}{note[1:]}." for note in lost]
     several = plan.esc is not None and len(escs) > 1
     return {
         "signal": plan.name,

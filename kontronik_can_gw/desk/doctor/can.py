@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings
+from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
 
 _CAN_TYPE = "280"

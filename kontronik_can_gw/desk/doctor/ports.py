@@ -6,7 +6,7 @@ No port is opened: whether it takes the ESC's line settings is known once the ga
 import os
 import stat
 
-from kontronik_can_gw.desk.doctor.findings import Finding, Findings
+from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.runtime.serial_port import is_mini_uart
 

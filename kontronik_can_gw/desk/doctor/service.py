@@ -5,7 +5,7 @@ from pathlib import PurePath
 from stat import S_ISDIR
 from typing import NamedTuple
 
-from kontronik_can_gw.desk.doctor.findings import Findings
+from kontronik_can_gw.desk.doctor import Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
 
 NAME = "kontronik-can-gw"

@@ -1,0 +1,89 @@
+"""Shared by commands of the desk: the layout that ``-c`` or ``--dbc`` names, ``-o``, progress, pseudo terminals."""
+
+import argparse
+import sys
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from kontronik_can_gw.cli.common import announced_config, load_all, say
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.desk.recordings.convert import Output
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable
+
+_Block = TypeVar("_Block", bound=Sized)
+
+
+def given_layout(args: argparse.Namespace) -> BusLayout | None:
+    """The layout that an option names; None where none is given. UserError with every mistake."""
+    return bus_layout(args) if args.config or args.dbc else None
+
+
+def bus_layout(args: argparse.Namespace) -> BusLayout:
+    """The layout that an option names, else of the configuration of this folder or machine, else the shipped one.
+
+    UserError with every mistake.
+    """
+    if args.config is None and args.dbc is None:
+        args.config = announced_config()
+    if args.config is None:
+        return layout_of_dbc(args.dbc or shipped("dbc/kontronik_esc.dbc"))
+    loaded = load_all(args.config)
+    if loaded.database is None:
+        raise UserError(
+            f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. Give --dbc instead."
+        )
+    return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
+
+
+def write_output(where: str, text: str, encoding: str = "utf-8") -> None:
+    """Write text to a file and say so, or to standard output for ``-``; line ends stay. RunError where it cannot be written."""
+    if where == "-":
+        shown = printable(text, keep="\r\n\t") if sys.stdout.isatty() else text
+        sys.stdout.buffer.write(shown.encode(encoding))
+        return
+    try:
+        with Output(Path(where), what="-o") as out:
+            out.open().write(text.encode(encoding))
+            out.is_whole = True
+    except OSError as error:
+        raise RunError(f"{where}: cannot be written: {error.strerror}. Give another -o.") from None
+    say(f"{where} written")
+
+
+def watched(blocks: Iterable[_Block], name: str, data_on_screen: bool) -> Iterator[_Block]:
+    """The blocks, with the number of their items so far on standard error while they are taken; on no terminal nothing is shown.
+
+    ``data_on_screen``: data is written to standard output, which may be the same terminal.
+    """
+    if not sys.stderr.isatty() or (data_on_screen and sys.stdout.isatty()):
+        yield from blocks
+        return
+    from rich import console, progress
+
+    columns = "{task.description}", "{task.completed:,}", "after", "{task.elapsed:.0f} s"
+    shown = [progress.TextColumn(text, markup=False) for text in columns]
+    screen = console.Console(stderr=True)
+    with progress.Progress(progress.SpinnerColumn(), *shown, console=screen, transient=True) as bar:
+        task = bar.add_task(printable(name), total=None)
+        for block in blocks:
+            bar.advance(task, len(block))
+            yield block
+
+
+@contextmanager
+def terminals(names: Sequence[str], link: str | None) -> Iterator[list[PtyEsc]]:
+    """A pseudo terminal for each name, printed as "esc1 /dev/pts/5". ``link``: symbolic link, {n} is the number from 1."""
+    with ExitStack() as stack:
+        opened = []
+        for number in range(1, len(names) + 1):
+            path = link and link.replace("{n}", str(number))
+            opened.append(stack.enter_context(PtyEsc(path)))
+        for name, terminal in zip(names, opened, strict=True):
+            print(f"{name} {terminal.path}")
+        sys.stdout.flush()
+        yield opened
