@@ -17,8 +17,8 @@ from markdown_it import MarkdownIt
 from kontronik_can_gw.canopen.data_types import TYPE_NAMES
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.desk.describe.markdown import Table, markdown
+from kontronik_can_gw.desk.describe.tables import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import VALUES

@@ -11,8 +11,7 @@ from report_flights import Row, column, flight_of, rows_of, shipped_bus, simulat
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.report.esc import EscFlight
-from kontronik_can_gw.desk.report.events import Event, Events
+from kontronik_can_gw.desk.report.esc import EscFlight, Event, Events
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.quantities import MINIMA
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap

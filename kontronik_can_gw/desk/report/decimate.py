@@ -11,7 +11,7 @@ the first after it, even for a gap of one row.
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
-from kontronik_can_gw.desk.report.events import Number
+from kontronik_can_gw.desk.report.esc import Number
 
 MIN_POINTS = 8
 _MERGED = 4

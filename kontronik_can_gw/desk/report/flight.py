@@ -12,8 +12,7 @@ from kontronik_can_gw.desk.recordings.fields import Field, column_of
 from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.tables.rows import LATEST_NS
 from kontronik_can_gw.desk.report.decimate import Decimator
-from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight
-from kontronik_can_gw.desk.report.events import Event, Events, Number
+from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Event, Events, Number
 from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
