@@ -68,13 +68,9 @@ def test_the_numbers_are_those_of_pandas(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
 ) -> None:
     sources = (
-        "battery_power",
-        "battery_voltage",
-        "battery_current",
-        "electrical_speed",
-        "energy_used",
+        "battery_power battery_voltage battery_current electrical_speed energy_used consumed_charge"
     )
-    data = table(bus, rows, esc, *sources, "consumed_charge")
+    data = table(bus, rows, esc, *sources.split())
     found = flight.escs[esc]
     live = data[data.battery_voltage.notna()]
     assert found.telemetry_ns == live.held.sum()
