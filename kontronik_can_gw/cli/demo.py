@@ -7,9 +7,9 @@ from threading import Event
 
 from kontronik_can_gw.cli.arguments import number_from, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.desk.monitor.demo import DemoBus
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.watch import watch
+from kontronik_can_gw.desk.sources import DemoBus
 
 # fmt: off
 OPTIONS = (

@@ -4,7 +4,6 @@ import argparse
 import re
 import sys
 from argparse import ArgumentTypeError
-from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
 from threading import Event
@@ -25,7 +24,6 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     Layout,
     OperatingError,
     SelfTestError,
-    Sent,
     SimulatedEsc,
 )
 
@@ -154,12 +152,8 @@ def _to_files(escs: list[SimulatedEsc], path: str, time_ns: int) -> None:
 
 def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | None) -> None:
     names = [f"esc{number}" for number in range(1, len(escs) + 1)]
-    stop, frames, intact, guilty = Event(), Counter[int](), Counter[int](), dict[int, str]()
+    stop, guilty = Event(), dict[int, str]()
     with stopping_on_signals(stop.set), terminals(names, link) as opened:
-
-        def count(index: int, sent: Sent, taken: bool) -> None:
-            frames[index] += 1
-            intact[index] += sent.intact and taken
 
         def complain(index: int) -> None:
             """Report once that the gateway transmits to the ESC."""
@@ -174,14 +168,13 @@ def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | Non
             list(zip(escs, opened, strict=True)),
             seconds=None if time_ns is None else time_ns / SECOND_NS,
             stop=stop.is_set,
-            on_sent=count,
             on_received=complain,
         )
-        for index, terminal in enumerate(opened):
+        for name, terminal in zip(names, opened, strict=True):
             lost = terminal.dropped_bytes
             dropped = f", {lost} bytes dropped (nobody read)" if lost else ""
-            counts = f"{frames[index]} frames, {intact[index]} of them intact{dropped}"
-            print(f"{names[index]}: {counts}", file=sys.stderr)
+            counts = f"{terminal.frames} frames, {terminal.intact} of them intact{dropped}"
+            print(f"{name}: {counts}", file=sys.stderr)
     if guilty:
         remedy = "Nothing may ever be sent to an ESC: turn echo and writing off."
         raise RunError(*(f"{guilty[index]}. {remedy}" for index in sorted(guilty)))

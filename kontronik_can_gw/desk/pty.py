@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Self
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, Sent, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
 
 
 class PtyEsc:
@@ -29,6 +29,8 @@ class PtyEsc:
         """Number of bytes from the gateway. Must stay 0."""
         self.first_received = b""
         """The first of them, at most 64."""
+        self.frames = self.intact = 0
+        """Frames of ``run``, and those that were accepted and are not damaged."""
         self._link: Path | None = None
         try:
             self._master, self._slave = os.openpty()
@@ -96,18 +98,14 @@ def run(
     *,
     seconds: float | None = None,
     stop: Callable[[], bool] = lambda: False,
-    on_sent: Callable[[int, Sent, bool], None] | None = None,
-    on_received: Callable[[int], None] | None = None,
-    origin_ns: int | None = None,
+    on_received: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Send in real time, all ESCs in this one thread.
 
     Ends when all frames due before ``seconds`` were sent, or ``stop()`` is true (asked at least each 100 ms). The simulations'
-    time 0 is ``origin_ns`` of time.monotonic_ns, the call's time unless given. ``on_sent`` gets the index of the ESC, the
-    frame, and whether the terminal accepted it; ``on_received`` the index of an ESC that received bytes.
+    time 0 is the call's time. ``on_received`` gets the index of an ESC that received bytes.
     """
-    if origin_ns is None:
-        origin_ns = time.monotonic_ns()
+    origin_ns = time.monotonic_ns()
     end_ns = None if seconds is None else round(seconds * SECOND_NS)
     poller = select.poll()
     index_of = {}
@@ -120,20 +118,18 @@ def run(
         if end_ns is not None and now_ns >= end_ns:
             now_ns, over = end_ns - 1, True
         over = over or stop()
-        for index, (esc, terminal) in enumerate(escs):
+        for esc, terminal in escs:
             for sent in esc.frames_until(now_ns) if esc.next_ns <= now_ns else ():
-                taken = terminal.write(sent.wire)
-                if on_sent is not None:
-                    on_sent(index, sent, taken)
+                terminal.frames += 1
+                terminal.intact += terminal.write(sent.wire) and sent.intact
         # At least 1 ms, so that frames due within it share a round: 64 ESCs cost no more rounds than 10.
         due_ns = min((esc.next_ns for esc, _ in escs), default=now_ns + SECOND_NS)
         until_ns = min(due_ns, now_ns + SECOND_NS // 10)
         if end_ns is not None:
             until_ns = min(until_ns, end_ns)
         for fd, _ in poller.poll(0 if over else max((until_ns - now_ns) / 1e6, 1)):
-            index = index_of[fd]
-            if escs[index][1].check() and on_received is not None:
-                on_received(index)
+            if escs[index_of[fd]][1].check():
+                on_received(index_of[fd])
 
 
 def _set_raw(fd: int) -> None:

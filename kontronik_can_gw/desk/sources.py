@@ -1,4 +1,4 @@
-"""Where the frames of monitor and MQTT come from: the CAN bus, to which nothing is sent, or a recording played in real time."""
+"""Where the frames of monitor and MQTT come from: the CAN bus, to which nothing is sent, a recording in real time, or a simulation."""
 
 import time
 from collections.abc import Callable
@@ -6,12 +6,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-from kontronik_can_gw.config.assemble import check_devices
+from kontronik_can_gw.config.assemble import assemble, check_devices
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.kontronik.simulator import (
+    FLIGHT,
+    Dropout,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    OperatingError,
+    SimulatedEsc,
+)
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.bus_listener import BusListener
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.unpacker import SignalReader
@@ -150,3 +161,52 @@ class Recording(Source):
 
     def wall_ns(self) -> int | None:
         return self._input.wall_ns(self._clock)
+
+
+_ERRORS = (
+    OperatingError.POWER_STAGE_OVERTEMP_WARNING,
+    OperatingError.BEC_OVERCURRENT,
+    OperatingError.UNDERVOLTAGE,
+    OperatingError.LIMIT_DISCHARGED_CAPACITY,
+)
+_DEMO_STEP_S = 0.005
+
+
+class DemoBus(Source):
+    """A bus on which a gateway sends the telemetry of one flight, again and again."""
+
+    def __init__(self, seed: int) -> None:
+        esc = {"port": "simulated", "pole_pairs": 7, "gear": 9.8}
+        made = assemble(parse({"esc": [esc]}, "demo"))
+        assert made.database is not None
+        super().__init__("demo", BusLayout(made.database, made.layout, made.escs, made.config))
+        now = time.monotonic_ns()
+        self._esc = _flight(seed, now)
+        self._gateway = Gateway(made.escs, made.layout, now)
+        self._gateway.port(0, True, now)
+        self._gateway.start(now)
+
+    def pump(self, take: Take, until_s: float) -> None:
+        """Let the gateway work until this time."""
+        gateway = self._gateway
+        while True:
+            now = time.monotonic_ns()
+            for sent in self._esc.frames_until(now):
+                gateway.receive_bytes(0, sent.wire, now, now)
+            gateway.advance(now)
+            for frame in gateway.take_frames(now):
+                take(frame, now)
+            if time.monotonic() >= until_s:
+                return
+            time.sleep(_DEMO_STEP_S)
+
+
+def _flight(seed: int, start_ns: int) -> SimulatedEsc:
+    """A short flight, again and again, with damaged frames, silences and errors."""
+    errors = tuple(
+        ErrorWindow(_ERRORS[n % len(_ERRORS)], (6 + 13 * n) * SECOND, 3 * SECOND)
+        for n in range(1000)
+    )
+    faults = Faults(flipped_bits=1e-5, dropout=Dropout(SECOND, 17 * SECOND), errors=errors)
+    profile = tuple(phase._replace(duration_s=max(1.5, phase.duration_s * 0.4)) for phase in FLIGHT)
+    return SimulatedEsc(EscOptions(profile=profile, faults=faults), seed=seed, start_ns=start_ns)

@@ -1,7 +1,7 @@
 """The description is complete and true, as cantools and canopen read the same files; whatever they hold is shown as text."""
 
 import json
-from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from markdown_it import MarkdownIt
 from kontronik_can_gw.canopen.data_types import TYPE_NAMES
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.desk.describe.markdown import Table, markdown
+from kontronik_can_gw.desk.describe.tables import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import VALUES
@@ -228,34 +228,19 @@ def test_of_two_escs_each_has_its_signals_and_cob_ids(tmp_path: Path, facts: Fac
 # --- the document, read back by a parser that knows nothing of us
 
 
-class Page(HTMLParser):
-    """The texts of a page by the tag that they stand in."""
-
-    def __init__(self, markdown_text: str) -> None:
-        super().__init__()
-        self.texts: dict[str, list[str]] = {}
-        self._tag = ""
-        parser = MarkdownIt("commonmark").enable("table").enable("strikethrough")
-        raw = [
-            t.content
-            for token in parser.parse(markdown_text)
-            for t in (token, *(token.children or ()))
-            if "html" in t.type
-        ]
-        assert set(raw) <= {"<!-- -->"}, "nothing that is HTML in the source may come through"
-        self.feed(parser.render(markdown_text).replace("<!-- -->", ""))
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self._tag = tag
-        self.texts.setdefault(tag, []).append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        self._tag = ""
-
-    def handle_data(self, data: str) -> None:
-        if self._tag:
-            self.texts[self._tag][-1] += data
+def texts_of(markdown_text: str) -> dict[str, list[str]]:
+    """The texts of a document by the tag that they stand in; none may hold markup."""
+    found: dict[str, list[str]] = {}
+    parser = MarkdownIt("commonmark").enable("table").enable("strikethrough")
+    for opening, token in pairwise(parser.parse(markdown_text)):
+        assert token.type != "html_block"
+        if token.type == "inline":
+            parts = [(part.type, part.content) for part in token.children or ()]
+            plain = [text for kind, text in parts if (kind, text) != ("html_inline", "<!-- -->")]
+            assert {kind for kind, _ in parts} <= {"text", "html_inline"}, parts
+            assert len(plain) == sum(kind == "text" for kind, _ in parts), parts
+            found.setdefault(opening.tag, []).append("".join(plain))
+    return found
 
 
 def one_line(text: str) -> str:
@@ -263,7 +248,7 @@ def one_line(text: str) -> str:
 
 
 def test_every_text_of_the_tables_is_in_the_document(facts: Facts) -> None:
-    cells = {text for texts in Page(text_of()).texts.values() for text in texts}
+    cells = {text for texts in texts_of(text_of()).values() for text in texts}
     for rows in facts.values():
         for row in rows if isinstance(rows, list) else ():
             assert {one_line(text) for text in row.values() if isinstance(text, str)} <= cells, row
@@ -287,7 +272,7 @@ def test_any_text_comes_back_as_it_is(title: str, paragraph: str, cell: str) -> 
     named = [{"one": "x", "head": f"H {title}"}, {"one": "x", "head": "H"}]
     rows = [{"one": cell}, {"one": "y"}]
     tables = [Table(f"T {title}", [paragraph], rows), Table("B", [], named, by="head")]
-    found = Page(markdown("All", [], tables)).texts
+    found = texts_of(markdown("All", [], tables))
     assert [one_line(text) for text in found["h2"]] == [one_line(f"T {title}"), "B"]
     assert [one_line(text) for text in found["h3"]] == [one_line(f"H {title}"), "H"]
     assert [one_line(text) for text in found.get("p", [])] == [one_line(paragraph)][

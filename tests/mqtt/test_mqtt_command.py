@@ -1,7 +1,6 @@
 """``kontronik-can-gw mqtt`` without a broker: each mistake is one line with the remedy."""
 
 import errno
-import sys
 from pathlib import Path
 from typing import NoReturn
 
@@ -47,15 +46,3 @@ def test_a_machine_without_loopback_is_one_line_with_the_remedy(
     assert (done.code, "Traceback" in done.err) == (1, False)
     assert "127.0.0.1: Network is unreachable." in done.err
     assert done.err.endswith("sudo ip link set lo up\n")
-
-
-def test_without_the_library_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [
-        name for name in sys.modules if name.startswith(("paho", "kontronik_can_gw.desk.mqtt"))
-    ]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "paho", None)
-    assert (
-        refused(1, "mqtt", "--broker", "x")
-        == "needs paho-mqtt 2: pip install 'kontronik-can-gw[mqtt]'"
-    )

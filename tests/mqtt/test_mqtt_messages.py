@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -158,30 +158,36 @@ def changes(published: Published, key: str) -> list[tuple[int, Any]]:
     return found
 
 
-def test_an_error_is_reported_at_once_however_slow_the_rate() -> None:
+def test_what_is_notable_is_reported_at_once_however_slow_the_rate_and_a_speed_is_not() -> None:
+    """An error from 3 to 4 s, the motor from 6 s, a silent line from 9 s on."""
     window = ErrorWindow(OperatingError.OVERVOLTAGE, 3 * SECOND_NS, SECOND_NS)
-    options = EscOptions(profile=QUIET.profile, faults=Faults(errors=(window,)))
-    frames = flight(layout_of(["esc1"]), 6, [options])
-    published = run(publisher("esc1", rate=0.01), frames, 6)
-    times = [now for now, value in changes(published, "problem")]
-    assert len(times) == 3  # the first state, the error, its end
+    start = Phase("off", 5, 0, OperatingState.MotorOff, 0)
+    profile = (start, Phase("go", 90, 60, OperatingState.Forward, 5))
+    options = EscOptions(profile=profile, faults=Faults(errors=(window,)))
+    published = run(
+        publisher("esc1", rate=0.01), flight(layout_of(["esc1"]), 11, [options], until=9), 11
+    )
+    times = [now for now, value in changes(published, "problem") if value is not None]
     for told, happened in zip(times[1:], (3 * SECOND_NS, 4 * SECOND_NS), strict=True):
         assert 0 <= told - happened <= 0.2 * SECOND_NS + 2 * STEP_NS
-
-
-def test_a_new_kind_of_state_and_a_lost_link_are_reported_at_once_and_a_new_speed_is_not() -> None:
-    start = Phase("off", 2, 0, OperatingState.MotorOff, 0)
-    options = EscOptions(profile=(start, Phase("go", 90, 60, OperatingState.Forward, 5)))
-    frames = flight(layout_of(["esc1"]), 8, [options], until=6)
-    published = run(publisher("esc1", rate=0.01), frames, 8)
     kinds = changes(published, "motor")
     assert [kind for _, kind in kinds] == ["idle", "run", None]
-    assert abs(kinds[1][0] - 3 * SECOND_NS) <= 0.25 * SECOND_NS  # a second of power-up first
+    assert abs(kinds[1][0] - 6 * SECOND_NS) <= 0.25 * SECOND_NS  # a second of power-up first
     lost = next(now for now, found in states(published) if found["link_state"] == "Lost")
-    assert lost - 6 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway itself waits for the time-out
-    assert len(states(published)) <= 8
+    assert lost - 9 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway itself waits for the time-out
+    assert len(states(published)) <= 10
     topic = TOPICS.of("esc1", "available")
     assert [m.payload for _, m in published if m.topic == topic] == [b"online", b"offline"]
+    assert not any(m.retain for _, m in published if m.topic.endswith("/state"))
+
+
+def test_an_esc_without_live_values_in_the_dbc_is_available_by_what_there_is() -> None:
+    bus = layout_of(["esc1"])
+    messages = tuple(each for each in bus.layout.messages if each.name == "EscLink")
+    lean = replace(bus, layout=replace(bus.layout, messages=messages))
+    published = run(Publisher(lean, TOPICS, MqttConfig()), flight(bus, 3), 3)
+    topic = TOPICS.of("esc1", "available")
+    assert [m.payload for _, m in published if m.topic == topic] == [b"online"]
 
 
 def test_what_comes_and_goes_is_bounded() -> None:
@@ -233,53 +239,33 @@ COMPONENT_KEYS = {
 }  # fmt: skip
 
 
-def discovered(published: Published) -> dict[str, dict[str, Any]]:
-    """Topic and content of the discovery."""
-    return {
-        m.topic: json.loads(m.payload) for _, m in published if m.topic.startswith("homeassistant/")
-    }
-
-
-@pytest.fixture(scope="module")
-def of_two() -> Published:
-    """What is published of a flight of two ESCs."""
-    bus = layout_of(["left", "right"])
-    return run(publisher("left", "right", discovery="homeassistant"), flight(bus, 3), 3)
-
-
-def components(found: dict[str, dict[str, Any]]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    for topic, device in found.items():
-        for key, component in device["components"].items():
-            yield topic, key, component
-
-
-def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_the_state(
-    of_two: Published,
-) -> None:
-    found = discovered(of_two)
-    newest = {esc: states(of_two, esc)[-1][1] for esc in ("left", "right", "")}
-    ids = [component["unique_id"] for _, _, component in components(found)]
+def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_the_state() -> None:
+    frames = flight(layout_of(["left", "right"]), 3)
+    published = run(publisher("left", "right", discovery="ha"), frames, 3)
+    ids: list[str] = []
+    for esc in ("left", "right", ""):
+        topic, newest = TOPICS.discovery("ha", esc), states(published, esc)[-1][1]
+        found = next(json.loads(m.payload) for _, m in published if m.topic == topic)
+        for key, component in found["components"].items():
+            assert set(component) <= COMPONENT_KEYS, key
+            assert component["unique_id"] == f"{topic.split('/')[2]}_{key}"
+            ids.append(component["unique_id"])
+            assert component["name"]
+            shown = re.findall(r"value_json\.(\w+)", component["value_template"])
+            assert shown and set(shown) <= set(newest), key
+            assert component.get("entity_category") in (None, "diagnostic")
+            kind = component.get("device_class")
+            if component["platform"] == "binary_sensor":
+                assert kind == "problem"
+                continue
+            assert component["platform"] == "sensor"
+            units, classes = DEVICE_CLASSES[kind]
+            assert component.get("unit_of_measurement") in units, key
+            assert component.get("state_class") in classes, key
+            options = component.get("options", [])
+            assert len(options) == len(set(options))
+            assert (len(options) > 1) == (kind == "enum")
     assert len(ids) == len(set(ids)) > 100
-    for topic, key, component in components(found):
-        assert set(component) <= COMPONENT_KEYS, key
-        assert component["unique_id"] == f"{topic.split('/')[2]}_{key}"
-        assert component["name"]
-        shown = re.findall(r"value_json\.(\w+)", component["value_template"])
-        assert shown and set(shown) <= set(
-            newest[next((esc for esc in ("left", "right") if esc in topic), "")]
-        ), key
-        assert component["platform"] in ("sensor", "binary_sensor")
-        assert component.get("entity_category") in (None, "diagnostic")
-        if component["platform"] == "binary_sensor":
-            assert component["device_class"] == "problem"
-            continue
-        units, classes = DEVICE_CLASSES[component.get("device_class")]
-        assert component.get("unit_of_measurement") in units, key
-        assert component.get("state_class") in classes, key
-        if component.get("device_class") == "enum":
-            assert len(component["options"]) == len(set(component["options"])) > 1
-        else:
-            assert "options" not in component
 
 
 def test_an_esc_is_announced_when_it_is_heard_and_again_when_it_is_known() -> None:

@@ -30,22 +30,13 @@ class Browser:
         assert PROGRAM is not None, MISSING
         to_browser, self._out = os.pipe()
         self._in, from_browser = os.pipe()
-        self._log = (profile.parent / f"{profile.name}.log").open("wb")
         fds = (to_browser, from_browser)
-
-        def arrange() -> None:  # the browser reads from 3 and writes to 4
-            high = [os.dup(fd) for fd in fds]
-            moved = [os.dup2(fd, 40 + i) for i, fd in enumerate(high)]
-            os.dup2(moved[0], 3)
-            os.dup2(moved[1], 4)
-
+        # the browser reads from 3 and writes to 4
+        command = ["bash", "-c", 'exec 8<&"$0" 9>&"$1"; exec "${@:2}" 3<&8 4>&9', *map(str, fds)]
+        command += [PROGRAM, *OPTIONS.split(), f"--user-data-dir={profile}", "about:blank"]
+        quiet = subprocess.DEVNULL
         self._process = subprocess.Popen(
-            [PROGRAM, *OPTIONS.split(), f"--user-data-dir={profile}", "about:blank"],
-            stdin=subprocess.DEVNULL,
-            stdout=self._log,
-            stderr=self._log,
-            close_fds=False,
-            preexec_fn=arrange,
+            command, stdin=quiet, stdout=quiet, stderr=quiet, pass_fds=fds
         )
         for fd in fds:
             os.close(fd)
@@ -72,7 +63,6 @@ class Browser:
             self._process.kill()
             self._process.wait()
         os.close(self._in)
-        self._log.close()
 
     def call(self, method: str, **params: object) -> dict[str, Any]:
         """One command of the protocol; its result."""

@@ -5,8 +5,8 @@ from itertools import accumulate, pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kontronik_can_gw.desk.report.decimate import MIN_POINTS, Decimator
-from kontronik_can_gw.desk.report.events import Number
+from kontronik_can_gw.desk.report.esc import Number
+from kontronik_can_gw.desk.report.flight import MIN_POINTS, Decimator
 
 NUMBERS = st.one_of(st.none(), st.integers(-50, 50))
 ROWS = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=300)

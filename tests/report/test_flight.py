@@ -11,8 +11,7 @@ from report_flights import Row, column, flight_of, rows_of, shipped_bus, simulat
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.report.esc import EscFlight
-from kontronik_can_gw.desk.report.events import Event, Events
+from kontronik_can_gw.desk.report.esc import EscFlight, Event, Events
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.quantities import MINIMA
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
@@ -69,13 +68,9 @@ def test_the_numbers_are_those_of_pandas(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
 ) -> None:
     sources = (
-        "battery_power",
-        "battery_voltage",
-        "battery_current",
-        "electrical_speed",
-        "energy_used",
+        "battery_power battery_voltage battery_current electrical_speed energy_used consumed_charge"
     )
-    data = table(bus, rows, esc, *sources, "consumed_charge")
+    data = table(bus, rows, esc, *sources.split())
     found = flight.escs[esc]
     live = data[data.battery_voltage.notna()]
     assert found.telemetry_ns == live.held.sum()

@@ -11,7 +11,7 @@ from report_flights import data_of, flight_of, shipped_bus, simulated
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
-from kontronik_can_gw.desk.report.text import clock, duration, number, wall_clock
+from kontronik_can_gw.desk.report.summary import clock, duration, number, wall_clock
 from kontronik_can_gw.esc.telemetry import SECOND as S
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"

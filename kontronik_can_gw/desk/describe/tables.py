@@ -1,26 +1,29 @@
-"""Makes the tables of ``describe`` and of docs/reference. Nothing is defined here: each row is read from DBC, EDS, layout or definitions.
+"""Makes the tables of ``describe`` and of docs/reference.
+
+Each row is read from DBC, EDS, layout or definitions; only the meanings of the states of link, CAN controller and gateway are defined here.
 
 Ids, indices and bit numbers are integers, times in ms. A physical value is raw * factor + offset.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from fractions import Fraction
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from kontronik_can_gw.canopen.dbc_names import pascal_case
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import TABLES, shipped
 from kontronik_can_gw.dbc.prepare import is_mute, reporter
-from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, State
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import MS, EscSettings, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.signals.plan import MessagePlan, Role, SendType, SignalPlan
 
 _AVAILABLE = {
@@ -145,6 +148,47 @@ def _finite(value: float) -> float | None:
 
 
 # --- values, errors, states
+
+
+class Text(NamedTuple):
+    """Meaning of a state, and remedy."""
+
+    meaning: str
+    remedy: str = "Nothing to do."
+
+
+# fmt: off
+LINK_STATES: Mapping[LinkState, Text] = {
+    LinkState.NEVER_SEEN: Text(
+        "nothing has come since the start",
+        "Switch the ESC on. Check the cable and the telemetry setting of the ESC. A KOSMIK sends after one throttle pulse."),
+    LinkState.SEARCHING: Text(
+        "bytes come, but no good frame yet",
+        "If it stays: the ESC may be set to another protocol, or the line is disturbed. The log and decode say what it looks like."),
+    LinkState.OK: Text("good frames come"),
+    LinkState.DEGRADED: Text("good frames come, and many CRC errors or dropped bytes with them", GatewayError.CRC_RATE.remedy),
+    LinkState.LOST: Text("good frames came, and come no more", GatewayError.TELEMETRY_LOST.remedy),
+    LinkState.PORT_ERROR: Text("the serial port cannot be opened or read", GatewayError.PORT_GONE.remedy),
+}
+CAN_STATES: Mapping[CanState, Text] = {
+    CanState.UNKNOWN: Text("the CAN interface does not report it"),
+    CanState.ERROR_ACTIVE: Text("works"),
+    CanState.ERROR_WARNING: Text("works, but there are errors on the bus", GatewayError.CAN_PASSIVE.remedy),
+    CanState.ERROR_PASSIVE: Text("works, with many errors on the bus", GatewayError.CAN_PASSIVE.remedy),
+    CanState.BUS_OFF: Text(
+        "switched off by errors on the bus: no frame can leave",
+        f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0 somebody has to restart the interface."),
+    CanState.DOWN: Text(
+        "the CAN interface is down or missing: no frame can leave",
+        "Plug the adapter in, set the interface up. kontronik-can-gw doctor names the command."),
+}
+GATEWAY_STATES: Mapping[GatewayState, Text] = {
+    GatewayState.STARTING: Text("opens its ports and the CAN interface"),
+    GatewayState.RUNNING: Text("at work"),
+    GatewayState.STOPPING: Text("about to end"),
+    GatewayState.REPLAY: Text("the values come from a recording, not from an ESC"),
+}
+# fmt: on
 
 
 def values(escs: Sequence[EscSettings]) -> list[Table]:

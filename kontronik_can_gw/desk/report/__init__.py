@@ -1,1 +1,1 @@
-"""A recorded flight as an HTML page. analysis (with decimate, ledger, fit) turns rows into a flight; page renders it."""
+"""A recorded flight as an HTML page: ``flight`` and ``esc`` turn rows into numbers, events and points; ``page`` and ``summary`` render them."""

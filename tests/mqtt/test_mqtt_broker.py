@@ -1,0 +1,353 @@
+"""The client and ``kontronik-can-gw mqtt`` against a real mosquitto, subscribers that are not ours, and brokers that speak rubbish."""
+
+import contextlib
+import os
+import pwd
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import paho.mqtt.client as paho
+import pytest
+from command_line import written
+from paho.mqtt.enums import CallbackAPIVersion
+from vcan_tools import GatewayProcess, wait_for
+
+from kontronik_can_gw.config.keys import MqttConfig
+from kontronik_can_gw.desk.mqtt import client as mqtt_client
+from kontronik_can_gw.desk.mqtt.client import MqttClient
+from kontronik_can_gw.desk.mqtt.messages import Message
+
+MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin:/sbin")
+pytestmark = [
+    pytest.mark.extended,
+    pytest.mark.skipif(MOSQUITTO is None, reason="sudo apt-get install mosquitto"),
+]
+PATIENCE = 60.0
+ONLINE = "k/test/online"
+
+
+def free_port() -> int:
+    """A port that nobody listens on, below those that the kernel gives to connections."""
+    while True:
+        port = random.randrange(20_000, 30_000)
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+
+
+class Mosquitto:
+    """A broker with a configuration of its own, that can be stopped and started again on the same port."""
+
+    def __init__(
+        self, folder: Path, lines: str = "allow_anonymous true\n", port: int | None = None
+    ) -> None:
+        self.port = port or free_port()
+        self.address = f"127.0.0.1:{self.port}"
+        user = pwd.getpwuid(os.geteuid()).pw_name
+        text = f"listener {self.port} 127.0.0.1\n{lines}persistence false\nuser {user}\n"
+        self._file = written(folder / f"mosquitto{self.port}.conf", text)
+        self.start()
+
+    def start(self) -> None:
+        self._process = subprocess.Popen([str(MOSQUITTO), "-c", str(self._file)])
+        wait_for(self._listens, "mosquitto")
+
+    def _listens(self) -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
+
+    def freeze(self, frozen: bool) -> None:
+        """Let it stand still, as one that is overloaded."""
+        self._process.send_signal(signal.SIGSTOP if frozen else signal.SIGCONT)
+
+    def stop(self) -> None:
+        self.freeze(False)
+        self._process.terminate()
+        self._process.wait(PATIENCE)
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Mosquitto]:
+    made = Mosquitto(tmp_path)
+    yield made
+    made.stop()
+
+
+class Subscriber:
+    """paho, as somebody else uses it."""
+
+    def __init__(self, port: int, topic: str) -> None:
+        self.heard: list[paho.MQTTMessage] = []
+        self.client = paho.Client(CallbackAPIVersion.VERSION2)
+        subscribed = threading.Event()
+        self.client.on_connect = lambda client, *_: client.subscribe(topic, 1)
+        self.client.on_subscribe = lambda *_: subscribed.set()
+        self.client.on_message = lambda *message: self.heard.append(message[2])
+        self.client.connect("127.0.0.1", port)
+        self.client.loop_start()
+        assert subscribed.wait(PATIENCE)
+
+    def wait(self, topic: str, payload: bytes | None = None) -> paho.MQTTMessage:
+        """The first message of a topic (with this payload), as soon as it has come."""
+
+        def found() -> list[paho.MQTTMessage]:
+            heard = [message for message in list(self.heard) if message.topic == topic]
+            return [message for message in heard if payload in (None, message.payload)]
+
+        wait_for(found, lambda: f"{topic} {payload!r} in {[m.payload for m in self.heard]}")
+        return found()[0]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+# --- the client
+
+
+@contextlib.contextmanager
+def connecting(broker: MqttConfig) -> Iterator[MqttClient]:
+    client = MqttClient(broker, "test", ONLINE)
+    client.start()
+    try:
+        yield client
+    finally:
+        client.stop(PATIENCE)
+
+
+def to(port: int) -> MqttConfig:
+    return MqttConfig(broker=f"127.0.0.1:{port}")
+
+
+def waiting(client: MqttClient) -> int:
+    """Number of messages that are not sent yet."""
+    handed = sum(not mqtt_client._is_done(info) for info in client._handed.values())
+    return len(client._waiting) + handed
+
+
+def turning(client: MqttClient, condition: Callable[[], object]) -> None:
+    """Call ``turn`` as the command does, until something holds."""
+
+    def holds() -> object:
+        client.turn(time.monotonic_ns())
+        return condition()
+
+    wait_for(holds, lambda: client.problem)
+
+
+def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosquitto) -> None:
+    client = MqttClient(to(broker.port), "test", ONLINE)
+    for number in range(1000):
+        client.offer(Message("k/test/state", b"%d" % number))
+        client.offer(Message("k/test/other", b"%d" % number))
+    client.offer(Message("k/test/known", b"1", lasting=True, retain=True))
+    client.offer(Message("k/test/known", b"2", lasting=True, retain=True))
+    assert waiting(client) == 3
+    with Subscriber(broker.port, "k/test/#") as heard:
+        client.start()
+        turning(client, lambda: client.problem == "" and not waiting(client))
+        heard.wait("k/test/other", b"999")
+        client.stop(PATIENCE)
+        heard.wait(ONLINE, b"offline")
+    assert [(m.topic, m.payload) for m in heard.heard if not m.retain] == [
+        (ONLINE, b"online"),
+        ("k/test/known", b"2"),
+        ("k/test/state", b"999"),
+        ("k/test/other", b"999"),
+        (ONLINE, b"offline"),
+    ]
+
+
+def test_a_broker_that_takes_nothing_makes_nothing_pile_up(broker: Mosquitto) -> None:
+    """It stands still: what waits is replaced, what then comes is new, and the end comes in time."""
+    sent: list[bytes] = []
+    client = MqttClient(to(broker.port), "test", ONLINE)
+    with Subscriber(broker.port, "k/test/state") as heard:
+        client.start()
+        turning(client, lambda: client.problem == "")
+
+        def offer() -> None:
+            sent.append(b"%06d" % len(sent) + b"x" * 100_000)
+            client.offer(Message("k/test/state", sent[-1]))
+            client.turn(time.monotonic_ns())
+
+        broker.freeze(True)
+        for _ in range(100):
+            offer()
+        assert waiting(client) <= 3  # "online"; a state is with paho, and the newest waits
+        broker.freeze(False)
+        turning(client, lambda: not waiting(client))
+        heard.wait("k/test/state", sent[-1])
+        numbers = [int(message.payload[:6]) for message in heard.heard]
+        assert numbers == sorted(numbers)
+        broker.freeze(True)
+        for _ in range(100):
+            offer()
+        client.stop(0.3)  # it returns though nothing is taken
+        broker.freeze(False)
+
+
+def test_rubbish_instead_of_an_answer_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_client, "MIN_PAUSE_S", 0.01)
+    monkeypatch.setattr(mqtt_client, "MAX_PAUSE_S", 0.1)
+    rng = random.Random(1)
+    rubbish = [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x00" * 100, b"\x20\x7f\x00", bytes(range(256)), b""]  # fmt: skip
+    rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(6)]
+    rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(6)]
+    for answer in rubbish:
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            listener.settimeout(PATIENCE)
+            with connecting(to(listener.getsockname()[1])) as client:
+                for _ in range(2):  # it tries again
+                    with listener.accept()[0] as connection:
+                        connection.recv(4096)
+                        connection.sendall(answer)
+                turning(client, lambda: client.problem)
+
+
+def openssl(*words: object) -> None:
+    subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
+
+
+def test_tls_with_an_authority_of_ones_own_and_certificates_that_do_not_fit(tmp_path: Path) -> None:
+    authority, secret = tmp_path / "authority.pem", tmp_path / "authority.key"
+    new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
+    openssl("req", "-x509", *new, "-subj", "/CN=authority", "-keyout", secret, "-out", authority)
+    for name in ("localhost", "boat"):
+        key, request, made = (tmp_path / f"{name}.{end}" for end in ("key", "csr", "pem"))
+        more = written(tmp_path / "extension", f"subjectAltName=DNS:{name}\n")
+        openssl("req", *new, "-subj", f"/CN={name}", "-keyout", key, "-out", request)
+        signing = ("-CA", authority, "-CAkey", secret, "-CAcreateserial", "-extfile", more)
+        openssl("x509", "-req", "-in", request, *signing, "-out", made)
+    lines = f"allow_anonymous true\nrequire_certificate true\ncafile {authority}\n"
+    lines += f"certfile {tmp_path}/localhost.pem\nkeyfile {tmp_path}/localhost.key\n"
+    broker = Mosquitto(tmp_path, lines)
+    right = replace(to(0), broker=f"localhost:{broker.port}", tls=True, ca_file=str(authority))
+    right = replace(right, cert_file=f"{tmp_path}/boat.pem", key_file=f"{tmp_path}/boat.key")
+    try:
+        with connecting(right) as client:
+            turning(client, lambda: client.problem == "")
+            # more than a record of TLS, and than the kernel takes at once
+            client.offer(Message("k/tls/big", b"x" * 300_000, lasting=True))
+            turning(client, lambda: not waiting(client))
+        wrong: list[tuple[dict[str, Any], str]] = [
+            ({"ca_file": None}, "CERTIFICATE_VERIFY_FAILED"),
+            ({"broker": broker.address}, "not valid for '127.0.0.1'"),
+            ({"cert_file": None, "key_file": None}, ""),
+        ]
+        for change, said in wrong:
+            with connecting(replace(right, **change)) as client:
+                turning(client, lambda: client.problem)
+                assert said in (client.problem or "")
+    finally:
+        broker.stop()
+
+
+# --- the command, on a bus that is quiet
+
+Live = Callable[..., GatewayProcess]
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[Live]:
+    """Starts the program for a gateway of this name."""
+    started = []
+
+    def start(name: str, address: str, more: str = "") -> GatewayProcess:
+        text = '[can]\ninterface = "virtual"\nchannel = "mqtt"\n[[esc]]\nport = "/dev/ttyS0"\n'
+        text += f'[mqtt]\nbroker = "{address}"\ngateway = "{name}"\nrate = 20.0\n{more}'
+        started.append(GatewayProcess(written(tmp_path / "gateway.toml", text), command="mqtt"))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.kill()
+
+
+def test_the_broker_keeps_online_and_offline_and_the_service_manager_is_reported(
+    live: Live, broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said, state = "", "kontronik/sd/online"
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", "1000000")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(PATIENCE)
+        program = live("sd", broker.address)
+        while "STATUS=connected" not in said or said.count("WATCHDOG=1") < 5:
+            said += manager.recv(4096).decode()
+        with Subscriber(broker.port, state) as heard:
+            assert heard.wait(state, b"online").retain
+        assert program.end() == 0
+        with Subscriber(broker.port, state) as heard:
+            assert heard.wait(state, b"offline").retain
+        while "STOPPING=1" not in said:
+            said += manager.recv(4096).decode()
+    assert said.startswith("READY=1")
+
+
+def test_the_last_will_says_offline_where_it_was_killed(live: Live, broker: Mosquitto) -> None:
+    state = "kontronik/killed/online"
+    program = live("killed", broker.address)
+    with Subscriber(broker.port, state) as heard:
+        heard.wait(state, b"online")
+        program.end(signal.SIGKILL)
+        heard.wait(state, b"offline")
+    with Subscriber(broker.port, state) as heard:
+        assert heard.wait(state, b"offline").retain
+
+
+def test_a_broker_that_comes_late_goes_and_comes_again(live: Live, tmp_path: Path) -> None:
+    port = free_port()
+    program = live("late", f"127.0.0.1:{port}")
+    program.wait_for_line(f"MQTT broker 127.0.0.1:{port}: cannot be reached: Connection refused")
+    broker = Mosquitto(tmp_path, port=port)
+    try:
+        program.wait_for_line("connected as kontronik-can-gw-late")
+        broker.stop()
+        program.wait_for_line("the connection was lost")
+        broker.start()
+        with Subscriber(port, "kontronik/late/#") as heard:
+            heard.wait("kontronik/late/online", b"online")
+            heard.wait("kontronik/late/esc1/available", b"offline")  # the broker had lost it
+            heard.wait("kontronik/late/esc1/state")
+        program.wait_for_line(": connected, after")
+        assert program.log.count("Connection refused") <= 3  # not one line an attempt
+        assert program.end() == 0
+    finally:
+        broker.stop()
+    assert "Traceback" not in program.log
+
+
+def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
+    live: Live, tmp_path: Path
+) -> None:
+    users, secret = tmp_path / "users", written(tmp_path / "password", "wrong donkey\nmore\n")
+    command = ["mosquitto_passwd", "-b", "-c", str(users), "boat", "right horse"]
+    subprocess.run(command, check=True, capture_output=True)
+    broker = Mosquitto(tmp_path, f"allow_anonymous false\npassword_file {users}\n")
+    try:
+        program = live("pw", broker.address, 'username = "boat"\npassword_file = "password"\n')
+        refusal = "refuses the connection: not authorized. Check username, password_file"
+        program.wait_for_line(refusal)
+        secret.write_text("right horse\n")
+        program.wait_for_line(f"MQTT broker {broker.address}: connected")
+        shown = Path(f"/proc/{program.process.pid}/cmdline").read_text()
+        assert program.end() == 0
+        assert program.log.count("refuses the connection") == 1
+        for text in ("donkey", "horse"):
+            assert text not in program.log + shown
+    finally:
+        broker.stop()
