@@ -257,10 +257,9 @@ class LssSlave:
         elif service == Service.CONFIGURE_BIT_TIMING:
             self._answer(service, BIT_TIMING_NOT_SUPPORTED)  # the bit rate belongs to the system
         elif service == Service.STORE:
-            # noted before the host is asked, which may know the result at once
-            self._stores.append(True)
-            if not self._host.store_configuration():
-                self._stores.pop()
+            if self._host.store_configuration():
+                self._stores.append(True)
+            else:
                 self._answer(service, STORE_NOT_SUPPORTED)
         elif service in _INQUIRE:
             part = self._host.identity[service - _INQUIRE[0]]
