@@ -37,8 +37,9 @@ _NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTI
 _ALL_OR_COMMUNICATION, _ALL_OR_APPLICATION = (1, 2), (1, 3)  # sub-indices
 _MAX_SAVES = 4
 
-_HEADER_START = re.compile(rb'\{"format":"kontronik-can-gw parameters","version":([0-9]{1,9})[,}]')
-_CRC = re.compile(rb'"crc32":"([0-9A-F]{8})"\}')
+_HEADER = re.compile(
+    rb'\{"format":"kontronik-can-gw parameters","version":([0-9]{1,9})[,}](?:"crc32":"([0-9A-F]{8})"\}\n)?'
+)
 
 
 @dataclass(frozen=True)
@@ -95,18 +96,15 @@ def decode(data: bytes) -> Stored:
     """Read the file's text. ValueError with the reason for everything that ``encode`` of this version does not write."""
     if not data:
         raise ValueError("the file is empty")
-    start = _HEADER_START.match(data)
-    if start is None:
+    header = _HEADER.match(data)
+    if header is None:
         raise ValueError("the first line is not that of a parameter file")
-    if int(start[1]) != VERSION:
+    if (version := int(header[1])) != VERSION:
         raise ValueError(
-            f"format version {int(start[1])} is unknown, this program knows version {VERSION}"
+            f"format version {version} is unknown, this program knows version {VERSION}"
         )
-    header, _, body = data.partition(b"\n")
-    crc = _CRC.fullmatch(header, start.end())
-    if crc is None:
-        raise ValueError("the first line is damaged")
-    if int(crc[1], 16) != zlib.crc32(body):
+    body = data[header.end() :]
+    if int(header[2] or b"-1", 16) != zlib.crc32(body):
         raise ValueError("the content does not fit its CRC-32: damaged or truncated")
     try:
         content = json.loads(body)
