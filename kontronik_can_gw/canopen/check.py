@@ -5,22 +5,22 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.canopen.cob_ids import SDO_ANSWER, SDO_REQUEST, default_ids
-from kontronik_can_gw.canopen.data_types import (
+from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.eds import (
     SIGNED,
     TYPE_BITS,
     TYPE_NAMES,
     WHOLE,
+    Eds,
+    Entry,
     range_of,
 )
-from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.node_settings import NodeSettings, configured_settings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.objects import BINDINGS
-from kontronik_can_gw.canopen.parameters import CHECKED
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAPPING, MAX_TPDOS
+from kontronik_can_gw.canopen.storage import CHECKED, Stored
 from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROFILE
-from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import EscSettings

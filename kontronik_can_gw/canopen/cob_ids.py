@@ -1,12 +1,23 @@
-"""COB-IDs: the predefined connection set and the restricted ones (CiA 301, 7.3.3 and 7.3.5)."""
+"""COB-IDs: predefined and restricted ones (CiA 301, 7.3.3 and 7.3.5), which of them a node uses, and what takes the frames that come."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
+from kontronik_can_gw.canopen import nmt
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
+from kontronik_can_gw.canopen.nmt import Command
+from kontronik_can_gw.node_state import UNCONFIGURED
 
+if TYPE_CHECKING:
+    from kontronik_can_gw.canopen.node import Node
+
+FrameTaker = Callable[[bytes, int, int], None]
+"""Is given a frame's data, the time, and when the frame came."""
 Taken = Callable[[int, object], bool]
-"""Whether another user than this has a COB-ID, see ``uses.Use``."""
+"""Whether another user than this has a COB-ID, see ``Use``."""
 
 NMT, EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
 """Those of EMERGENCY and after are first ids: the node-ID is added."""
@@ -46,3 +57,71 @@ def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int
             cob_id = int(variable.default(node_id))
             if not cob_id & INVALID_BIT:
                 yield index, sub, cob_id & 0x7FF
+
+
+class Use(NamedTuple):
+    """A COB-ID that a node uses."""
+
+    cob_id: int
+    what: str
+    user: object = None
+    """The service for which a master can choose it; that of SYNC is one for all nodes. None: it cannot be chosen."""
+    own: bool = False
+    """No other device on the bus may send with it."""
+
+
+def uses(node: "Node") -> Iterator[Use]:
+    """All COB-IDs that a node sends with or listens to as its own."""
+    yield Use(NMT, "NMT")
+    yield Use(LSS_REQUEST, "LSS")
+    yield Use(LSS_ANSWER, "LSS")
+    if node.node_id == UNCONFIGURED:
+        return
+    name = f"CANopen node {node.node_id}"
+    yield Use(node.sync.cob_id, "SYNC", SYNC)
+    yield Use(SDO_REQUEST + node.node_id, f"SDO requests to {name}")
+    yield Use(HEARTBEAT + node.node_id, f"the heartbeat of {name}", own=True)
+    yield Use(SDO_ANSWER + node.node_id, f"SDO answers of {name}", own=True)
+    emergencies = node.emergencies
+    if not emergencies.cob_id & INVALID_BIT:
+        yield Use(emergencies.cob_id & 0x7FF, f"emergencies of {name}", emergencies, own=True)
+    for tpdo in node.tpdos:
+        if tpdo.valid:
+            yield Use(tpdo.cob_id, f"TPDO {tpdo.number + 1} of {name}", tpdo, own=True)
+
+
+def routes(node: "Node") -> Iterator[tuple[int, FrameTaker]]:
+    """COB-IDs the node listens to, those of heartbeats that it watches too, and what takes their frames."""
+    yield LSS_REQUEST, lambda data, now, _at: node.lss.receive(data, now)
+    if node.node_id != UNCONFIGURED:
+        yield NMT, partial(_on_nmt, node)
+        yield node.sync.cob_id, partial(_on_sync, node)
+        yield SDO_REQUEST + node.node_id, partial(_on_sdo, node)
+        for node_id in node.consumer.node_ids:
+            yield HEARTBEAT + node_id, partial(node.consumer.receive, node_id)
+
+
+def _on_nmt(node: "Node", data: bytes, now: int, _at: int) -> None:
+    match nmt.command(data, node.node_id):
+        case None:
+            pass
+        case Command.RESET_NODE:
+            node.reset_node(now)
+        case Command.RESET_COMMUNICATION:
+            node.reset_communication(now)
+        case command:
+            node.nmt.enter(nmt.STATE_AFTER[command], now)
+
+
+def _on_sdo(node: "Node", data: bytes, now: int, _at: int) -> None:
+    if node.nmt.communicates:
+        node.sdo.receive(data, now)
+
+
+def _on_sync(node: "Node", data: bytes, now: int, at: int) -> None:
+    if not node.nmt.communicates:
+        return
+    counter = node.sync.counter(data)
+    node.emergencies.set(GatewayError.SYNC_LENGTH, counter is None, now)
+    if counter is not None:
+        node.tpdos.on_sync(counter, now, at)

@@ -4,10 +4,14 @@ import re
 from collections.abc import Container, Mapping
 from pathlib import PurePath
 
-from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, OCTET_STRING, TYPE_BITS, UNICODE_STRING
-from kontronik_can_gw.canopen.eds import Eds, Entry
-from kontronik_can_gw.canopen.eds_sections import (
+from kontronik_can_gw.canopen.eds import (
+    DOMAIN_TYPE,
     OBJECT,
+    OCTET_STRING,
+    TYPE_BITS,
+    UNICODE_STRING,
+    Eds,
+    Entry,
     Section,
     bare,
     integer,

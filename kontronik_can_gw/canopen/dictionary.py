@@ -6,8 +6,7 @@ Built from an EDS. A variable is either plain storage or bound: ``read`` then gi
 from collections.abc import Callable, Iterator, Mapping
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.data_types import CODECS, DOMAIN_TYPE
-from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.eds import CODECS, DOMAIN_TYPE, Eds, Entry
 from kontronik_can_gw.canopen.objects import Bound
 
 Value = int | float | bytes

@@ -4,30 +4,148 @@ Refused is what cannot be read, or only in several ways: limits, types, defaults
 key and remedy, one mistake of each section at once. What concerns other readers of the file only (lists of objects, counts, ObjectType,
 [DeviceInfo]) is not looked at. ``check`` judges whether a node can be built from the entries.
 
-Choices where CiA 306 leaves room: an object has sub-indices where it has sections of them, else it is a variable; section names that
-it does not know are ignored. Types of 24, 40, 48 and 56 bits and times are refused.
+Choices where CiA 306 leaves room: section and key names in any case; LF as well as CR LF; a key without a value is a key that is not
+there; an object has sub-indices where it has sections of them, else it is a variable; section names that it does not know are ignored.
+Types of 24, 40, 48 and 56 bits and times are refused.
 """
 
 import re
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from kontronik_can_gw.canopen.data_types import (
-    BOOLEAN,
-    DOMAIN_TYPE,
-    FLOATS,
-    OCTET_STRING,
-    REAL32,
-    SIGNED,
-    TYPE_NAMES,
-    UNICODE_STRING,
-    VISIBLE_STRING,
-    WHOLE,
-    range_of,
-)
-from kontronik_can_gw.canopen.eds_sections import OBJECT, Section, integer, read_sections
 from kontronik_can_gw.errors import UserError
+
+# --- data types of CiA 301 (table 44) that the object dictionary can have
+
+BOOLEAN = 0x01
+U8, U16, U32 = 0x05, 0x06, 0x07
+VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN_TYPE = 0x09, 0x0A, 0x0B, 0x0F
+REAL32, REAL64 = 0x08, 0x11
+_TYPES = {
+    BOOLEAN: ("BOOLEAN", "?"),
+    0x02: ("INTEGER8", "b"),
+    0x03: ("INTEGER16", "h"),
+    0x04: ("INTEGER32", "i"),
+    U8: ("UNSIGNED8", "B"),
+    U16: ("UNSIGNED16", "H"),
+    U32: ("UNSIGNED32", "I"),
+    REAL32: ("REAL32", "f"),
+    VISIBLE_STRING: ("VISIBLE_STRING", ""),
+    OCTET_STRING: ("OCTET_STRING", ""),
+    UNICODE_STRING: ("UNICODE_STRING", ""),
+    DOMAIN_TYPE: ("DOMAIN", ""),
+    REAL64: ("REAL64", "d"),
+    0x15: ("INTEGER64", "q"),
+    0x1B: ("UNSIGNED64", "Q"),
+}
+"""Name, and of a number its struct code."""
+TYPE_NAMES = {code: name for code, (name, _) in _TYPES.items()}
+SIGNED = frozenset(code for code, (_, form) in _TYPES.items() if form and form in "bhiq")
+FLOATS = frozenset({REAL32, REAL64})
+CODECS = {code: struct.Struct(f"<{form}") for code, (_, form) in _TYPES.items() if form}
+"""Of the number types, by their codes."""
+TYPE_BITS = {code: 8 * found.size for code, found in CODECS.items()} | {BOOLEAN: 1}
+"""Bits of a number type."""
+WHOLE = TYPE_BITS.keys() - FLOATS - {BOOLEAN}
+"""The types of whole numbers."""
+
+
+def range_of(data_type: int) -> tuple[int, int]:
+    """Smallest and greatest value of a type of whole numbers, or BOOLEAN."""
+    bits = TYPE_BITS.get(data_type, 0)
+    if data_type in SIGNED:
+        return -(1 << bits - 1), (1 << bits - 1) - 1
+    return 0, (1 << bits) - 1
+
+
+# --- the text: sections, keys, values, there and back (CiA 306, clause 4)
+
+_HEADING = re.compile(r"\s*\[([^\]]*)\]")
+_COMMENT = re.compile(r"(?:^|\s);.*|^\s*#.*")
+OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
+"""The section of an object or of one of its sub-indices."""
+_NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
+
+
+@dataclass
+class Section:
+    """One section: its name as written, and by keys in lower case each key as written and its value."""
+
+    name: str
+    keys: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+    def get(self, key: str) -> str:
+        return self.keys.get(key.lower(), ("", ""))[1]
+
+    def set(self, key: str, value: object) -> None:
+        self.keys[key.lower()] = key, str(value)
+
+    def said(self, key: str) -> str:
+        """A key as a mistake quotes it."""
+        return f"{key}={self.get(key)}"
+
+    def number(self, key: str, otherwise: int = 0) -> int:
+        """The number of a key; ``otherwise`` where it has no value. ValueError for what is no number."""
+        text = self.get(key)
+        found = integer(text) if text else otherwise
+        if found is None:
+            raise ValueError(f"{self.said(key)}: not a number. Write 0x1F or 31.")
+        return found
+
+
+def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
+    """The sections by their names in lower case, those of objects in one spelling. What is wrong is added to ``problems``."""
+    found: dict[str, Section] = {}
+    section, where = Section(""), ""
+    for number, raw in enumerate(data.split(b"\n"), 1):
+        if not raw.isascii():
+            text = raw.decode("ascii", "backslashreplace").strip()
+            problems.append(f"line {number} is not ASCII: {text}. Write it in plain letters.")
+        line = raw.decode("ascii", "replace")
+        if heading := _HEADING.match(line):
+            section = Section(heading[1].strip())
+            where = f"[{section.name}] "
+            if found.setdefault(_spelling(section.name), section) is not section:
+                problems.append(f"{where}this section is there twice. Remove one.")
+        elif text := bare(line):
+            key, equals, value = (part.strip() for part in text.partition("="))
+            if not (equals and key and where):
+                what = f"'{text}' is neither a section, nor key=value, nor a comment after ';'."
+                problems.append(where + what)
+            elif key.lower() in section.keys:
+                problems.append(f"{where}{key}: this key is there twice. Remove one.")
+            else:
+                section.set(key, value)
+    return found
+
+
+def text_of(sections: Mapping[str, Section]) -> str:
+    """The text of sections, without comments; lines end in CR LF."""
+    lines: list[str] = []
+    for section in sections.values():
+        lines += [f"[{section.name}]", *(f"{key}={value}" for key, value in section.keys.values())]
+        lines.append("")
+    return "\r\n".join(lines)
+
+
+def bare(line: str) -> str:
+    """A line without comment and surrounding blanks."""
+    return _COMMENT.sub("", line).strip()
+
+
+def integer(text: str) -> int | None:
+    """A decimal or hexadecimal number; None for any other text."""
+    return int(text, 0) if _NUMBER.match(text) else None
+
+
+def _spelling(name: str) -> str:
+    """``1018SUB01`` is ``1018sub1``."""
+    match = OBJECT.match(name)
+    return f"{match[1]}sub{int(match[2], 16):x}".lower() if match and match[2] else name.lower()
+
+
+# --- entries
 
 MAX_BYTES = 2_000_000
 """Of an EDS; the shipped one has 60 kB, 250 entries, 2 200 lines."""
@@ -204,11 +322,11 @@ def _default(section: Section, data_type: int) -> tuple[int | float | bytes | No
 
 def _real(text: str, data_type: int) -> float:
     """A decimal, or the hexadecimal bits of the IEEE number that CiA 306 writes."""
+    codec = CODECS[data_type]
     try:
         if "x" not in text.lower():
             return float(text)
-        size, code = (4, ">f") if data_type == REAL32 else (8, ">d")
-        number: float = struct.unpack(code, int(text, 16).to_bytes(size, "big"))[0]
+        number: float = codec.unpack(int(text, 16).to_bytes(codec.size, "little"))[0]
         return number
     except (ValueError, OverflowError):
         raise ValueError(f"DefaultValue={text}: not a number. Write 1.5.") from None

@@ -21,14 +21,11 @@ class EscObjects:
     def __init__(
         self, node: "Node", gateway: GatewayStatus, changed: Callable[[EscSettings], None]
     ) -> None:
-        self._dictionary = dictionary = node.dictionary
-        self._esc = esc = node.esc
+        dictionary, esc = node.dictionary, node.esc
+        self._node, self._esc = node, esc
         self._base = esc.settings
         self._errors = esc.protocol.by_name.get("operating_errors")
         self._gateway = gateway
-        self._emergencies = node.emergencies
-        self._nmt = node.nmt
-        self._expected = node.settings.device
         self._changed = changed
         self._live = False  # for the edge of 1029h:2
         dictionary.bind(0x1002, read=self._status_register)
@@ -41,10 +38,10 @@ class EscObjects:
 
     def apply_settings(self, now: int) -> None:
         """Take over 2100h."""
-        self._emergencies.mask = self._dictionary.number(at.SETTINGS, 6)
+        self._node.emergencies.mask = self._node.dictionary.number(at.SETTINGS, 6)
         if self._esc.live is not None and self._errors is not None:
-            self._emergencies.set_word(self._errors.of(self._esc.live), now, force=True)
-        settings = esc_settings(self._dictionary, self._base)
+            self._node.emergencies.set_word(self._errors.of(self._esc.live), now, force=True)
+        settings = esc_settings(self._node.dictionary, self._base)
         if settings != self._esc.settings:
             self._changed(settings)
 
@@ -52,12 +49,12 @@ class EscObjects:
         """Something of the ESC changed: bits of telemetry.Event."""
         live = self._esc.live
         if events & Event.STATE and live is not None and self._errors is not None:
-            self._emergencies.set_word(self._errors.of(live), now)
+            self._node.emergencies.set_word(self._errors.of(live), now)
         if events & (Event.LINK | Event.INFO) or self._live is (live is None):
             self._follow_link(events, now)
 
     def _follow_link(self, events: int, now: int) -> None:
-        esc, found = self._esc, self._emergencies
+        esc, found, expected = self._esc, self._node.emergencies, self._node.settings.device
         link = esc.link
         if events & Event.LINK:
             if link is LinkState.PORT_ERROR:
@@ -65,11 +62,11 @@ class EscObjects:
             found.set(GatewayError.TELEMETRY_LOST, link is LinkState.LOST, now)
             found.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
             found.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
-        if events & Event.INFO and esc.info is not None and self._expected is not None:
+        if events & Event.INFO and esc.info is not None and expected is not None:
             device = esc.protocol.value("device_raw", esc.info)
-            found.set(GatewayError.OTHER_DEVICE, device != self._expected, now)
+            found.set(GatewayError.OTHER_DEVICE, device != expected, now)
         if self._live and esc.live is None and link in (LinkState.LOST, LinkState.PORT_ERROR):
-            self._nmt.behave(2, now)
+            self._node.nmt.behave(2, now)
         self._live = esc.live is not None
 
     # --- objects

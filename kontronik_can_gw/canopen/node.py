@@ -14,14 +14,11 @@ from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects
-from kontronik_can_gw.canopen.heartbeat import Consumer, Producer
-from kontronik_can_gw.canopen.identity import Identity
-from kontronik_can_gw.canopen.lss import LssSlave
-from kontronik_can_gw.canopen.nmt import Nmt
-from kontronik_can_gw.canopen.parameters import Parameters
+from kontronik_can_gw.canopen.lss import Identity, LssSlave
+from kontronik_can_gw.canopen.nmt import Consumer, Nmt, Producer
 from kontronik_can_gw.canopen.pdo import SyncConsumer, Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
-from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.canopen.storage import Parameters, Stored
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus

@@ -9,7 +9,10 @@ from kontronik_can_gw.canopen.cob_ids import (
     LSS_REQUEST,
     NMT,
     OF_NODE_ID,
+    FrameTaker,
     default_ids,
+    routes,
+    uses,
 )
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
@@ -19,7 +22,6 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.canopen.uses import FrameTaker, routes, uses
 from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds
+from kontronik_can_gw.canopen.cob_ids import Use, uses
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, decode
-from kontronik_can_gw.canopen.uses import Use, uses
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings

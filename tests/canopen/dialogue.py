@@ -291,6 +291,12 @@ class Bench(Talker):
                 assert self.gateway.nodes is not None
                 listened_to = sorted(self.gateway.nodes.receive_ids)
                 return f"listens {' '.join(f'{cob_id:03X}' for cob_id in listened_to)}"
+            case "slave", _:
+                return f"slave {'configuration' if self.nodes[0].lss.configuring else 'waiting'}"
+            case "node-id", _:
+                return f"node-id {self.nodes[0].node_id} {self.nodes[0].identity.pending_node_id}"
+            case "reset", []:
+                self.nodes[0].lss.reset()
             case "rejected", [node, *_]:
                 keys = sorted(self.nodes[int(node) - 1].parameters.rejected)
                 return " ".join(["rejected", node, *map(_name, keys)])
@@ -372,6 +378,8 @@ def bench_of(options: Sequence[str]) -> Bench:
             case ["tpdo", number, _, kind, _, inhibit, _, timer, _, *mapped]:
                 entries = [int(each, 16) for each in mapped]
                 changes.update(tpdo(int(number), int(kind), int(inhibit), int(timer), *entries))
+            case ["identity" | "active", *_]:
+                pass
             case ["boot"]:
                 arguments["boot"] = False
             case ["started"]:
@@ -403,6 +411,15 @@ def bench_of(options: Sequence[str]) -> Bench:
             case _:
                 raise AssertionError(f"what is 'with {option}'?")
     bench = Bench(changes={**kept, **changes}, **arguments)
+    for option in options:
+        match option.split():
+            case ["identity", *parts]:
+                for sub, part in enumerate(parts, 1):
+                    variable = bench.nodes[0].dictionary.find(0x1018, sub)
+                    variable.power_on = variable.value = int(part, 16)
+            case ["active", "and", "pending", active, pending]:
+                bench.nodes[0].identity.active_node_id = int(active)
+                bench.nodes[0].parameters.set_node_id = int(pending)
     return bench.start() if "started" in options else bench
 
 

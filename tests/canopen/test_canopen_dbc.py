@@ -17,7 +17,7 @@ from packer_oracle import ERROR_BITS, KNOWN, pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.uses import uses
+from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.writer import copies_text

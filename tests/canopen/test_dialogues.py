@@ -1,15 +1,13 @@
-"""Dialogues from files with CANopen nodes, the SDO server alone and LSS slaves. The format: dialogues/README.md."""
+"""Dialogues from files with CANopen nodes and the SDO server alone. The format: dialogues/README.md."""
 
 from pathlib import Path
 
 import pytest
 from dialogue import bench_of
-from lss_bench import Talk
 from script import Dialogue, play_lines, read_dialogues
 from sdo_bench import sdo_bench_of
 
-FILES = sorted(Path(__file__).parent.glob("*dialogues/*.txt"))
-MAKERS = {"sdo": sdo_bench_of, "lss": Talk}
+FILES = sorted(Path(__file__).parent.glob("dialogues/*.txt"))
 
 
 @pytest.mark.parametrize(
@@ -18,5 +16,5 @@ MAKERS = {"sdo": sdo_bench_of, "lss": Talk}
     ids=lambda dialogue: dialogue.name,
 )
 def test_dialogue(dialogue: Dialogue) -> None:
-    make = MAKERS.get(dialogue.name.partition(":")[0], bench_of)
+    make = sdo_bench_of if dialogue.name.startswith("sdo:") else bench_of
     play_lines(make(dialogue.options), dialogue.lines)

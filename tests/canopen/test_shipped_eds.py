@@ -1,6 +1,5 @@
 """The shipped EDS against the rows of the sheet, the configuration's ranges and rules of fussy readers; what others make of it."""
 
-import io
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields
@@ -155,29 +154,6 @@ def test_the_mirrors_can_be_dropped(shipped: Eds, tmp_path: Path) -> None:
     file = tmp_path / "mine.eds"
     file.write_bytes(shorter)
     assert dcfchk(file, 1) == ""
-
-
-def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
-    values: dict[tuple[int, int], int | float | bytes] = {
-        (0x1008, 0): b"left motor",
-        (0x100A, 0): b"1.2.3",
-        (0x1017, 0): 500,
-        (0x1018, 4): 0xDEADBEEF,
-        (0x1800, 1): 0x40000185,
-        (0x2001, 1): -4711,
-        (0x2100, 1): 7,
-        (0x6079, 0): 24420,
-    }
-    text = dcf.dcf(shipped, 5, 250_000, values, "left", "left.dcf")
-    assert text.count("\r\n") == text.count("\n")
-    source = io.StringIO(text)
-    source.name = "left.dcf"
-    dictionary = canopen.import_od(source)
-    assert (dictionary.node_id, dictionary.bitrate) == (5, 250_000)
-    read_back = {(v.index, v.subindex): as_bytes(v.value) for v in variables(dictionary)}
-    assert {at: value for at, value in read_back.items() if value is not None} == values
-    cob_id = dictionary.get_variable(0x1802, 1)
-    assert cob_id is not None and cob_id.default == 0x40000385
 
 
 # --- readers of others ----------------------------------------------------------------------------------------------

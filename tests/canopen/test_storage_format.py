@@ -83,7 +83,7 @@ DAMAGED = [
     (with_crc(content(), version=2), "version 2 is unknown"),
     (FUTURE, "version 12 is unknown"),
     (with_crc(content(), version='"1"'), "first line"),
-    (with_crc(content()).replace(b"\n", b"\r\n"), "first line is damaged"),
+    (with_crc(content()).replace(b"\n", b"\r\n"), "CRC-32"),
 ]
 FORM = "form"  # the reason for all that has the right CRC
 OTHER_CONTENT: list[Any] = [

@@ -14,7 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
-from kontronik_can_gw.canopen.data_types import TYPE_NAMES
+from kontronik_can_gw.canopen.eds import TYPE_NAMES
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.describe.markdown import Table, markdown

@@ -5,14 +5,13 @@ from fractions import Fraction
 from pathlib import PurePath
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.data_types import TYPE_NAMES
+from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.eds import TYPE_NAMES, Eds, Entry
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
-from kontronik_can_gw.canopen.uses import uses
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.describe.tables import meanings_of, number, protocols_of
 from kontronik_can_gw.esc.telemetry import MS, EscSettings

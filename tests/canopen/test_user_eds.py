@@ -1,14 +1,18 @@
-"""An EDS with a mistake is refused by file, section, key and remedy, all mistakes at once; what CiA 306 allows is taken."""
+"""An EDS of a user: a mistake is refused by file, section, key and remedy, all at once; what CiA 306 allows is taken, and what it drops
+behaves as the shipped default.
+"""
 
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import eds_text
 import pytest
-from dialogue import shipped_eds
-from eds_text import SHIPPED, variable
+from dialogue import Bench, info, live, shipped_eds
+from dialogue import changed as changed_eds
+from eds_text import SHIPPED, variable, with_key
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,11 +29,11 @@ def with_object(content: str, index: int = 0x2200) -> str:
     return eds_text.with_object(SHIPPED, index, content)
 
 
-def problems(text: str | bytes) -> tuple[str, ...]:
-    """What is wrong with an EDS that nodes 1 and 2 are to have, () for nothing."""
+def problems(text: str | bytes, *node_ids: int) -> tuple[str, ...]:
+    """What is wrong with an EDS that these nodes (none: 1 and 2) are to have, () for nothing."""
     data = text if isinstance(text, bytes) else text.encode("ascii")
     try:
-        check_eds(reader.load(data, "mine.eds"), shipped_eds(), [EscSettings()], (1, 2))
+        check_eds(reader.load(data, "mine.eds"), shipped_eds(), [EscSettings()], node_ids or (1, 2))
     except UserError as error:
         return error.problems
     return ()
@@ -112,6 +116,28 @@ def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject)
         assert problem.startswith("mine.eds: ") and problem.endswith((".", ";'."))
 
 
+def test_cob_ids_of_one_node_only_and_of_what_is_not_in_the_eds_are_judged() -> None:
+    text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080")
+    (said,) = problems(dcf.without(text.encode(), {0x1014}), 1)
+    assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in said
+    text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
+    assert problems(text, 1) == ()
+    said = problems(text, 3)[0]
+    assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in said
+    assert problems(SHIPPED, *range(1, 128)) == ()
+
+
+def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
+    text = SHIPPED
+    for key, value in (("DataType", "0x0005"), ("HighLimit", "0xFF"), ("DefaultValue", "0xFA")):
+        text = with_key(text, "2100sub4", key, value)
+    assert problems(text, 1) == ()
+    eds = reader.load(text.encode(), "my.eds")
+    said = "2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"
+    with pytest.raises(UserError, match=said):
+        check_eds(eds, shipped_eds(), [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
+
+
 # --- what is allowed ------------------------------------------------------------------------------------------------
 
 
@@ -174,3 +200,94 @@ def test_a_text_that_a_dcf_cannot_hold_is_named(value: bytes) -> None:
         UserError, match=r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot stand"
     ):
         dcf.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left", "left.dcf")
+
+
+# --- what is dropped -------------------------------------------------------------------------------------------------
+
+DATA = SHIPPED.encode()
+PDOS = frozenset(range(0x1800, 0x1C00))
+OPTIONAL = sorted(
+    {entry.index for entry in shipped_eds().entries} - PDOS - {0x1000, 0x1001, 0x1018}
+)
+EVERY_SYNC = {(0x1800, 2): {"default": 1}}
+LSS_INQUIRY = ("5A", "5B", "5C", "5D", "5E")
+
+
+def pdos_with(index: int) -> frozenset[int]:
+    """The objects of PDOs that map something of an object: they go with it."""
+    return frozenset(
+        entry.index + offset
+        for entry in shipped_eds().entries
+        if entry.index >> 9 == 0x1A00 >> 9
+        and entry.sub
+        and isinstance(entry.default, int)
+        and entry.default >> 16 == index
+        for offset in (0, -0x200)
+    )
+
+
+def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
+    """What a node says, with its times, to a session in which every service has something to do. No SDO: that shows what is there."""
+    eds = changed_eds(reader.load(dcf.without(DATA, dropped), "my.eds"), EVERY_SYNC)
+    check_eds(eds, shipped_eds(), [EscSettings()])
+    bench = Bench(eds=eds, boot=False, self_start=self_start)
+    bench.can_state("ERROR_ACTIVE")
+    bench.put(0, "01 00")
+    for number in range(60):
+        bench.wait(10)
+        errors = (0, 1 << 17, 1 | 1 << 17, 0)[number // 15]
+        bench.uart(live(battery_voltage=2000 + number, operating_errors=errors))
+        if number == 5:
+            bench.uart(info(cell_count=6))
+        if number % 7 == 0:
+            bench.put(0x080, b"" if number != 21 else b"\x01")
+        if number % 9 == 0:
+            bench.put(0x702, "05")
+    bench.wait(1500)  # heartbeats; telemetry is lost
+    bench.uart(live()[:-1] + b"\xff")
+    bench.uart(live())
+    for name in ("BUS_OFF", "ERROR_ACTIVE"):
+        bench.can_state(name)
+        bench.wait(300)
+    bench.put(0x7E5, "04 01 00 00 00 00 00 00")
+    for service in LSS_INQUIRY:
+        bench.put(0x7E5, service + 7 * " 00")
+    bench.put(0, "82 00")
+    bench.wait(2000)
+    for index in dropped:
+        assert bench.read(index) == bench.write(index, 0, 0, size=1) == 0x06020000
+    for entry in eds.entries:
+        bench.read(entry.index, entry.sub)
+    return [f"{time} {frame.can_id:03X} {frame.data.hex()}" for time, frame in bench.heard]
+
+
+@cache
+def whole(dropped: frozenset[int] = frozenset()) -> list[str]:
+    return behaviour(dropped)
+
+
+@pytest.mark.parametrize("index", OPTIONAL, ids=lambda index: f"{index:04X}h")
+def test_a_dropped_object_leaves_the_behaviour_of_the_shipped_default(index: int) -> None:
+    pdos = pdos_with(index)
+    assert behaviour(pdos | {index}) == whole(pdos)
+
+
+def test_all_dropped_at_once_leave_it_too() -> None:
+    pdos = frozenset(index for index in shipped_eds().object_names if index in PDOS)
+    assert behaviour(frozenset(OPTIONAL) | pdos) == whole(pdos)
+    assert behaviour(frozenset(OPTIONAL) | pdos, self_start=True) == behaviour(
+        pdos, self_start=True
+    )
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_only_the_objects_of_a_pdo_take_it_away(number: int) -> None:
+    left = [line for line in whole() if line.split()[1] != f"{number + 1}81"]
+    assert behaviour(frozenset({0x1800 + number, 0x1A00 + number})) == left
+
+
+def test_the_session_hears_every_service() -> None:
+    heard = {line.split()[1] for line in whole()}
+    assert heard == {"701", "081", "181", "281", "381", "481", "7E4"}
+    codes = {line.split()[2][:4] for line in whole() if line.split()[1] == "081"}
+    assert codes == {"0000", "2032", "4081", "4082", "1075"}
