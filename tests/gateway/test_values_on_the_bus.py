@@ -1,18 +1,15 @@
 """What a gateway sends at a known time, from bytes to frames: values that are easily taken for others, or not sent at all."""
 
 import pytest
+from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.signals.plan import Layout
 
 EVENT = 'BA_ "GenMsgSendType" BO_ 256 1;\n'
 ON_CHANGE = 'BA_ "GenMsgSendType" BO_ 256 2;\n'
@@ -26,11 +23,6 @@ def text_of(signal: Sig, more: str = EVENT) -> str:
     return dbc_text([Msg("M", 256, 8, [signal])], more)
 
 
-def layout_of(text: str) -> Layout:
-    database = parse_database(text.encode(), "t.dbc")
-    return prepare(database, "t.dbc", (ESC,), DbcConfig(), fd_allowed=True)
-
-
 def wire(**values: int) -> bytes:
     return encode(LiveData(**values), codec.Layout.V4)
 
@@ -39,7 +31,7 @@ class Bench:
     """One message, as a rule sent with each live frame, of a gateway that is awake at each deadline."""
 
     def __init__(self, signal: Sig, more: str = EVENT) -> None:
-        self.gateway = Gateway((ESC,), layout_of(text_of(signal, more)), 0)
+        self.gateway = Gateway((ESC,), compiled(text_of(signal, more)), 0)
         self.now = 0
         self.gateway.start(0)
         self.first = self.take()
@@ -49,12 +41,8 @@ class Bench:
         return int.from_bytes(self.read(wire(**values))[-1], "little")
 
     def info(self, device: Device) -> None:
-        self.read(
-            encode(
-                InfoData(device_and_variant=device_and_variant(device, 120), cell_count=6),
-                codec.Layout.V4,
-            )
-        )
+        info = InfoData(device_and_variant=device_and_variant(device, 120), cell_count=6)
+        self.read(encode(info, codec.Layout.V4))
 
     def read(self, data: bytes) -> list[bytes]:
         """A period later bytes come; the frames sent until and with them."""
@@ -115,5 +103,5 @@ def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_seco
 
 def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:
     cycle = 'BA_ "GenMsgSendType" BO_ 256 "Cyclic";\nBA_ "GenMsgCycleTime" BO_ 256 20;\n'
-    (message,) = layout_of("\ufeff" + text_of(SPEED, cycle)).messages
+    (message,) = compiled("\ufeff" + text_of(SPEED, cycle)).messages
     assert message.cycle_ns == 20 * MS

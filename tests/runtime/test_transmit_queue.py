@@ -3,13 +3,10 @@
 from collections import Counter
 from itertools import pairwise
 
+from dbc_bench import compiled
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import compile_frame
@@ -115,10 +112,7 @@ def test_pages_of_a_message_are_no_parts_of_a_transfer_however_many() -> None:
     rows = "".join(f' SG_ S{n} m{n} : 8|8@1+ (1,0) [0|0] "" X\n' for n in numbers)
     text = f'VERSION ""\nBU_: G X\nBO_ 256 M: 2 G\n SG_ Page M : 0|8@1+ (1,0) [0|0] "" X\n{rows}'
     bind: dict[str, str | float] = {f"S{n}": n for n in numbers}
-    escs = (EscSettings("esc1"),)
-    (plan,) = prepare(
-        parse_database(text.encode(), "m.dbc"), "m.dbc", escs, DbcConfig(bind=bind)
-    ).messages
+    (plan,) = compiled(text, bind=bind).messages
     make = compile_frame(plan)
     queue, sent = TransmitQueue(), list[CanFrame]()
     queue.put_all([make((), GatewayStatus(), 0, 0, FIRST_PART + 1)])

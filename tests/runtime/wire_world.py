@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterable, Sequence
 
 import native_world
 import pytest
-from packer_oracle import Msg, Sig, dbc_text, read
+from dbc_bench import compiled
+from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -53,7 +52,7 @@ def layout_of(escs: Sequence[EscSettings]) -> Layout:
         name = esc.name if len(escs) > 1 else ""
         speed = Sig(f"{name}ElectricalSpeed", 0, 32, unit="1/min")
         messages.append(Msg(f"M{n}", 256 + n, 8, [speed, Sig(f"{name}DataAge", 32, 16, unit="ms")]))
-    return prepare(read(dbc_text(messages, _TIMES)), "w", escs, DbcConfig(), fd_allowed=False)
+    return compiled(dbc_text(messages, _TIMES), [esc.name for esc in escs])
 
 
 def live(speed: int) -> bytes:
