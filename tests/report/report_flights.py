@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any
 
-from simulated_bus import flight, layout_of
+from simulated_bus import flight
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -19,11 +19,6 @@ from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 Row = tuple[int, list[Value]]
-
-
-def shipped_bus(*names: str) -> BusLayout:
-    """The shipped DBC for these ESCs, by default one."""
-    return layout_of(names or ["esc1"])
 
 
 def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()) -> Iterator[Row]:

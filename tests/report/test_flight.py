@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 import pytest
-from report_flights import Row, column, flight_of, rows_of, shipped_bus, simulated
+from report_flights import Row, column, flight_of, rows_of, simulated
+from simulated_bus import layout_of
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -39,7 +40,7 @@ OPTIONS = (EscOptions(faults=FAULTS), EscOptions(device=Device.JIVEPRO))
 
 @pytest.fixture(scope="module")
 def bus() -> BusLayout:
-    return shipped_bus("left", "right")
+    return layout_of(["left", "right"])
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +141,7 @@ def test_losses_are_gaps_in_lines_and_events(
 
 
 def test_many_events_and_states_stay_bounded() -> None:
-    bus = shipped_bus()
+    bus = layout_of(["esc1"])
     rows = rows_of(
         bus,
         range(0, 300 * S, S // 100),
@@ -157,7 +158,7 @@ def test_many_events_and_states_stay_bounded() -> None:
 @pytest.mark.parametrize("points", [100, 20_000])
 def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(points: int) -> None:
     """As in a log that was stopped for a while: 2 s of rows, nothing for 1.1 s, and so on."""
-    bus = shipped_bus()
+    bus = layout_of(["esc1"])
     times = [part * 3_100_000_000 + at * 10_000_000 for part in range(40) for at in range(201)]
     voltages = [20 + number % 7 for number in range(len(times))]
     flight = flight_of(bus, rows_of(bus, times, battery_voltage=voltages), points)
@@ -183,7 +184,7 @@ def test_words_of_errors_and_states_become_events() -> None:
             *(("battery_voltage", Kind.FLOAT), ("bec_voltage", Kind.FLOAT)),
         )
     ]
-    esc = EscFlight(0, shipped_bus().escs[0], fields, events)
+    esc = EscFlight(0, layout_of(["esc1"]).escs[0], fields, events)
     programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30
     words = [programming, programming | unknown, 1, 1, None]
     states = ["Forward", "Forward", 99, "odd", None]

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 from report_browser import MISSING, PROGRAM, Browser
-from report_flights import flight_of, shipped_bus, simulated
+from report_flights import flight_of, simulated
+from simulated_bus import layout_of
 
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
@@ -38,7 +39,7 @@ COUNT = """((key, name) => {
 
 
 def flown(names: list[str]) -> Flight:
-    bus = shipped_bus(*names)
+    bus = layout_of(names)
     options = [EscOptions(faults=FAULTS), EscOptions()]
     return flight_of(bus, simulated(bus, 60, options))
 

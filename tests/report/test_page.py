@@ -6,7 +6,8 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from report_flights import data_of, flight_of, shipped_bus, simulated
+from report_flights import data_of, flight_of, simulated
+from simulated_bus import layout_of
 
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.desk.report.flight import Flight
@@ -18,7 +19,7 @@ EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u
 
 
 def flown(seconds: float = 12) -> Flight:
-    bus = shipped_bus()
+    bus = layout_of(["esc1"])
     return flight_of(bus, simulated(bus, seconds), 500)
 
 

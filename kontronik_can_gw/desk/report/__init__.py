@@ -1,1 +1,1 @@
-"""A recorded flight as an HTML page: ``flight`` and ``esc`` turn rows into numbers and events; ``page`` and ``summary`` render them."""
+"""A recorded flight as an HTML page: ``flight`` and ``esc`` turn rows into numbers, events and points, which ``page`` renders."""
