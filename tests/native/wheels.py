@@ -43,7 +43,7 @@ def mistakes(wheel: Path) -> Iterator[str]:
             if not path.exists():
                 yield f"{path.name} is not there"
                 continue
-            command = ["readelf", "-dsW", path]
+            command = ["readelf", "-dsW", str(path)]
             text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
             if "(NEEDED)" in text:
                 yield f"{path.name}: needs a library"
