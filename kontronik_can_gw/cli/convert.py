@@ -130,7 +130,7 @@ def _report(
     if not args.quiet:
         where = "standard output" if args.output == "-" else args.output
         say(f"{where}: {summary}, in {seconds:.1f} s", args.command)
-        if recording.times_assumed and form != BYTES:
+        if "times" in recording.provenance and form != BYTES:
             say(f"times are {recording.provenance['times']}", args.command)
     for line in damage:
         say(line, args.command)

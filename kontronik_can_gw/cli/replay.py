@@ -107,7 +107,7 @@ def main(args: argparse.Namespace) -> int:
             )
         play = {"can": _on_can, "pty": _on_pty}[args.on]
         text = play(args, recording, pace)
-        if recording.times_assumed:
+        if "times" in recording.provenance:
             text += f"; times are {recording.provenance['times']}"
         say(f"{text}{', stopped' if pace.stopped.is_set() else ''}")
         for line in recording.damage:

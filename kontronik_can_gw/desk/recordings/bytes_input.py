@@ -48,7 +48,6 @@ class BytesInput(PlayedInput):
         escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
         setup = CaptureSetup(escs, (str(path),), None, DbcConfig(), False, None)
         super().__init__(str(path), layout, setup)
-        self.times_assumed = True
         self.provenance["times"] = "assumed: 100 live frames a second"
         if layout.config is None:
             self.provenance["motor"] = (

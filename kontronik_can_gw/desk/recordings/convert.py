@@ -113,12 +113,10 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
 
 def _table_writer(file: IO[bytes], form: str, table: "Table") -> Any:
     """What has ``write`` for blocks of rows; RunError where a library is missing."""
+    from kontronik_can_gw.desk.recordings.tables import ParquetTable, TextTable
+
     if form == "parquet":
-        from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
-
         return ParquetTable(file, table)
-    from kontronik_can_gw.desk.recordings.tables.text import TextTable
-
     return TextTable(file, table, is_json=form == "jsonl")
 
 

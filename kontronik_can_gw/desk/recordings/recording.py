@@ -94,10 +94,8 @@ class Input(ABC):
         self.name = name
         self.bus = bus
         self.provenance: dict[str, str] = {}
-        """What is known of where it came from, in words."""
+        """What is known of where it came from, in words; ``times`` where these are assumed."""
         self.damage: list[str] = []
-        self.times_assumed = False
-        """True where the recording has no times."""
         self.others = 0
         """CAN frames that the layout does not have; complete when it was read to the end."""
 

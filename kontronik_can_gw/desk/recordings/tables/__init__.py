@@ -1,1 +1,0 @@
-"""Tables of ESC values, a row at each time: CSV, JSON lines, Parquet."""
