@@ -90,20 +90,17 @@ def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> N
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("my.dbc", f'BO_ 1 X: 8 "{EVIL}"', ["dbc", "--from"]),
-        ("my.dbc", f"VERSION {EVIL}", ["describe", "--dbc"]),
-        ("x.toml", f'[can]\nchannel = "{EVIL[:3]}\n', ["check", "-c"]),
-        ("x.toml", '"\\u001b]0;x" = 1\n', ["check", "-c"]),
-        ("x.log", f"(1.0) can0 {EVIL}\n", ["convert", "--to", "csv", "--quiet"]),
-        ("x.kcap", EVIL, ["replay", "--on", "pty"]),
-        ("\x1b]0;x\x07.bin", "", ["decode"]),
+        ("my.dbc", f'BO_ 1 X: 8 "{EVIL}"', "dbc --from"),
+        ("x.toml", '"\\u001b]0;x" = 1\n', "check -c"),
+        ("x.kcap", EVIL, "replay --on pty"),
+        ("\x1b]0;x\x07.bin", "", "decode"),
     ],
 )
 def test_what_is_wrong_with_hostile_files(
-    name: str, content: str, words: list[str], tmp_path: Path
+    name: str, content: str, words: str, tmp_path: Path
 ) -> None:
     path = tmp_path / name
     path.write_text(content)
-    done = run(*words, path, *(["-"] if words[0] == "convert" else []))
-    assert "usage:" not in done.err
+    done = run(*words.split(), path)
+    assert done.code and "usage:" not in done.err
     assert is_clean(done.out + done.err)

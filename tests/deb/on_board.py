@@ -46,7 +46,6 @@ def main() -> None:
         "unit": run("systemctl", "show", "-p", "FragmentPath,ActiveState,User", "kontronik-can-gw"),
         "log": run("journalctl", "-u", "kontronik-can-gw", "-o", "cat", "--no-pager"),
         "status": run("kontronik-can-gw", "status", "--json"),
-        "service status": run("kontronik-can-gw", "service", "status"),
         "doctor": run("kontronik-can-gw", "doctor", "-c", "/etc/kontronik-can-gw/gateway.toml"),
         "writable": [folder for folder in ("/etc", "/usr/lib", "/var/lib") if writable(folder)],
     }

@@ -9,7 +9,7 @@ from kontronik_can_gw.desk.doctor import Finding
 from kontronik_can_gw.desk.doctor.machine import Machine
 
 DIALOUT = 20
-_ROOM = (False, 1 << 30)
+ROOM = (False, 1 << 30)
 
 
 class Tree(Machine):
@@ -112,7 +112,7 @@ class Tree(Machine):
         return ""
 
     def space(self, folder: str) -> tuple[bool, int]:
-        return self.full.get(folder, _ROOM)
+        return self.full.get(folder, ROOM)
 
     def may(self, name: str, mode: int) -> bool:
         return name not in self.closed

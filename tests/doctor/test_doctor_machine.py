@@ -5,7 +5,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from doctor_trees import Tree, grave, only
+from doctor_trees import ROOM, Tree, grave, only
 
 from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
@@ -25,12 +25,6 @@ def service(tree: Tree) -> list[Finding]:
     findings = Findings("Machine")
     check_service(tree, findings, unit_of(tree, CONFIG), CONFIG)
     return findings.found
-
-
-def folder(tree: Tree, own: bool = False) -> Finding:
-    findings = Findings("Configuration")
-    check_folder(tree, findings, "stored parameters", STORE, own, 0)
-    return findings.found[-1]
 
 
 # --- the service
@@ -63,21 +57,30 @@ def test_how_the_service_fares_is_reported(
 
 
 @pytest.mark.parametrize(
-    ("left", "severity", "word"),
+    ("there", "space", "who", "severity", "said"),
     [
-        ((True, 1 << 30), ERROR, "read-only"),
-        ((False, 1000), ERROR, "full"),
-        ((False, 1 << 21), OK, ""),
+        (STORE, (True, 1 << 30), "open", ERROR, "read-only"),
+        (STORE, (False, 1000), "open", ERROR, "full"),
+        (STORE, (False, 1 << 21), "open", OK, ""),
+        ("/var/lib", ROOM, "open", OK, f"{STORE}, will be made"),
+        ("/var/lib", ROOM, "closed", ERROR, f"chown anna {STORE}"),
+        ("/var/lib", ROOM, "of systemd", OK, "made by systemd"),
+        ("/var/lib", ROOM, "of a gateway", NOTE, "perhaps the gateway that runs may"),
     ],
 )
-def test_a_full_or_read_only_file_system_is_reported(
-    tree: Tree, left: tuple[bool, int], severity: str, word: str
+def test_a_folder_must_be_one_that_this_user_or_systemd_can_fill(
+    tree: Tree, there: str, space: tuple[bool, int], who: str, severity: str, said: str
 ) -> None:
-    tree.folder(STORE)
-    tree.full[STORE] = left
-    found = folder(tree)
-    assert found.severity == severity
-    assert word in found.text
+    tree.folder(there)
+    tree.full[there] = space
+    if who != "open":
+        tree.closed.add(there)
+    if who == "of a gateway":
+        tree.process(78, "python3", "-m", "kontronik_can_gw", "run")
+    findings = Findings("Configuration")
+    check_folder(tree, findings, "stored parameters", STORE, who == "of systemd", 0)
+    (found,) = findings.found
+    assert (found.severity, said in f"{found.text} {found.command}") == (severity, True), found
 
 
 # --- the real thing
@@ -104,13 +107,3 @@ def test_the_real_machine_is_looked_at_without_an_exception() -> None:
     assert machine.real("/proc/self/..") == "/proc"
     assert machine.text("/proc/none") == "" and machine.names("/proc/none") == []
     assert machine.user and machine.group_name(0) == "root"
-
-
-def test_a_folder_must_be_one_that_this_user_or_systemd_can_fill(tree: Tree) -> None:
-    tree.folder("/var/lib")
-    assert folder(tree).text.endswith(f"{STORE}, will be made")
-    tree.closed.add("/var/lib")
-    assert f"chown anna {STORE}" in folder(tree).command
-    assert "made by systemd" in folder(tree, own=True).text
-    tree.process(78, "python3", "-m", "kontronik_can_gw", "run")  # of another user
-    assert folder(Tree(tree.root)).severity == OK

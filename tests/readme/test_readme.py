@@ -1,23 +1,35 @@
-"""README.md and docs/ are true: tables are those of the sources, commands exist, links lead somewhere, examples are valid."""
+"""README.md, docs/ and examples/ are true: tables are those of the sources, commands exist, links lead somewhere, examples are valid.
+
+Shell blocks can be typed as they stand, on any machine; tests/vcan has those that need a CAN interface.
+"""
 
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from command_line import run
 from pictures import SHOWN, VIEWS, main
 from reference import FOLDER, pages
 from report_browser import MISSING, PROGRAM
 from shell_blocks import PAGES as BY_HAND
+from shell_blocks import WORDS, Block, blocks, make_files, run_block
 
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.config.export import schema
+from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 
 PROJECT = FOLDER.parents[1]
 PAGES = {path: path.read_text(encoding="utf-8") for path in (*BY_HAND, *FOLDER.glob("*.md"))}
 README = PAGES[PROJECT / "README.md"]
 ALL = "\n".join(PAGES[path] for path in BY_HAND)
+EXAMPLES = PROJECT / "examples"
+CONFIGURATIONS = sorted(EXAMPLES.glob("*/gateway.toml"))
+NEEDS = {"jq": "jq", "cc": "gcc libc6-dev"}
 
 
 def test_the_reference_is_that_of_the_sources() -> None:
@@ -115,3 +127,68 @@ def test_pictures_can_be_made_anew(tmp_path: Path) -> None:
     main(tmp_path)
     made = {path.name for path in tmp_path.iterdir()}
     assert made > set(SHOWN) and len(made) == 4 + len(VIEWS)
+
+
+# --- examples
+
+
+@pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.parent.name)
+def test_check_accepts_it_without_a_warning(file: Path) -> None:
+    done = run("check", file)
+    assert (done.code, done.err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [("bus.dbc", []), ("canopen.dbc", ["--canopen"])],
+)
+def test_a_dbc_beside_it_is_what_the_command_writes(file: str, words: list[str]) -> None:
+    for dbc in EXAMPLES.glob(f"*/{file}"):
+        assert run("dbc", *words, "-c", dbc.with_name("gateway.toml")).data == dbc.read_bytes(), dbc
+
+
+def test_every_example_has_its_dbc() -> None:
+    assert len(CONFIGURATIONS) == 4
+    assert all(list(file.parent.glob("*.dbc")) for file in CONFIGURATIONS)
+
+
+def test_dcfgen_takes_the_bus_file_of_ros2_canopen(tmp_path: Path) -> None:
+    shutil.copy(EXAMPLES / "ros2/bus.yml", tmp_path)
+    shutil.copy(shipped("eds/kontronik_esc.eds"), tmp_path)
+    code = "from dcfgen.cli import main; main()"
+    command = [sys.executable, "-W", "ignore", "-c", code, "-rS", "bus.yml"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    for name in ("master.dcf", "left.bin", "right.bin"):
+        assert (tmp_path / name).stat().st_size > 100
+
+
+# --- shell blocks
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    make_files(folder, "can0", 100)
+    return folder
+
+
+def given(block: Block) -> object:
+    """A block as a parameter; libraries of tables take their time."""
+    marks = [pytest.mark.extended] if "parquet" in block.text else []
+    return pytest.param(block, id=block.place, marks=marks)
+
+
+@pytest.mark.parametrize("block", [given(block) for block in blocks("")])
+def test_a_block_can_be_typed_as_it_stands(block: Block, files: Path, tmp_path: Path) -> None:
+    for program, package in NEEDS.items():
+        if f"{program} -" in block.text and shutil.which(program) is None:
+            pytest.skip(f"no {program}: sudo apt-get install {package}")
+    folder = tmp_path / "f"
+    shutil.copytree(files, folder, symlinks=True)
+    run_block(block, folder)
+
+
+def test_each_block_says_why_it_cannot_be_run() -> None:
+    assert {block.word for block in blocks()} <= set(WORDS)
+    assert len(blocks()) == ALL.count("\n```sh")
+    assert "```bash" not in ALL

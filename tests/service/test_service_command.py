@@ -127,8 +127,6 @@ def test_a_link_that_leads_out_of_the_root_is_not_followed(tmp_path: Path) -> No
     [
         ("install --instance ../x", "'../x' is no name"),
         ("install --instance gateway", "'gateway' is no name"),
-        ("install --network 500000", "--network: was removed. Copy the two files"),
-        ("install --mqtt", "--mqtt: was removed. Leave it out, then type sudo systemctl enable"),
         ("uninstall --instance left", "was removed. Type sudo systemctl disable --now kontronik"),
         ("status -n 3", "status: was removed. Type systemctl status"),
         ("uninstall --now", "unrecognized arguments: --now"),

@@ -69,34 +69,52 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
     return found
 
 
-def talk(facts: Facts, name: str, code: int = 0) -> str:
-    """What an action said; it had this exit code."""
-    done = facts[name]
-    assert done["code"] == code, done
-    return str(done["talk"])
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        # an example that nobody edited is not started
+        ("after install", {"ActiveState": "inactive", "UnitFileState": "disabled"}),
+        ("running", {"ActiveState": "active", "UnitFileState": "enabled"}),
+        ("killed", {"NRestarts": "1"}),
+        ("frozen", {"NRestarts": "2"}),
+        # several side by side
+        ("both 0", {"ActiveState": "active"}),
+        ("both 1", {"ActiveState": "active"}),
+        ("left", {"ActiveState": "inactive", "UnitFileState": "disabled"}),
+        ("after uninstall 0", {"ActiveState": "inactive"}),
+        ("running in the end", {"ActiveState": "active"}),
+    ],
+)
+def test_the_state_that_systemd_shows(facts: Facts, place: str, expected: Facts) -> None:
+    name, _, number = place.rpartition(" ")
+    shown = facts[name][int(number)] if number.isdigit() else facts[place]
+    assert {key: shown[key] for key in expected} == expected
 
 
-def test_an_example_that_nobody_edited_is_not_started(facts: Facts) -> None:
-    assert "gateway.toml: is the example. Set ports, bit rate and motors first." in talk(
-        facts, "install"
-    )
-    assert facts["after install"]["ActiveState"] == "inactive"
-    assert facts["after install"]["UnitFileState"] == "disabled"
+@pytest.mark.parametrize(
+    ("action", "code", "said"),
+    [
+        ("install", 0, "gateway.toml: is the example. Set ports, bit rate and motors first."),
+        ("install now", 0, "is enabled. See: systemctl status kontronik-can-gw.service\n"),
+        ("install left", 0, "kontronik-can-gw@left.service is enabled."),
+        ("install with faulty configuration", 1, "gateway.toml: esc[1].nonsense: unknown key."),
+        ("uninstall", 0, "kept: /etc/kontronik-can-gw"),
+        ("end", 0, ""),
+    ],
+)
+def test_what_an_action_says(facts: Facts, action: str, code: int, said: str) -> None:
+    done = facts[action]
+    assert (done["code"], said in done["talk"]) == (code, True), done
+    assert facts["same process"], "that of before the faulty configuration"
 
 
 def test_it_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
-    said = "is enabled. See: systemctl status kontronik-can-gw.service\n"
-    assert talk(facts, "install now").endswith(said)
-    assert facts["running"]["ActiveState"] == "active"
-    assert facts["running"]["UnitFileState"] == "enabled"
     process = dict(line.split(":\t", 1) for line in facts["process"].splitlines() if ":\t" in line)
     assert "0" not in process["Uid"].split() + process["Gid"].split()
     assert len(process["Groups"].split()) == 3  # its own and those of serial ports
     assert {process[f"Cap{kind}"] for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb")} == {"0" * 16}
-    assert process["NoNewPrivs"] == "1"
-    assert process["Seccomp"] == "2"
-    assert facts["nice"] == -10
-    assert facts["oom"] == "-500"
+    assert (process["NoNewPrivs"], process["Seccomp"]) == ("1", "2")
+    assert (facts["nice"], facts["oom"]) == (-10, "-500")
 
 
 def test_telemetry_of_a_port_of_its_group_reaches_the_bus(facts: Facts) -> None:
@@ -117,31 +135,12 @@ def test_the_folder_of_locks_outlives_the_service_that_stops(facts: Facts) -> No
     assert facts["locks after a stop"] == ["x"], "what the probe wrote"
 
 
-def test_a_killed_process_is_started_again(facts: Facts) -> None:
+def test_a_killed_or_frozen_process_is_replaced_and_shows_where_it_was(facts: Facts) -> None:
     assert facts["running again after kill"] >= 0
     assert facts["fresh after kill"]
-    assert facts["killed"]["NRestarts"] == "1"
-
-
-def test_a_frozen_process_is_replaced_and_shows_where_it_was(facts: Facts) -> None:
     assert facts["running again after freeze"] >= 5, "not before the watchdog's time is over"
-    assert facts["frozen"]["NRestarts"] == "2"
     assert any("most recent call first" in str(message) for _, message in facts["log"])
-
-
-def test_a_faulty_configuration_is_not_started_by_install(facts: Facts) -> None:
-    said = talk(facts, "install with faulty configuration", 1)
-    assert "gateway.toml: esc[1].nonsense: unknown key." in said
-    assert "kontronik-can-gw.service was not enabled." in said
-    assert facts["same process"]
-
-
-def test_several_gateways_run_side_by_side(facts: Facts) -> None:
-    talk(facts, "install left")
-    assert [state["ActiveState"] for state in facts["both"]] == ["active", "active"]
     assert "esc1: telemetry ok" in facts["both"][0]["StatusText"]
-    assert facts["left"]["ActiveState"] == "inactive"
-    assert facts["left"]["UnitFileState"] == "disabled"
 
 
 def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> None:
@@ -170,14 +169,9 @@ def test_metrics_are_served_and_the_gateway_still_has_no_ip(facts: Facts) -> Non
 
 
 def test_uninstall_keeps_what_people_wrote(facts: Facts) -> None:
-    assert "kept: /etc/kontronik-can-gw" in talk(facts, "uninstall")
-    state, left = facts["after uninstall"]
-    assert state["ActiveState"] == "inactive"
-    assert left == [
+    assert facts["after uninstall"][1] == [
         "/etc/kontronik-can-gw",
         "/var/lib/kontronik-can-gw",
         "/var/lib/kontronik-can-gw-left",
         "/var/lib/kontronik-can-gw-probe",
     ]
-    assert facts["running in the end"]["ActiveState"] == "active"
-    assert facts["end"]["code"] == 0
