@@ -10,8 +10,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
 from kontronik_can_gw.canopen.eds import FLOATS, SIGNED, TYPE_BITS, Entry, range_of
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event

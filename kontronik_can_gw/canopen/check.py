@@ -3,9 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.canopen.cob_ids import SDO_ANSWER, SDO_REQUEST, default_ids
-from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.dictionary import Dictionary, SdoAbort
 from kontronik_can_gw.canopen.eds import (
     SIGNED,
     TYPE_BITS,

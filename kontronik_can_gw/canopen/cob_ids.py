@@ -5,8 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw.canopen import nmt
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import Command
 from kontronik_can_gw.node_state import UNCONFIGURED

@@ -6,9 +6,8 @@ from functools import partial
 from struct import Struct
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.cob_ids import EMERGENCY, INVALID_BIT, Taken, check_free
-from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
 from kontronik_can_gw.canopen.emergency_codes import (
     FROM_GATEWAY,
     OF_COMMUNICATION,

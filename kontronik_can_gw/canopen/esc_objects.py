@@ -4,8 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import signature
+from kontronik_can_gw.canopen.dictionary import Abort, SdoAbort, signature
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
 from kontronik_can_gw.esc.telemetry import EscSettings, Event, LinkState

@@ -23,8 +23,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.storage import Parameters
 from kontronik_can_gw.node_state import UNCONFIGURED

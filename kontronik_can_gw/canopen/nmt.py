@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
 
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.output import NEVER

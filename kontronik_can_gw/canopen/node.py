@@ -7,10 +7,9 @@ service is plain storage. The node itself has what several services have a part 
 from functools import partial
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.abort import Abort
 from kontronik_can_gw.canopen.bound_values import bind_values
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT, LSS_ANSWER, SDO_ANSWER
-from kontronik_can_gw.canopen.dictionary import Variable
+from kontronik_can_gw.canopen.dictionary import Abort, Variable
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects

@@ -10,10 +10,9 @@ carry the link status: those go on, with all ones (80..0h for signed types) for 
 
 from collections.abc import Callable, Sequence
 
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.bound_values import bits_of, compile_pdo
 from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, SYNC, Taken, check_free
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, key
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Variable, key
 from kontronik_can_gw.esc.telemetry import MS, SECOND, Event
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ

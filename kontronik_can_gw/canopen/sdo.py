@@ -23,8 +23,7 @@ Choices where the standard leaves room:
 from collections import deque
 from collections.abc import Callable
 
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
 from kontronik_can_gw.canopen.sdo_transfers import (
     BLOCK_SIZE,
     SubBlock,

@@ -8,7 +8,7 @@ from binascii import crc_hqx
 from collections import deque
 from collections.abc import Generator
 
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.dictionary import Abort, SdoAbort
 
 BLOCK_SIZE = 127
 """Segments of one sub-block of a block download, the most there can be."""

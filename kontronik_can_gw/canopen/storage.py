@@ -20,8 +20,7 @@ from functools import partial
 from typing import Any
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, signature
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Variable, signature
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.node_state import UNCONFIGURED
 

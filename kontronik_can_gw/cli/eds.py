@@ -4,9 +4,8 @@ import argparse
 from pathlib import Path
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.canopen.dcf import dcf
-from kontronik_can_gw.canopen.dictionary import Value
+from kontronik_can_gw.canopen.dictionary import SdoAbort, Value
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 from script import MS, Talker, bytes_of, hexadecimal, ms
 
-from kontronik_can_gw.canopen.abort import Abort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, key
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, Variable, key
 from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.output import NEVER

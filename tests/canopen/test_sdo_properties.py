@@ -16,7 +16,7 @@ from sdo_bench import Bench
 from sdo_client import Refused, answer_to, download, upload, uploaded
 from wire import Wire
 
-from kontronik_can_gw.canopen.abort import Abort
+from kontronik_can_gw.canopen.dictionary import Abort
 from kontronik_can_gw.output import NEVER
 
 # ---- any traffic

@@ -10,7 +10,7 @@ from typing import Any
 import cantools
 import pytest
 
-from kontronik_can_gw.canopen.abort import SdoAbort
+from kontronik_can_gw.canopen.dictionary import SdoAbort
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.nodes import shipped_canopen
