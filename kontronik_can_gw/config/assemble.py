@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -90,7 +90,9 @@ def load_configuration(
     with collecting(problems):
         check_interface(config.can)
     if problems:
-        return assemble(without_clashing_escs(config), None, problems)
+        with collecting(problems):
+            assemble(without_clashing_escs(config))
+        raise UserError(*problems)
     if store is None or not config.canopen.enabled:
         return assemble(config)
     from kontronik_can_gw.config.nodes import parameter_folder
@@ -140,14 +142,12 @@ def _outputs(
     return tuple(found)
 
 
-def assemble(
-    config: Config, store: "ParameterStore | None" = None, known: Sequence[str] = ()
-) -> Loaded:
-    """The objects made from a configuration. Without a store its files are only read. UserError with what is ``known``, too.
+def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
+    """The objects made from a configuration. Without a store its files are only read.
 
     A faulty configuration, DBC or EDS is refused. Stored parameters that do not fit them are ignored with a warning.
     """
-    problems = [*known]
+    problems: list[str] = []
     with collecting(problems):
         check_devices(config)
     escs, plain, canopen = config.escs, None, None
