@@ -107,9 +107,10 @@ def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:
 
     found: Table = {}
     for options in ([], ["--canopen"]) if canopen else ([],):
-        printed = io.StringIO()
+        printed = io.TextIOWrapper(io.BytesIO(), encoding="cp1252", newline="")
         with contextlib.redirect_stdout(printed):
             assert main(["dbc", *words, *options]) == 0
-        database: Any = cantools.database.load_string(printed.getvalue(), "dbc", strict=True)
+        text = printed.buffer.getvalue().decode("cp1252")
+        database: Any = cantools.database.load_string(text, "dbc", strict=True)
         found |= {message.frame_id: _message(message, escs) for message in database.messages}
     return found
