@@ -71,7 +71,7 @@ def one(library: Any, seed: int) -> int:
         text = chance.choice(FILES)
     text = changed(chance, text)
     try:
-        database = parse_database(text.encode("latin-1"), "x.dbc")
+        database = parse_database(text.encode("latin-1", "ignore"), "x.dbc")
         layout = prepare(database, "x.dbc", escs, chosen, fd_allowed=True)
         both = equality.Both(library, chance, escs, layout)
     except (UserError, NotInCore):
