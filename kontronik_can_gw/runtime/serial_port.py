@@ -272,22 +272,22 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
             f"[Service]: DeviceAllow={path} rw."
         )
     if number in (errno.EAGAIN, errno.EBUSY):
-        return _in_use(path, _users_now_and_then(path))
+        return _in_use(path, _users(path))
     return RunError(f"{path}: cannot be opened: {text}")
 
 
-_found_users: dict[str, tuple[float, str]] = {}
-"""Until when what was found of a port is taken to hold, and what it was."""
+_seen_users: set[Path] = set()
+_next_search: dict[str, float] = {}
 _SEARCH_PAUSE_S = 10.0
 
 
 def _users_now_and_then(path: str) -> str:
-    """Who has the port open; looked for every ten seconds at most, because it takes a while on a slow machine."""
-    until, users = _found_users.get(path, (0.0, ""))
-    if (now := time.monotonic()) >= until:
-        users = _users(path)
-        _found_users[path] = now + _SEARCH_PAUSE_S, users
-    return users
+    """Who has the port open; looked for at first and then no more than every ten seconds, because it takes a while on a slow machine."""
+    now = time.monotonic()
+    if now < _next_search.get(path, 0.0) and not _seen_users:
+        return ""
+    _next_search[path] = now + _SEARCH_PAUSE_S
+    return _users(path)
 
 
 def _users(path: str) -> str:
@@ -300,11 +300,15 @@ def _users(path: str) -> str:
             found.add(
                 f"the kernel's console (take console={name} out of the kernel's command line)"
             )
-    for process in Path("/proc").glob("[0-9]*"):
+    seen = [process for process in _seen_users if _has_open(process, device)]
+    # who had it open when we last looked mostly has it still: all programs are not looked through each time
+    for process in seen or Path("/proc").glob("[0-9]*"):
         if process.name != str(os.getpid()) and _has_open(process, device):
             with contextlib.suppress(OSError):
                 name = (process / "comm").read_text(errors="replace").strip()
                 found.add(f"{name} (pid {process.name})")
+                _seen_users.add(process)
+    _seen_users.difference_update([process for process in _seen_users if not process.exists()])
     return ", ".join(sorted(found))
 
 
