@@ -187,6 +187,7 @@ def _dbc_settings(found: Mapping[str, Any]) -> DbcConfig:
     """Settings checked like those of a configuration. Captures of 0.5.0 have fewer."""
     keys = {key: found.get(name) for key, name in _DBC_KEYS.items()}
     given = {key: value for key, value in keys.items() if value not in (None, {}, [])}
+    given |= {key: found[_DBC_KEYS[key]] for key in ("bind", "e2e_data_ids")}
     given["on_loss"] = "silent" if found["silent_on_loss"] else "not_available"
     return parse({"dbc": given, "esc": [{"port": "-"}]}, "the capture").dbc
 

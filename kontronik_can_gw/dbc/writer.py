@@ -174,9 +174,9 @@ def _escaped(text: str) -> str:
 
 
 def _number(value: Any) -> str:
-    """The nearest float where it is not whole."""
+    """A fraction that is not whole: the nearest float."""
     if isinstance(value, Fraction):
-        value = float(value)
+        value = value.numerator if value.denominator == 1 else float(value)
     if isinstance(value, float) and value.is_integer() and abs(value) < 1 << 63:
         value = int(value)
     return str(value)

@@ -286,7 +286,7 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
     }
 }
 
-/* --- text (twins: can_logs/writer.py, tables/text.py) ---------------------------------------------------------------- */
+/* --- text (twins: can_logs/writer.py, tables.py) ---------------------------------------------------------------- */
 
 typedef struct { char of[256][2]; } kcg_pairs; /* the two hex digits of each byte */
 

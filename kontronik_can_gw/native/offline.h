@@ -2,7 +2,7 @@
 
    The core decodes, keeps the state and packs; here are the loops around it. Entries that come now and then (ports, the bus, settings,
    received frames) are left to the owner, who gives them to the same core and goes on. The Python twins: capture/replay.py,
-   desk/recordings/bytes_input.py (plain bytes), samples.py (rows), tables/text.py and can_logs/writer.py (text). */
+   desk/recordings/bytes_input.py (plain bytes), samples.py (rows), tables.py and can_logs/writer.py (text). */
 #ifndef KCG_OFFLINE_H
 #define KCG_OFFLINE_H
 #include "core.h"

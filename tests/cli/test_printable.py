@@ -5,12 +5,13 @@ import json
 import logging
 import re
 import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
 from command_line import run
 
-from kontronik_can_gw.cli import say, show
+from kontronik_can_gw.cli import main, say, show
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
@@ -85,6 +86,19 @@ def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> N
     assert done.code == 0, done.err
     assert "?EVIL?" in done.out or "\\u001bEVIL\\u0007" in done.out
     assert is_clean(done.out + done.err)
+
+
+def test_a_file_that_is_shown_on_a_terminal_is_text(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for is_terminal in (False, True):  # into a pipe it goes as it is
+        out = io.TextIOWrapper(io.BytesIO(), "utf-8")
+        monkeypatch.setattr(out, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        with redirect_stdout(out):
+            assert main(["dbc", "-c", str(folder / "gateway.toml")]) == 0
+        out.seek(0)
+        assert is_clean(text := out.read()) == is_terminal
+        assert "EVIL" in text
 
 
 @pytest.mark.parametrize(

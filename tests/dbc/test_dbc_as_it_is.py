@@ -15,6 +15,7 @@ from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.prepare import is_mute, reporter, unreported
 from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.desk.describe.tables import held
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import SEND_TYPES, Role, SendType
@@ -167,6 +168,8 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
     assert read == expected | {"Ratio": 1.5, "Cool": -2}
     unbound = {s.name for plan in layout.messages for s in plan.signals if s.unbound}
     assert unbound == {"Torque", "Warm", "Ratio", "Cool"}
+    shown = {s.name: held(s) for plan in layout.messages for s in plan.signals if s.unbound}
+    assert shown == {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}
     assert [line for line in layout.warnings if "sent once" in line] == [
         "my_car.dbc: sent once at the start, without a cycle and a value that changes: Motor_21"
     ]

@@ -3,6 +3,7 @@
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,12 @@ def plain_plans(layout: Layout) -> list[MessagePlan]:
         replace(plan, compiled=tuple(sorted(plan.signals, key=lambda signal: signal.name)))
         for plan in layout.messages
     ]
+
+
+def test_limits_of_64_bits_are_written_exactly() -> None:
+    signal = writer.SignalRow("Big", 0, 64, limits=(Fraction(-1, 8), Fraction(2**64 - 2)))
+    row = writer.MessageRow(1, "M", 8, ["Gateway"], None, {}, [signal])
+    assert "[-0.125|18446744073709551614]" in writer.dbc_text(read(SHIPPED), [row])
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -52,7 +52,9 @@ def _cell(key: str, value: object) -> str:
     """A cell: None and False are empty, True is yes, a value table is ``0 Off, 1 On``."""
     if value is None or isinstance(value, bool):
         return "yes" if value else ""
-    if isinstance(value, int) and (key in _HEX or abs(value) > 0xFFFFFF):
+    if isinstance(value, int) and (
+        key in _HEX or (abs(value) > 0xFFFFFF and key not in ("min", "max"))
+    ):
         return f"{value:0{_HEX.get(key, 1)}X}h"
     if isinstance(value, float):
         return f"{value:.10g}"

@@ -24,6 +24,7 @@ from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.gateway_status import CanState, GatewayState
+from kontronik_can_gw.signals.packer import float_of
 from kontronik_can_gw.signals.plan import MessagePlan, Role, SendType, SignalPlan
 
 _AVAILABLE = {
@@ -118,8 +119,10 @@ def _signal(
     lost = list(plan.notes)
     if is_mute(plan) and (found := reporter(message, plan)) is not None:
         lost.append(f"{found.name} reports the loss")
-    if plan.role is Role.CONSTANT or plan.unbound:
-        lost.append(f"{'bound to nothing: ' if plan.unbound else ''}always raw {plan.constant}")
+    if plan.unbound:
+        lost.append(f"bound to nothing: always {held(plan)}")
+    elif plan.role is Role.CONSTANT:
+        lost.append(f"always raw {plan.constant}")
     notes = [f"{note[:1].upper()}{note[1:]}." for note in lost]
     several = plan.esc is not None and len(escs) > 1
     return {
@@ -141,6 +144,16 @@ def _signal(
         "meaning": " ".join(filter(None, [_line(signal.comment), *notes])),
         "names": {value: choices[value] for value in sorted(choices) if value not in codes},
     }
+
+
+def held(signal: SignalPlan) -> str:
+    """The physical value of a constant, or its text in the value table."""
+    raw: float = signal.constant
+    if signal.is_float:
+        raw = float_of(signal.constant, signal.length)
+    elif text := signal.texts.get(signal.constant):
+        return text
+    return f"{raw * float(signal.factor) + float(signal.offset):.10g} {signal.unit}".rstrip()
 
 
 def _finite(value: float) -> float | None:
