@@ -62,13 +62,14 @@ def test_a_missing_library_is_named_with_its_extra(
 @pytest.mark.parametrize("form", ["csv", "parquet", "asc", "blf", "mf4-log"])
 def test_a_full_disk_is_one_line_and_leaves_nothing(dump: Path, tmp_path: Path, form: str) -> None:
     def small() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
 
-    done = program(dump, tmp_path / "out", "--to", form, preexec_fn=small)
-    assert done.returncode == 1, done.stderr
-    said = f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
-    assert done.stderr == said
-    assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
+    for more in ([], ["--until", "0.3"]):  # in the midst, and what Python holds to the end
+        done = program(dump, tmp_path / "out", "--to", form, *more, preexec_fn=small)
+        assert done.returncode == 1, done.stderr
+        said = f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
+        assert done.stderr == said
+        assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
 
 
 @pytest.mark.parametrize(

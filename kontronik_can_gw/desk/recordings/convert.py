@@ -80,18 +80,24 @@ class Output:
         is_kept = kind is None and self.is_whole
         if kind is None and self._target is None:
             sys.stdout.flush()
-        if self._file is not None:
-            # what is buffered of a file that is not kept may find no room
-            with suppress(*([] if is_kept else [OSError])):
-                self._file.flush()
-                if is_kept and self._part is not None:
-                    os.fsync(self._file.fileno())
-                self._file.close()
-        if self._part is not None and self._target is not None:
-            if is_kept:
+        try:
+            if self._file is not None:
+                # what is buffered of a file that is not kept may find no room
+                with suppress(*([] if is_kept else [OSError])):
+                    self._close(self._file, is_kept)
+            if is_kept and self._part is not None and self._target is not None:
                 self._part.replace(os.path.realpath(self._target))
-            else:
+        finally:
+            if self._part is not None:
                 self._part.unlink(missing_ok=True)
+
+    def _close(self, file: IO[bytes], is_kept: bool) -> None:
+        try:
+            if is_kept and self._part is not None:
+                file.flush()
+                os.fsync(file.fileno())
+        finally:
+            file.close()  # else Python tries again at its own end, and says so
 
 
 def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> str | None:
