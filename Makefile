@@ -1,7 +1,7 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-all release soak hour bench golden docs pictures wheels deb lint clean
+.PHONY: help demo test test-all release soak hour bench golden docs pictures wheels deb lint prose clean
 
 help:
 	@echo 'make demo      show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
@@ -19,6 +19,7 @@ help:
 	@echo 'make wheels    one wheel with the core in C for x86-64, arm64 and armv7, looked through   (ARGS=FOLDER)'
 	@echo 'make deb       Debian packages for amd64, arm64 and armhf, with all libraries   (ARGS=FOLDER)'
 	@echo 'make lint      ruff and mypy only'
+	@echo 'make prose     how plain the English is and how dense the code   (ARGS="--worst 12" ARGS="--hits PATH")'
 	@echo 'make clean     remove .venv and all caches'
 
 demo:
@@ -72,6 +73,10 @@ deb:
 lint:
 	@tests/bootstrap.sh lint
 	@.venv/bin/python tests/run.py test --only lint --only types
+
+prose:
+	@tests/bootstrap.sh lint
+	@.venv/bin/python tests/prose/plain_english.py $(ARGS)
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis tests/vm/.cache tests/foreign/.cache tests/deb/.cache build dist
