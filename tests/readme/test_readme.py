@@ -101,12 +101,6 @@ def test_every_make_target_that_is_named_exists() -> None:
             assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
-def test_pages_by_hand_are_short() -> None:
-    for path, text in PAGES.items():
-        if path.parent == PROJECT / "docs":
-            assert text.count("\n") <= 130, path.name
-
-
 def test_pictures_are_those_that_pages_show_small_and_need_no_server() -> None:
     shown = {
         (path.parent / link).resolve()
