@@ -1,9 +1,10 @@
-"""Puts each fault of faults.toml into a copy of the project and runs the tests there that must see it.
+"""Puts each fault of faults.toml into a copy of the project and runs the tests that must detect it.
 
     python tests/mutants/put_in_faults.py [WORDS...]
 
-WORDS choose the faults whose text has one of them. Exits with 0 if all faults were caught; with 1 and one line each for those that
-were not, or cannot be put in any more because the code is another one.
+WORDS select the faults whose description contains one of them. A fault can be in a Python file, in a C
+source or in a systemd unit of kontronik_can_gw. Exits with 0 if the tests detected every fault, else
+with 1 and one line for each fault that they missed or that no longer fits the code.
 """
 
 import argparse
@@ -22,7 +23,10 @@ PROJECT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("faults.toml")
 LIMIT_S = 1800
 FAILED = 1
-"""Of pytest: some test has failed. Everything else, as a collection that breaks off, judges nothing."""
+"""The exit code of pytest if a test failed. Any other code, such as a failed collection, proves nothing."""
+SUFFIXES = (".py", ".c", ".h", ".service")
+"""The kinds of files that can have a fault."""
+IN_C = (".c", ".h")
 
 
 @dataclass(frozen=True)
@@ -33,10 +37,11 @@ class Fault:
     seen_by: tuple[str, ...]
 
     def put_in(self, project: Path = PROJECT) -> tuple[Path, str]:
-        """The file it is in and the text that this is to have. ValueError where it cannot be put in."""
+        """Return the file and its text with the fault. ValueError if the fault does not fit the code."""
         # with any white space
         pattern = re.compile(r"\s+".join(map(re.escape, self.search.split())))
-        files = (project / "kontronik_can_gw").rglob("*.py")
+        folder = project / "kontronik_can_gw"
+        files = [file for file in folder.rglob("*") if file.suffix in SUFFIXES]
         found = [(file, match) for file in files for match in pattern.finditer(file.read_text())]
         if len(found) != 1:
             raise ValueError(
@@ -47,33 +52,58 @@ class Fault:
         margin = " " * (match.start() - text.rfind("\n", 0, match.start()) - 1)
         put_in = textwrap.indent(self.replace.strip("\n"), margin).removeprefix(margin)
         changed = text[: match.start()] + put_in + text[match.end() :]
-        try:
-            compile(changed, file.name, "exec")
-        except SyntaxError as error:
-            raise ValueError(f"with it {file.name} is no Python: {error}") from None
+        if file.suffix == ".py":
+            try:
+                compile(changed, file.name, "exec")
+            except SyntaxError as error:
+                raise ValueError(f"with it {file.name} is no Python: {error}") from None
         return file, changed
 
     def problem(self, copy: Path) -> str:
-        """What is wrong with it; nothing if a test fails with it, and with nothing else."""
+        """Return why the fault is not detected, or "" if a test fails with it."""
         try:
             file, changed = self.put_in(copy)
         except ValueError as error:
             return str(error)
+        is_in_c = file.suffix in IN_C
         whole = file.read_text()
         try:
             file.write_text(changed)
-            code = tested(copy, self.seen_by)
+            if is_in_c and not is_compiled(copy):
+                return f"with it {file.name} does not compile"
+            code = tested(copy, self.seen_by, core_in_c=is_in_c)
         finally:
             file.write_text(whole)
+            if is_in_c:
+                is_compiled(copy)
         return "" if code == FAILED else f"NOT CAUGHT (pytest: {code})"
 
 
-def tested(copy: Path, tests: tuple[str, ...]) -> int | str:
-    """pytest's exit code in the copy; what is changed is Python, so the core is too."""
+def is_compiled(copy: Path) -> bool:
+    """Compile the core in C of the copy. False if the compiler refuses it."""
+    command = [sys.executable, "-m", "kontronik_can_gw.native.compile"]
+    done = subprocess.run(command, cwd=copy, env=environment_of(copy), capture_output=True)
+    return done.returncode == 0
+
+
+def environment_of(copy: Path, core_in_c: bool = False) -> dict[str, str]:
+    """Return the environment in which Python imports the copy instead of the project."""
+    return {
+        **os.environ,
+        "KONTRONIK_PURE": "0" if core_in_c else "1",
+        "PYTHONPATH": str(copy),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+
+
+def tested(copy: Path, tests: tuple[str, ...], core_in_c: bool) -> int | str:
+    """Run the tests in the copy and return pytest's exit code.
+
+    With a fault in Python the core is in Python too, except in tests that choose the core.
+    """
     words = ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0", "--tb=no"]
     command = [sys.executable, *words, "-m", "not extended", *tests]
-    environment = {**os.environ, "KONTRONIK_PURE": "1", "PYTHONPATH": str(copy)}
-    environment["PYTHONDONTWRITEBYTECODE"] = "1"
+    environment = environment_of(copy, core_in_c)
     try:
         done = subprocess.run(
             command, cwd=copy, env=environment, capture_output=True, timeout=LIMIT_S
