@@ -14,16 +14,17 @@
 typedef struct {
     int64_t (*now)(void);
     void (*wait)(int64_t until, int for_room); /* until something has come; then the process may stand still */
-    void (*look)(void);
+    int (*look)(int is_all);              /* errno of a poll, of all descriptors or of some */
     int (*ready)(int fd);                 /* for what */
-    int (*size)(int fd, int most);        /* how many bytes a read gives: `data` then has them */
-    int (*send)(const uint8_t *frame, int size); /* 0: it is not taken */
+    int (*size)(int fd, int most);        /* how many bytes a read gives: `data` then has them; -errno, -1: the port has hung up */
+    int (*send)(const uint8_t *frame, int size); /* errno, or 0 if the bus takes the frame */
     void (*settings)(int fd, uint8_t *at, int is_set); /* of a port: they are set, or asked for */
 } kernel;
 static kernel k;
 uint8_t fake_data[1 << 16];
 static struct { int fd; struct epoll_event e; } watched[64];
 static int count;
+int fake_epolls; /* how many are open */
 
 void fake_use(const kernel *given)
 {
@@ -42,12 +43,14 @@ int fake_epoll_create1(int flags)
 {
     (void)flags;
     count = 0;
+    fake_epolls++;
     return 1;
 }
 
 int fake_close(int fd)
 {
     (void)fd;
+    fake_epolls--;
     return 0;
 }
 
@@ -82,8 +85,9 @@ int fake_poll(struct pollfd *fds, nfds_t n, int ms)
 {
     int found = 0;
     (void)ms;
-    if (n == (nfds_t)count)
-        k.look();
+    errno = k.look(n == (nfds_t)count);
+    if (errno)
+        return -1;
     for (nfds_t i = 0; i < n; i++) {
         fds[i].revents = (short)(k.ready(fds[i].fd) & fds[i].events);
         found += fds[i].revents != 0;
@@ -103,8 +107,10 @@ int fake_ioctl(int fd, unsigned long what, ...)
 ssize_t fake_read(int fd, void *data, size_t most)
 {
     int size = k.size(fd, (int)most);
+    if (size == -1)
+        return 0;
     if (size <= 0) {
-        errno = EAGAIN;
+        errno = size ? -size : EAGAIN;
         return -1;
     }
     memcpy(data, fake_data, (size_t)size);
@@ -114,10 +120,12 @@ ssize_t fake_read(int fd, void *data, size_t most)
 int fake_sendmmsg(int fd, struct mmsghdr *m, unsigned n, int flags)
 {
     (void)fd, (void)flags;
-    for (unsigned i = 0; i < n; i++)
-        if (!k.send(m[i].msg_hdr.msg_iov->iov_base, (int)m[i].msg_hdr.msg_iov->iov_len)) {
-            errno = EAGAIN;
+    for (unsigned i = 0; i < n; i++) {
+        int number = k.send(m[i].msg_hdr.msg_iov->iov_base, (int)m[i].msg_hdr.msg_iov->iov_len);
+        if (number) {
+            errno = number;
             return i ? (int)i : -1;
         }
+    }
     return (int)n;
 }

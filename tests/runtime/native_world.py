@@ -1,6 +1,7 @@
 """The World for a loop that turns in C: what linux.c asks of the kernel is answered by it (tests/native/fake_kernel.c)."""
 
 import ctypes as c
+import errno
 import struct
 import tempfile
 from functools import cache
@@ -15,6 +16,7 @@ from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.native_poller import NativePoller
 from kontronik_can_gw.runtime.poller import Handler
+from kontronik_can_gw.runtime.serial_port import PortLost
 from kontronik_can_gw.transmit_queue import Sent
 
 if TYPE_CHECKING:
@@ -31,14 +33,22 @@ _CALLS = (
     "ioctl",
 )
 _KERNEL = Path(__file__).parents[1] / "native" / "fake_kernel.c"
-_HEAD = struct.Struct("=IB3x")
+_HEAD = struct.Struct("=IB3B")
+_REFUSALS = {
+    Sent.OK: 0,
+    Sent.FULL: errno.EAGAIN,
+    Sent.BUSY: errno.ENOBUFS,
+    Sent.DOWN: errno.ENETDOWN,
+    Sent.GONE: errno.ENODEV,
+}
+"""The errno with which a socket gives each answer of a bus."""
 
 
 class _Kernel(c.Structure):
     _fields_ = (
         ("now", c.CFUNCTYPE(c.c_int64)),
         ("wait", c.CFUNCTYPE(None, c.c_int64, c.c_int)),
-        ("look", c.CFUNCTYPE(None)),
+        ("look", c.CFUNCTYPE(c.c_int, c.c_int)),
         ("ready", c.CFUNCTYPE(c.c_int, c.c_int)),
         ("size", c.CFUNCTYPE(c.c_int, c.c_int, c.c_int)),
         ("send", c.CFUNCTYPE(c.c_int, c.POINTER(c.c_uint8), c.c_int)),
@@ -64,7 +74,7 @@ class FakeNativePoller(NativePoller):
         self._world = world
         self._data = (c.c_uint8 * (1 << 16)).in_dll(library(), "fake_data")
         kinds: list[Any] = [kind for _, kind in _Kernel._fields_]
-        of_world = (world.clock, world.pass_until, world.look, world.ready)
+        of_world = (world.clock, world.pass_until, self._look, world.ready)
         calls = (*of_world, self._read, self._send, self._settings)
         self._kernel = _Kernel(*(kind(call) for kind, call in zip(kinds, calls, strict=True)))
         library().fake_use(c.byref(self._kernel))
@@ -91,8 +101,17 @@ class FakeNativePoller(NativePoller):
         self.late = self._world.late
         return ready
 
+    def _look(self, is_all: int) -> int:
+        if is_all:
+            self._world.look()
+        return self._world.poll_fault(bool(is_all))
+
     def _read(self, fd: int, most: int) -> int:
-        data = self._world.wires[fd - 1000].read(most)
+        wire = self._world.wires[fd - 1000]
+        try:
+            data = wire.read(most)
+        except PortLost:
+            return -1 if wire.hangs_up else -errno.EIO
         c.memmove(self._data, data, len(data))
         return len(data)
 
@@ -106,6 +125,9 @@ class FakeNativePoller(NativePoller):
 
     def _send(self, frame: Any, size: int) -> int:
         raw = bytes(frame[:size])
-        number, length = _HEAD.unpack_from(raw)
-        of = CanFrame(number & ~EXTENDED, raw[8 : 8 + length], number >= EXTENDED, size > 16)
-        return int(self._world.bus.send(of) is Sent.OK)
+        number, length, *rest = _HEAD.unpack_from(raw)
+        is_fd = size > 16
+        assert rest == [int(is_fd), 0, 0], "the flags of CAN FD, and reserved bytes"
+        data = raw[8 : 8 + length]
+        sent = CanFrame(number & ~EXTENDED, data, number >= EXTENDED, is_fd)
+        return _REFUSALS[self._world.bus.send(sent)]

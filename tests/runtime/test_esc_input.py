@@ -18,7 +18,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime import serial_port, usb_adapters
@@ -282,6 +282,40 @@ def test_settings_are_looked_at_twice_a_second_in_c_more_often(
     assert len(looks) <= (40 if core_language == "C" else 9), "and no more often"
     assert next(at for at in wire.looks if at > changed) - changed <= limit
     assert sum("changed the settings of /fake/0" in message for message in caplog.messages) == 1
+
+
+@pytest.mark.parametrize("hangs_up", [False, True])
+def test_a_port_that_cannot_be_read_is_lost_in_that_turn_and_the_others_are_read(
+    hangs_up: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Both ports are ready at that moment."""
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    world = World(2)
+    failing, sound = world.wires
+    loop = loop_in(world, monkeypatch, (EscSettings("esc1"), EscSettings("esc2")))
+    loop.open()
+    loop.begin()
+    begin = world.now
+    for wire in world.wires:
+        wire.stream(begin, begin + 3 * SECOND, 20 * MS)
+    run(loop, world, begin + 1100 * MS)
+    failing.hangs_up = hangs_up
+    failing.fails_at = failed = min(at for at in sound.frames if at > world.now)
+    run(loop, world, failed + 50 * MS)
+    lost = loop.escs[0].facts().lost_since_ns
+    assert lost is not None
+    assert 0 <= lost - failed <= 2 * MS
+    reason = "hung up" if hangs_up else "Input/output error"
+    assert f"esc1: /fake/0: lost ({reason}). Trying again." in caplog.messages
+    assert loop.gateway.escs[0].link is LinkState.PORT_ERROR
+    run(loop, world, begin + 4 * SECOND)
+    loop.close()
+    assert loop.gateway.escs[1].counters.live == len(sound.frames)
+    assert loop.escs[0].reopened == 1
+    shown_later = [
+        at for at, frame in world.bus.sent if frame.can_id == 0x100 and at > failed + SECOND
+    ]
+    assert shown_later
 
 
 def test_echo_is_off_before_anything_else_is_done(monkeypatch: pytest.MonkeyPatch) -> None:

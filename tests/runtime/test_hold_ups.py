@@ -3,17 +3,29 @@
 On the CAN side: commands that waited are obeyed, answers are sent, measurements are made anew.
 """
 
+import errno
 import random
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import pytest
+from dbc_bench import compiled
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from wire_world import CAN_FD, NOT_AVAILABLE, World, layout_of, loop_in, run
+from packer_oracle import Msg, dbc_text
+from wire_world import (
+    CAN_FD,
+    NOT_AVAILABLE,
+    TIMES,
+    World,
+    layout_of,
+    loop_in,
+    run,
+    speed_and_age,
+)
 
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
@@ -134,18 +146,26 @@ def test_the_loop_looks_at_its_ports_four_times_within_the_shortest_time_out_wha
     loop.close()
 
 
+@pytest.mark.parametrize("interrupted", ["no poll", "polls of ports that were read", "all polls"])
 def test_what_waited_beyond_one_read_is_dated_by_its_place(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, interrupted: str
 ) -> None:
+    """A poll in C that a signal interrupts does not tell that a port is empty."""
     world = World()
     (wire,) = world.wires
     start = world.now
+    if interrupted != "no poll":
+        world.poll_fault = lambda is_all: (
+            errno.EINTR if interrupted == "all polls" or not is_all else 0
+        )
     loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=20 * SECOND))
     wire.stream(start, start + 8 * SECOND, 40 * NS_PER_BYTE)  # without a pause: 83 kB
     world.now += 9 * SECOND
+    esc = loop.gateway.escs[0]
     for _ in range(24):
         loop.turn()
-    esc = loop.gateway.escs[0]
+        newest = bisect_right(wire.frames, esc.live_bound_ns + NS_PER_BYTE)
+        assert esc.counters.live in (0, newest)
     loop.close()
     assert wire.waiting == 0
     assert abs(wire.frames[-1] - esc.live_bound_ns) <= NS_PER_BYTE
@@ -174,6 +194,123 @@ def test_a_port_that_always_has_bytes_keeps_no_other_one_waiting(
     first = {number: at for at, number, _ in reversed(list(values(world, 1)))}
     assert list(range(1, 21)) == sorted(first)
     assert all(first[n + 1] - whole <= 2 * MS for n, whole in enumerate(usual.frames))
+
+
+@pytest.mark.parametrize("is_reopened", [False, True])
+def test_a_frame_that_waits_in_a_port_when_it_is_opened_is_never_shown(
+    monkeypatch: pytest.MonkeyPatch, is_reopened: bool
+) -> None:
+    """Nothing tells how old it is."""
+    world = World()
+    (wire,) = world.wires
+    if not is_reopened:
+        wire.send(world.now - 5 * SECOND)
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=60 * SECOND))
+    if is_reopened:
+        wire.fails_at = world.now
+        run(loop, world, world.now + 10 * MS)
+        assert loop.escs[0].port is None
+        wire.send(world.now + MS)
+        run(loop, world, world.now + 10 * MS)
+        assert wire.waits_to_be_read
+    run(loop, world, world.now + 2 * SECOND)
+    assert loop.escs[0].port is not None
+    assert list(values(world)) == []
+    wire.send(world.now)
+    run(loop, world, world.now + SECOND)
+    loop.close()
+    assert {number for _, number, _ in values(world)} == {2}
+
+
+MANY = [Msg(f"M{n}", 0x100 + n, 8, speed_and_age()) for n in range(100)]
+"""More messages than one call of the kernel takes from the core in C: 64."""
+
+
+def shown_of_all(world: World) -> Iterator[tuple[int, int, int, int]]:
+    """(id, time, number, age in ms) of every frame that was sent with a value."""
+    for at, frame in world.bus.sent:
+        number, age = shown(frame)
+        if number != NOT_AVAILABLE:
+            yield frame.can_id, at, number, age
+
+
+@pytest.mark.parametrize("frames_before", [0, 64])
+def test_frames_that_become_old_while_they_are_handed_over_are_made_anew(
+    monkeypatch: pytest.MonkeyPatch, frames_before: int
+) -> None:
+    """The process is held up behind the read, or when the kernel has taken 64 of 100 frames."""
+    world = World()
+    (wire,) = world.wires
+    start, hold_up, read = world.now, 300 * MS, wire.read
+    escs = (EscSettings("esc1", timeout_ns=SECOND),)
+    loop = loop_in(world, monkeypatch, escs, compiled(dbc_text(MANY, TIMES)))
+    loop.open()
+    loop.begin()
+    wire.stream(start, start + SECOND, 100 * MS)
+    run(loop, world, start + SECOND)
+    held, sent = len(wire.frames) + 1, 0
+
+    def slow_read(most: int = 4096) -> bytes:
+        data = read(most)
+        if data:
+            monkeypatch.setattr(wire, "read", read)
+            world.now += hold_up
+        return data
+
+    def count(frame: CanFrame) -> None:
+        nonlocal sent
+        sent += shown(frame)[0] == held
+        if sent == frames_before:
+            world.bus.on_send = lambda _frame: None
+            world.now += hold_up
+
+    world.bus.sent.clear()
+    if frames_before:
+        world.bus.on_send = count
+    else:
+        monkeypatch.setattr(wire, "read", slow_read)
+    wire.send(world.now, bundled=True)
+    whole = wire.frames[-1]
+    run(loop, world, world.now + 900 * MS)
+    loop.close()
+    found = [each for each in shown_of_all(world) if each[2] == held]
+    early = [each for each in found if each[1] < whole + hold_up]
+    assert len(early) == frames_before
+    assert {can_id for can_id, *_ in found} == {message.can_id for message in MANY}
+    for _, at, _, age in found:
+        assert 0 <= at - whole - age * MS < 2 * MS
+
+
+def test_a_bus_that_takes_a_part_of_what_is_handed_over_gets_the_rest(
+    monkeypatch: pytest.MonkeyPatch, core_language: str
+) -> None:
+    """The kernel takes six of 25 frames at once. The others follow before the next values."""
+    world = World()
+    (wire,) = world.wires
+    start, period = world.now, 50 * MS
+    messages = MANY[:25]
+    world.bus.frame_ns = 200_000
+    layout = compiled(dbc_text(messages, TIMES.replace("20", "1000")))
+    loop = loop_in(world, monkeypatch, [EscSettings("esc1")], layout)
+    loop.open()
+    loop.begin()
+    wire.stream(start + 5 * MS, start + SECOND, period)
+    run(loop, world, start + SECOND)
+    status = loop.gateway.status
+    loop.close()
+    assert len(world.bus.sent) == status.sent_frames
+    assert status.send_failures >= 19 * 3
+    assert status.dropped_frames == 0
+    found = list(shown_of_all(world))
+    for number, whole in enumerate(wire.frames, 1):
+        in_time = {
+            can_id
+            for can_id, at, shown_number, _ in found
+            if shown_number == number and at < whole + period // 2
+        }
+        assert in_time == {message.can_id for message in messages}
+    if core_language == "C":
+        assert cast("NativePoller", loop._poller).count > 500
 
 
 @pytest.mark.parametrize("blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}])

@@ -30,6 +30,7 @@ from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Received
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler, Poller
+from kontronik_can_gw.runtime.serial_port import PortLost
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
@@ -40,9 +41,15 @@ NS_PER_BYTE = KONTRONIK.byte_ns
 NOT_AVAILABLE = 0xFFFFFFFF
 _FIRST_PORT, CAN_FD = 1000, 2000
 _MAX_READ = 4096
-_TIMES = """BA_DEF_DEF_ "GenMsgCycleTime" 20;
+TIMES = """BA_DEF_DEF_ "GenMsgCycleTime" 20;
 BA_DEF_DEF_ "GenMsgSendType" "CyclicAndEvent";
 """
+
+
+def speed_and_age(esc: str = "") -> list[Sig]:
+    """The signals of an ESC's speed and of its age in ms."""
+    speed = Sig(f"{esc}ElectricalSpeed", 0, 32, unit="1/min")
+    return [speed, Sig(f"{esc}DataAge", 32, 16, unit="ms")]
 
 
 def layout_of(escs: Sequence[EscSettings]) -> Layout:
@@ -50,9 +57,8 @@ def layout_of(escs: Sequence[EscSettings]) -> Layout:
     messages = []
     for n, esc in enumerate(escs):
         name = esc.name if len(escs) > 1 else ""
-        speed = Sig(f"{name}ElectricalSpeed", 0, 32, unit="1/min")
-        messages.append(Msg(f"M{n}", 256 + n, 8, [speed, Sig(f"{name}DataAge", 32, 16, unit="ms")]))
-    return compiled(dbc_text(messages, _TIMES), [esc.name for esc in escs])
+        messages.append(Msg(f"M{n}", 256 + n, 8, speed_and_age(name)))
+    return compiled(dbc_text(messages, TIMES), [esc.name for esc in escs])
 
 
 def live(speed: int) -> bytes:
@@ -76,6 +82,10 @@ class Wire:
         self.now_set = self.settings
         self.looks: list[int] = []
         """When the settings were looked at, or set."""
+        self.fails_at: int | None = None
+        """From this time on the port is readable and each read fails, which takes a millisecond."""
+        self.hangs_up = False
+        """A read that fails returns nothing, instead of an I/O error."""
         self._world = world
         self._number = number
         self._bytes = bytearray()
@@ -104,7 +114,10 @@ class Wire:
     @property
     def next_arrival(self) -> int | None:
         """When it becomes readable; in the past where it is."""
-        return self.arrivals[self._read] if self._read < len(self.arrivals) else None
+        times = self.arrivals[self._read : self._read + 1]
+        if self.fails_at is not None:
+            times.append(self.fails_at)
+        return min(times, default=None)
 
     # as a SerialPort
 
@@ -112,6 +125,9 @@ class Wire:
         return _FIRST_PORT + self._number
 
     def read(self, most: int = _MAX_READ) -> bytes:
+        if self._has_failed:
+            self._world.now += MS
+            raise PortLost("hung up" if self.hangs_up else "Input/output error")
         count = min(self.waiting, most)
         data = bytes(self._bytes[self._read : self._read + count])
         self._read += count
@@ -120,7 +136,11 @@ class Wire:
 
     @property
     def waits_to_be_read(self) -> bool:
-        return bool(self.waiting)
+        return self._has_failed or bool(self.waiting)
+
+    @property
+    def _has_failed(self) -> bool:
+        return self.fails_at is not None and self.fails_at <= self._world.now
 
     def discard(self) -> None:
         self._read += self.waiting
@@ -137,7 +157,8 @@ class Wire:
         return held
 
     def close(self) -> None:
-        pass
+        """Close the port; it works when it is opened again."""
+        self.fails_at = None
 
 
 class Bus(CanPort):
@@ -153,6 +174,8 @@ class Bus(CanPort):
         self.clock_error = 0
         """Of the times that are told."""
         self.answer = Sent.OK
+        self.refused: list[int] = []
+        """When each frame was refused with ``answer``, which takes 0.1 ms."""
         self.frame_ns = 0
         """How long a frame takes on the bus; not 0: the kernel takes six in advance."""
         self._out: list[int] = []
@@ -202,6 +225,8 @@ class Bus(CanPort):
                     return count, Sent.FULL
                 self._out.append(max([self._world.now, *self._out[-1:]]) + self.frame_ns)
             if self.answer is not Sent.OK:
+                self.refused.append(self._world.now)
+                self._world.now += MS // 10
                 return count, self.answer
             self.sent.append((self._world.now, frame))
             self.on_send(frame)
@@ -230,6 +255,8 @@ class World:
         self.looks: list[int] = [self.now]
         self.hold_up: Callable[[], int] = lambda: 0
         """How long the process stands still behind a wait, before it looks at the clock, in ns."""
+        self.poll_fault: Callable[[bool], int] = lambda _is_all: 0
+        """The errno with which a poll in C fails; 0: it does not. True: it asks for all descriptors."""
         self.until = 1 << 62
         """Turns in C end by then."""
         self.opening_ns = 0
@@ -261,8 +288,9 @@ class World:
 
     def pass_until(self, until: int, for_room: int) -> None:
         """Time goes by until something comes, or the bus takes frames; then the process may stand still."""
-        found = [wire.next_arrival for wire in self.wires if wire.fileno() not in self.blind]
-        if CAN_FD not in self.blind and self.bus.inbox:
+        watched = self.handlers.keys() - self.blind
+        found = [wire.next_arrival for wire in self.wires if wire.fileno() in watched]
+        if CAN_FD in watched and self.bus.inbox:
             found.append(self.bus.inbox[0][1])
         if for_room:
             found.append(self.bus.room_at)
