@@ -1,5 +1,6 @@
 """The files as they are installed: judged by systemd's own tools where those are, and read line by line everywhere."""
 
+import ast
 import os
 import re
 import shutil
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import kontronik_can_gw
 from kontronik_can_gw.cli.service import planned
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
@@ -98,6 +100,65 @@ def test_it_may_open_serial_ports_and_nothing_else() -> None:
         assert {"modprobe@usbserial.service", "modprobe@cdc_acm.service"} <= set(
             unit[name][0].split()
         )
+
+
+PACKAGE = Path(kontronik_can_gw.__file__).parent
+IN_LIBRARIES: dict[str, set[str]] = {
+    "run": set(),
+    # paho connects to the broker; getaddrinfo asks the kernel for this machine's addresses
+    "mqtt": {"AF_INET", "AF_INET6", "AF_NETLINK"},
+    "metrics": set(),
+}
+"""The address families that a command needs besides the ones its own code names."""
+
+
+def reachable(command: str) -> set[Path]:
+    """Return the modules that a command may import at any time."""
+    found: set[Path] = set()
+    waiting = {f"kontronik_can_gw.cli.{command}"}
+    while waiting:
+        place = PACKAGE.parent.joinpath(*waiting.pop().split("."))
+        file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+        if file in found or not file.exists():
+            continue
+        found.add(file)
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                waiting |= {each.name for each in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                waiting |= {f"{node.module}.{each.name}" for each in node.names} | {node.module}
+    return {file for file in found if file.is_relative_to(PACKAGE)}
+
+
+def named_families(files: set[Path]) -> set[str]:
+    """Return the address families that modules name, such as socket.AF_CAN."""
+    return {
+        node.attr
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute) and node.attr.startswith("AF_")
+    }
+
+
+def allowed_families(unit: str) -> set[str]:
+    """Return the address families that a unit permits."""
+    return {word for line in settings(unit)["RestrictAddressFamilies"] for word in line.split()}
+
+
+@pytest.mark.parametrize("name", [*NAMES, *BESIDE])
+def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) -> None:
+    unit = files()[name]
+    command = settings(unit)["ExecStart"][0].split()[1]
+    modules = reachable(command)
+    if (
+        command == "metrics"
+    ):  # it listens and reads one file; what it shares with others opens nothing
+        modules = {PACKAGE / "desk" / "metrics.py"}
+    assert allowed_families(unit) == named_families(modules) | IN_LIBRARIES[command]
+
+
+def test_the_gateway_may_use_can_rtnetlink_and_the_notify_socket_only() -> None:
+    assert allowed_families(files()[NAMES[0]]) == {"AF_CAN", "AF_NETLINK", "AF_UNIX"}
 
 
 def test_an_instance_has_a_configuration_and_folders_of_its_own() -> None:
