@@ -4,6 +4,7 @@
     tests/vm/run --which            which of them `auto` takes, or none
 
 Prints what COMMAND prints, stdout and stderr apart, and exits with its exit code; 124: time-out; 125: the VM failed.
+COMMAND finds the programs of .venv first. `make test` sets up .venv and a virtual machine.
 
 native  COMMAND itself. Without the right to make interfaces: in a network namespace of its own, by `unshare` or `sudo`.
 uml     User Mode Linux, 2 s to boot, Python at full speed. vcan, CAN FD, vxcan, gateway, BCM, J1939, slcan, tbf, netem.
@@ -66,11 +67,20 @@ def passed_on() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if PASSED_ON.match(name)}
 
 
+SET_UP = "`make test` sets up .venv and a kernel with vcan."
+
+
+def is_in_venv() -> bool:
+    """Whether this Python is a virtual environment's, which has the project and its test tools."""
+    return sys.prefix != sys.base_prefix
+
+
 def extend_path() -> None:
-    """By the folders of `ip` and `tc`."""
-    folders = os.environ.get("PATH", "").split(os.pathsep)
-    further = [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders]
-    os.environ["PATH"] = os.pathsep.join(filter(None, folders + further))
+    """Puts the virtual environment's programs first in PATH, and the folders of `ip` and `tc` last."""
+    folders = [os.path.join(sys.prefix, "bin")] if is_in_venv() else []
+    folders += os.environ.get("PATH", "").split(os.pathsep)
+    folders += ["/usr/sbin", "/usr/bin", "/sbin", "/bin"]
+    os.environ["PATH"] = os.pathsep.join(filter(None, dict.fromkeys(folders)))
 
 
 # --- this kernel
@@ -353,13 +363,19 @@ def main() -> int:
     if args.backend in ("auto", "native"):
         prefix = native_prefix()
         if prefix is None and args.backend == "native" and not args.which:
-            print("vm/run: native: this kernel has no vcan, or not for us", file=sys.stderr)
+            print(
+                "vm/run: native: this kernel has no vcan, or this user may not make one. "
+                "Use a virtual machine: --backend auto.",
+                file=sys.stderr,
+            )
             return VM_FAILED
     vms = installed() if args.backend == "auto" else [args.backend]
     if args.which:
         names = ["native"] if prefix is not None else [vm for vm in vms if vm in installed()]
         print(names[0] if names else "none")
         return 0 if names else 1
+    if not is_in_venv():
+        print(f"vm/run: {sys.executable} is not the project's .venv. {SET_UP}", file=sys.stderr)
     if prefix is not None:
         return run_native([*prefix, *args.command], args.timeout)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -368,8 +384,8 @@ def main() -> int:
         code, started = run_in_vm(vm, args.command, args.rw, args.timeout)
         if code != VM_FAILED or started:
             return code
-    if not vms:
-        print("vm/run: no vcan here, and no VM: run tests/vm/setup.sh uml", file=sys.stderr)
+    missing = ", and none of its virtual machines starts" if vms else " and no virtual machine"
+    print(f"vm/run: this kernel has no vcan{missing}. {SET_UP}", file=sys.stderr)
     return VM_FAILED
 
 
