@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from child_signals import use_defaults_in_children
+
+use_defaults_in_children()
 
 if not os.environ.get("KCG_VCAN"):
     import can  # noqa: F401
@@ -69,16 +72,23 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(autouse=True, scope="session")
 def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Gateways in this process find a machine's id; a container or a fresh root has none, of which a configuration warns.
+    """Makes the tests independent of how this machine is set up.
 
-    And no configuration in /etc, as where the gateway is installed.
+    - A machine id: containers and fresh roots have none, and the configuration warns about that.
+    - No configuration in /etc: an installed gateway has one.
+    - A runtime folder of their own, for this process and its children. A user without a session
+      has none, and a gateway of the system must not meet the locks of the tests. A child that
+      runs as root still uses /run/kontronik-can-gw.
     """
     from kontronik_can_gw.cli import arguments
-    from kontronik_can_gw.runtime import machine
+    from kontronik_can_gw.runtime import locks, machine
 
     file = tmp_path_factory.mktemp("machine") / "machine-id"
     file.write_text("0123456789abcdef0123456789abcdef\n")
+    runtime = tmp_path_factory.mktemp("runtime")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(runtime))
+        patch.setattr(locks, "SYSTEM_FOLDER", runtime / "kontronik-can-gw" / "lock")
         patch.setattr(machine, "_IDENTITIES", (str(file), "/etc/machine-id"))
         patch.setattr(arguments, "CONFIG_PLACES", arguments.CONFIG_PLACES[:1])
         yield

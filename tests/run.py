@@ -33,6 +33,8 @@ from pathlib import Path
 from typing import NoReturn
 from xml.etree import ElementTree as ET
 
+from child_signals import use_defaults_in_children
+
 PROJECT = Path(__file__).resolve().parent.parent
 PATH = os.pathsep.join(
     [str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"]
@@ -261,7 +263,9 @@ def main() -> int:
     os.environ["PATH"] = PATH
     with tempfile.TemporaryDirectory(prefix="kcg-test.", ignore_cleanup_errors=True) as folder:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda number, _frame: leave(folder, number))
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, lambda number, _frame: leave(folder, number))
+        use_defaults_in_children()
         scratch = Path(folder)
 
         def run_lane(lane: Sequence[str]) -> list[Result]:

@@ -1,0 +1,67 @@
+"""The tests do not depend on how they were started: under nohup, in the background, or without a session."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.runtime import locks
+
+TESTS = Path(__file__).parent
+IGNORING = ["sh", "-c", 'trap "" HUP INT QUIT; exec "$@"', "sh", sys.executable, "-c"]
+"""Starts Python as nohup and a shell's background job do, with these signals ignored."""
+HUP, INT, QUIT = 1, 2, 3
+
+
+def run_ignoring(script: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*IGNORING, script],
+        cwd=TESTS,
+        env=os.environ | {"KCG_VCAN": "1", "CI": ""},  # KCG_VCAN: conftest imports no libraries
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_children_of_tests_have_default_signals_under_nohup() -> None:
+    script = "import conftest, subprocess; subprocess.run(['cat', '/proc/self/status'])"
+    done = run_ignoring(script)
+    assert done.returncode == 0, done.stderr
+    for mask in ("SigIgn", "SigBlk"):
+        found = re.search(rf"^{mask}:\s*([0-9a-f]+)$", done.stdout, re.MULTILINE)
+        assert found is not None
+        assert not any(int(found[1], 16) >> (number - 1) & 1 for number in (HUP, INT, QUIT))
+
+
+def test_tests_themselves_go_on_ignoring_a_hangup_under_nohup() -> None:
+    script = "import conftest, os, signal; os.kill(os.getpid(), signal.SIGHUP); print('alive')"
+    assert run_ignoring(script).stdout == "alive\n"
+
+
+@pytest.mark.parametrize(("ignored", "code"), [(True, 0), (False, 128 + HUP)])
+def test_make_test_goes_on_after_a_hangup_only_under_nohup(ignored: bool, code: int) -> None:
+    script = (
+        "import run, sys; run.STEPS['lint'] = 'kill -HUP $PPID; sleep 0.1'; "
+        "sys.argv = ['run.py', 'test', '--only', 'lint']; sys.exit(run.main())"
+    )
+    if ignored:
+        done = run_ignoring(script)
+        assert done.stdout.endswith("1 passed, 0 failed, 0 skipped\n")
+    else:
+        command = [sys.executable, "-c", script]
+        done = subprocess.run(command, cwd=TESTS, capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+
+
+def test_locks_of_tests_are_in_a_folder_that_every_user_can_write() -> None:
+    """Without a session a user has no /run/user/UID."""
+    folder = locks.lock_folder()
+    assert not folder.is_relative_to("/run")
+    folder.mkdir(parents=True, exist_ok=True)
+    assert os.access(folder, os.W_OK)
+    assert Path(os.environ["XDG_RUNTIME_DIR"], "kontronik-can-gw", "lock") == folder
