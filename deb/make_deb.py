@@ -53,13 +53,17 @@ def version() -> str:
 
 
 def source_time() -> int:
-    """Seconds since 1970 of everything in a package."""
+    """Seconds since 1970 of everything in a package. Exits with one line if it is unknown."""
     if given := os.environ.get("SOURCE_DATE_EPOCH"):
         return int(given)
     command = ["git", "-C", str(PROJECT), "log", "-1", "--format=%ct"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        sys.exit("make_deb.py: no git repository: set SOURCE_DATE_EPOCH to the sources' time")
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        sys.exit(
+            "make_deb.py: git cannot tell the time of the last commit: it is missing, or this is no "
+            "clone. Set it by hand: SOURCE_DATE_EPOCH=$(date +%s) make deb"
+        )
     return int(done.stdout)
 
 

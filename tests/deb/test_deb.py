@@ -61,8 +61,24 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     wheel = zipped(folder / "gateway.whl", files)
     library = {"bitstruct/__init__.py": b"", "bitstruct/c.so": b"", "bitstruct.data/scripts/x": b""}
     libraries = [zipped(folder / "bitstruct.whl", library)]
-    packages = make_deb.make(wheel, libraries, folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(
+            "SOURCE_DATE_EPOCH", "1700000000"
+        )  # the sources may be no clone of a repository
+        packages = make_deb.make(wheel, libraries, folder)
     return {path.stem.rpartition("_")[2]: path.read_bytes() for path in packages}
+
+
+@pytest.mark.parametrize("is_git_installed", [True, False])
+def test_without_a_repository_the_remedy_is_one_line(
+    is_git_installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
+    monkeypatch.setattr(make_deb, "PROJECT", tmp_path)
+    if not is_git_installed:
+        monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SystemExit, match=r"^make_deb\.py: git .* SOURCE_DATE_EPOCH=.* make deb$"):
+        make_deb.source_time()
 
 
 def contents(package: bytes, part: str = "--fsys-tarfile") -> dict[str, tarfile.TarInfo]:
