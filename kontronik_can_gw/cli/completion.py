@@ -7,6 +7,7 @@ import shtab
 
 from kontronik_can_gw.cli import make_parser
 from kontronik_can_gw.cli.arguments import option
+from kontronik_can_gw.desk.libraries import install_command
 from kontronik_can_gw.errors import RunError
 
 _SHELLS = ("bash", "zsh", "tcsh", "fish")
@@ -29,7 +30,8 @@ def main(args: argparse.Namespace) -> int:
     """Print the script. RunError where the installed shtab is too old for the shell."""
     if args.shell not in shtab.SUPPORTED_SHELLS:
         raise RunError(
-            f"{args.shell}: needs a newer shtab than {shtab.__version__}: pip install --upgrade shtab"
+            f"{args.shell}: needs a newer shtab than {shtab.__version__}. "
+            f"Install it: {install_command('shtab')}"
         )
     parser = make_parser()
     for action in _actions(parser):

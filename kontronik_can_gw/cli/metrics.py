@@ -7,8 +7,8 @@ from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import CONFIG, option
 from kontronik_can_gw.cli.common import announced_config, say, stopping_on_signals
+from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.monitor.status import status_file
-from kontronik_can_gw.errors import RunError
 
 
 def _loopback(text: str) -> tuple[str, int]:
@@ -42,7 +42,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         from kontronik_can_gw.desk.metrics import server_of
     except ImportError:
-        raise RunError("needs prometheus-client: pip install 'kontronik-can-gw[metrics]'") from None
+        raise missing_library("metrics", "metrics") from None
     file = args.file or status_file(args.config or announced_config())
     host, port = args.listen
     stopped, server = threading.Event(), server_of(file, host, port)

@@ -18,6 +18,7 @@ from kontronik_can_gw.cli.common import (
 from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.config.keys import Config, MqttConfig
 from kontronik_can_gw.config.kinds import BROKER
+from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.mqtt.messages import Publisher, Topics
 from kontronik_can_gw.desk.sources import Bus, can_config
 from kontronik_can_gw.errors import RunError, UserError
@@ -60,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         from kontronik_can_gw.desk.mqtt.client import MqttClient
     except ImportError:
-        raise RunError("needs paho-mqtt 2: pip install 'kontronik-can-gw[mqtt]'") from None
+        raise missing_library("MQTT", "mqtt") from None
     if args.file is not None:
         raise UserError(
             f"{args.file}: recordings are not published any more. Type kontronik-can-gw replay {args.file} --on can --channel vcan0 "

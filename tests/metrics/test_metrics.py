@@ -22,6 +22,7 @@ from statistics_bench import Bench, with_nodes
 from vcan_tools import GatewayProcess
 
 from kontronik_can_gw.desk import metrics as metrics_module
+from kontronik_can_gw.desk.libraries import EXTRAS, install_command
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
@@ -261,25 +262,25 @@ def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
 
 
 @pytest.mark.parametrize(
-    ("words", "package", "name", "extra"),
+    ("words", "package", "said", "extra"),
     [
         (
             ("metrics", "--listen", "127.0.0.1:0"),
             "prometheus_client",
-            "prometheus-client",
+            "metrics needs prometheus-client>=0.20. ",
             "metrics",
         ),
-        (("mqtt", "--broker", "x"), "paho", "paho-mqtt 2", "mqtt"),
+        (("mqtt", "--broker", "x"), "paho", "MQTT needs paho-mqtt>=2. ", "mqtt"),
     ],
 )
-def test_without_the_library_its_extra_is_named(
-    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], package: str, name: str, extra: str
+def test_without_the_library_the_command_that_installs_it_is_named(
+    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], package: str, said: str, extra: str
 ) -> None:
     for module in list(sys.modules):
         if module.startswith((package, f"kontronik_can_gw.desk.{extra}")):
             monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, package, None)
-    assert refused(1, *words) == f"needs {name}: pip install 'kontronik-can-gw[{extra}]'"
+    assert refused(1, *words) == said + f"Install it: {install_command(EXTRAS[extra])}"
 
 
 def test_it_serves_the_file_of_a_configuration_on_this_machine_until_sigterm(

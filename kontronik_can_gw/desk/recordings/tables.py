@@ -9,9 +9,9 @@ from datetime import datetime
 from functools import cached_property, partial
 from typing import IO, TYPE_CHECKING, Any
 
+from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock, Sample
-from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.native import load
 
@@ -128,9 +128,7 @@ class ParquetTable:
             import pyarrow as pa  # type: ignore[import-untyped]
             from pyarrow import compute, parquet
         except ImportError:
-            raise RunError(
-                "Parquet needs pyarrow: pip install 'kontronik-can-gw[parquet]'"
-            ) from None
+            raise missing_library("Parquet", "parquet") from None
         self._pa: Any = pa
         self._compute: Any = compute
         self._table = table

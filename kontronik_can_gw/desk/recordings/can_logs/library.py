@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.recordings.can_logs.text import (
     OLDEST_WALL_S,
     SECOND_NS,
@@ -145,7 +146,7 @@ def mf4_library() -> Any:
     try:
         import asammdf  # noqa: F401
     except ImportError:
-        raise RunError("MF4 needs asammdf: pip install 'kontronik-can-gw[mf4]'") from None
+        raise missing_library("MF4", "mf4") from None
     # what it says is said again by us, in one line
     logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)
     library = importlib.import_module("can.io.mf4")
