@@ -1,18 +1,22 @@
-"""Opens the CAN interface that the configuration names: SocketCAN by a socket of our own, any other by python-can's driver.
+"""Opens the CAN interface of the configuration: SocketCAN through a socket of our own, others through python-can.
 
-Those have no descriptor to wait on: they are received from by a thread, a bounded queue, a descriptor. What may touch what: ``_read`` and
-``_fail`` run in the worker's thread, everything else in the loop's. They share ``_ids``, ``_failed`` and ``_dropped`` (each written by
-one side only) and the queue.
+The drivers of python-can have no descriptor to wait on. A thread receives from them and hands the
+frames over through a bounded queue with a descriptor. ``_read`` and ``_fail`` run in that thread,
+everything else in the loop's. Both sides share ``_ids``, ``_failed`` and ``_dropped`` (each written
+by one side only), the queue, and ``_own_frames``, which has a lock.
 """
 
 import contextlib
 import logging
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.lean import without_asammdf
@@ -34,6 +38,10 @@ log = logging.getLogger("kontronik_can_gw")
 QUEUE_LENGTH = 1024
 _POLL_S = 0.1
 _MAX_END_S = 1.0
+_RETURNING_OWN_FRAMES = ("udp_multicast",)
+"""Interfaces that return each sent frame as if another device had sent it."""
+_RETURN_LIMIT_NS = 10 * SECOND
+"""A sent frame that has not been returned by then was lost."""
 
 
 def check_interface(config: CanConfig) -> None:
@@ -60,20 +68,65 @@ def open_can(config: CanConfig) -> CanPort:
     if config.fd:
         options |= {"fd": True, "data_bitrate": config.data_bitrate}
     options.update(config.options)
+    own_frames = OwnFrames() if config.interface in _RETURNING_OWN_FRAMES else None
     try:
-        return DriverPort(can.Bus(interface=config.interface, channel=config.channel, **options))
+        bus = can.Bus(interface=config.interface, channel=config.channel, **options)
+        return DriverPort(bus, own_frames)
     except Exception as error:  # each of python-can's drivers fails in its own ways, a missing vendor library as NameError
         raise RunError(
             f"CAN {config.interface} {config.channel}: cannot be opened: {error}"
         ) from None
 
 
-class DriverPort(CanPort):
-    """A bus of python-can. A thread reads it as soon as there is an id to receive, until ``close`` or until the interface fails."""
+class OwnFrames:
+    """Recognizes frames of ours that the interface returns. Safe to use in two threads.
 
-    def __init__(self, bus: "can.BusABC") -> None:
+    Each sent frame is expected back once. Another device that sends an identical frame is still
+    noticed, because that frame arrives once more.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._expected: deque[tuple[int, CanFrame]] = deque()
+        """Times of sending and frames, oldest first."""
+
+    def add(self, frame: CanFrame, now: int) -> None:
+        """Expects a frame back. Call it before the frame is sent: the other thread may be faster."""
+        with self._lock:
+            while self._expected and now - self._expected[0][0] > _RETURN_LIMIT_NS:
+                self._expected.popleft()
+            self._expected.append((now, _as_received(frame)))
+
+    def discard(self, frame: CanFrame) -> None:
+        """No longer expects the frame: it could not be sent."""
+        self.is_own(frame)
+
+    def is_own(self, frame: CanFrame) -> bool:
+        """Whether a received frame is one of ours. Returns True once for each sent frame."""
+        received = _as_received(frame)
+        with self._lock:
+            for index, (_, expected) in enumerate(self._expected):
+                if expected == received:
+                    del self._expected[index]
+                    return True
+        return False
+
+
+def _as_received(frame: CanFrame) -> CanFrame:
+    """The frame without the fields that are not on the bus."""
+    return CanFrame(frame.can_id, frame.data, frame.extended, frame.fd)
+
+
+class DriverPort(CanPort):
+    """A bus of python-can, read by a thread from the first id to receive until ``close`` or a failure.
+
+    ``own_frames``: given for an interface that returns the frames sent through it.
+    """
+
+    def __init__(self, bus: "can.BusABC", own_frames: OwnFrames | None = None) -> None:
         super().__init__()
         self._bus = bus
+        self._own_frames = own_frames
         self._worker: Worker[None] | None = None
         self._frames: Handover[tuple[CanFrame, int | None]] = Handover(QUEUE_LENGTH)
         self._dropped = 0
@@ -141,7 +194,11 @@ class DriverPort(CanPort):
         for count, frame in enumerate(frames):
             if clock() > latest:
                 return count, Sent.LATE
+            if self._own_frames is not None and self._is_wanted(frame.key):
+                self._own_frames.add(frame, clock())
             answer = self._send_message(frame)
+            if self._own_frames is not None and answer is not Sent.OK:
+                self._own_frames.discard(frame)
             if answer is not Sent.OK:
                 return count, answer
         return len(frames), Sent.OK
@@ -177,7 +234,9 @@ class DriverPort(CanPort):
             return
         data, extended = bytes(message.data), message.is_extended_id
         frame = CanFrame(message.arbitration_id, data, extended, message.is_fd)
-        # what drivers put into ``timestamp`` counts from anything
+        if self._own_frames is not None and self._own_frames.is_own(frame):
+            return
+        # drivers count ``timestamp`` from different origins
         if not self._frames.put((frame, time.monotonic_ns())):
             self._dropped += 1
 

@@ -3,6 +3,7 @@
 import errno
 import itertools
 import os
+import queue
 import select
 import socket
 import struct
@@ -24,7 +25,7 @@ from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
-from kontronik_can_gw.runtime.open_can import QUEUE_LENGTH, DriverPort, open_can
+from kontronik_can_gw.runtime.open_can import QUEUE_LENGTH, DriverPort, OwnFrames, open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
 
@@ -359,6 +360,75 @@ def test_another_interfaces_refusal_is_busy() -> None:
     refusing = DriverPort(Refusing())  # type: ignore[arg-type]
     assert refusing.fileno() is None
     assert refusing.send(CanFrame(1, b"")) is Sent.BUSY
+
+
+class ReturningBus:
+    """A bus that returns each sent frame as if another device had sent it, as udp_multicast does."""
+
+    def __init__(self) -> None:
+        self.inbox: queue.Queue[can.Message] = queue.Queue()
+        self.is_full = False
+
+    def set_filters(self, _filters: object) -> None: ...
+
+    def shutdown(self) -> None: ...
+
+    def recv(self, timeout: float) -> can.Message | None:
+        try:
+            return self.inbox.get(timeout=timeout)
+        except queue.Empty:
+            return None
+
+    def send(self, sent: can.Message, timeout: float) -> None:
+        if self.is_full:
+            raise can.CanOperationError("full")
+        self.inbox.put(sent)
+
+
+def test_frames_that_the_interface_returns_are_not_received() -> None:
+    bus = ReturningBus()
+    port = DriverPort(bus, OwnFrames())  # type: ignore[arg-type]
+    own, other = CanFrame(0x680, b"own", page=2), CanFrame(0x680, b"other")
+    try:
+        port.set_receive_ids({0x680})
+        for _ in range(3):
+            assert port.send(own) is Sent.OK
+        bus.send(message(0x680, b"other"), 0)
+        assert receive(port, 1) == [other]
+        bus.is_full = True
+        assert port.send(own) is Sent.BUSY
+        bus.is_full = False
+        bus.send(message(0x680, b"own"), 0)  # another device sends what we could not send
+        assert receive(port, 1) == [own._replace(page=0)]
+    finally:
+        port.close()
+
+
+def test_an_identical_frame_of_another_device_is_received() -> None:
+    own_frames, frame = OwnFrames(), CanFrame(0x680, b"same")
+    own_frames.add(frame, 0)
+    assert [own_frames.is_own(frame) for _ in range(2)] == [True, False]
+    own_frames.add(frame, 0)
+    own_frames.add(CanFrame(0x681, b""), 11 * SECOND)
+    assert not own_frames.is_own(frame), "it was lost ten seconds ago"
+
+
+@pytest.mark.parametrize(("interface", "returns"), [("udp_multicast", True), ("virtual", False)])
+def test_udp_multicast_is_known_to_return_own_frames(
+    interface: str, returns: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is sent: the bus is one in this process."""
+    monkeypatch.setattr(can, "Bus", lambda **_: ReturningBus())
+    port = open_can(CanConfig(interface, "x"))
+    try:
+        port.set_receive_ids({0x680})
+        assert port.send(CanFrame(0x680, b"own")) is Sent.OK
+        assert port.send(CanFrame(0x680, b"last")) is Sent.OK
+        port._bus.inbox.put(message(0x680, b"other"))  # type: ignore[attr-defined]
+        expected = [CanFrame(0x680, data) for data in (b"own", b"last", b"other")]
+        assert receive(port, 1 if returns else 3) == expected[2 if returns else 0 :]
+    finally:
+        port.close()
 
 
 def test_one_thread_brings_the_wanted_frames_in_order() -> None:
