@@ -18,7 +18,7 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "A simulated ESC, the gateway, and the monitor, which knows the DBC. "
+    "A simulated ESC with simulated faults, the gateway, and the monitor, which knows the DBC. "
     "Exit code: 0 at its end, 2 wrong usage. The same with ports and a bus: simulate, run, monitor."
 )
 
@@ -26,7 +26,8 @@ EPILOG = (
 def main(args: argparse.Namespace) -> int:
     stop, end, bus = Event(), time.monotonic() + args.seconds, DemoBus(args.seed)
     monitor = Monitor(bus.bus)
+    say("the ESC and its faults are simulated; the gateway and the monitor are the real ones")
     with stopping_on_signals(stop.set):
         watch(bus, monitor, lambda: stop.is_set() or time.monotonic() >= end)
-    say(f"{monitor.view.frames} CAN frames decoded")
+    say(f"{monitor.view.frames} CAN frames of a simulated ESC decoded")
     return 0

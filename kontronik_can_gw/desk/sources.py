@@ -44,6 +44,8 @@ class Source:
     hints: tuple[str, ...] = ()
     """Possible causes where no frame comes."""
     progress = ""
+    simulation = ""
+    """What is simulated, if the frames are not those of a real bus."""
 
     def __init__(self, name: str, bus: BusLayout) -> None:
         self.name = name
@@ -174,6 +176,8 @@ _DEMO_STEP_S = 0.005
 
 class DemoBus(Source):
     """A bus on which a gateway sends the telemetry of one flight, again and again."""
+
+    simulation = "simulated ESC and faults"
 
     def __init__(self, seed: int) -> None:
         esc = {"port": "simulated", "pole_pairs": 7, "gear": 9.8}

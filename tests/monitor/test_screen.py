@@ -2,18 +2,20 @@
 
 import re
 from functools import cache
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.text import Text
 from simulated_bus import flight, layout_of, with_errors
 
-from kontronik_can_gw.desk.monitor.lines import number
+from kontronik_can_gw.desk.monitor.lines import number, shorten
 from kontronik_can_gw.desk.monitor.model import QUANTITIES, Monitor
 from kontronik_can_gw.desk.monitor.screen import screen, sparkline
 from kontronik_can_gw.desk.monitor.watch import obey
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.sources import Source
+from kontronik_can_gw.desk.sources import DemoBus, Source
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 
@@ -29,6 +31,7 @@ def bus_of(count: int) -> BusLayout:
     return layout_of([f"esc{index + 1}" for index in range(count)])
 
 
+LABELS = [quantity.label for quantity in QUANTITIES]
 KINDS = ["good", "errors", "lost", "silent", "replay", "none"]
 
 
@@ -102,10 +105,98 @@ def test_a_sparkline_shows_seconds_between_the_extremes_and_gaps() -> None:
     track.take(20.0)
     track.take(24.0)
     quantity = next(each for each in QUANTITIES if each.source == "battery_voltage")
-    assert sparkline(esc, quantity, 4).plain in ("▁ █▄", "▁ █▅")
-    assert sparkline(esc, quantity, 0).plain == ""
+    assert plain(sparkline(esc, quantity, 4)) in (["▁ █▄"], ["▁ █▅"])
+    assert plain(sparkline(esc, quantity, 0)) == [""]
     track.history.extend([-1e308, 1e308])
-    assert sparkline(esc, quantity, 2).plain == "▁▁"
+    assert plain(sparkline(esc, quantity, 2)) == ["▁▁"]
+
+
+def plain(lines: list[Text]) -> list[str]:
+    return [line.plain for line in lines]
+
+
+def test_a_sparkline_of_several_lines_has_eight_steps_in_each() -> None:
+    (esc,) = Monitor(bus_of(1)).escs
+    track = esc.tracks["battery_current"]
+    track.history.extend([0.0, 7.0, 8.0, None, 15.0, 16.0, 23.0])
+    quantity = next(each for each in QUANTITIES if each.source == "battery_current")
+    assert plain(sparkline(esc, quantity, 7, 3)) == [
+        "     ▁█",
+        "  ▁ ███",
+        "▁██ ███",
+    ]
+
+
+@pytest.mark.parametrize("size", [(80, 24), (80, 50), (120, 60)])
+def test_charts_of_one_esc_use_the_height_that_there_is(size: tuple[int, int]) -> None:
+    monitor = seen(1)
+    lines = texts(monitor, size)
+    labels = [i for i, text in enumerate(lines) if text.startswith(tuple(LABELS))]
+    heights = [after - before for before, after in pairwise(labels)]
+    assert len(labels) == len(LABELS)
+    spare = size[1] - 24 - 6
+    assert sum(heights) + 1 >= min(len(LABELS) + max(0, spare), 8 * len(LABELS))
+    assert sorted(heights, reverse=True) == heights, "the most important ones are taller"
+
+
+def test_charts_keep_their_height_when_errors_come() -> None:
+    places = [
+        [
+            i
+            for i, text in enumerate(texts(seen(1, kind), (80, 60)))
+            if text.startswith(tuple(LABELS))
+        ]
+        for kind in ("good", "errors")
+    ]
+    assert places[0] == places[1]
+
+
+@pytest.mark.parametrize(("size", "lines"), [((80, 24), 1), ((80, 50), 4), ((120, 60), 5)])
+def test_histories_of_all_escs_are_below_their_table(size: tuple[int, int], lines: int) -> None:
+    shown = texts(seen(2), size)
+    places = [
+        i for i, text in enumerate(shown) if re.match(r"esc[12] +(motor speed|power stage)", text)
+    ]
+    assert [re.split(r"  +", shown[place])[0] for place in places] == [
+        "esc1 motor speed",
+        "esc2 motor speed",
+        "esc1 power stage",
+        "esc2 power stage",
+    ]
+    assert places[1] - places[0] == lines
+
+
+@pytest.mark.parametrize("kind", ["good", "errors"])
+def test_long_names_do_not_push_out_the_charge(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = seen(2, kind)
+    names = ("left_front_m", "left_front_n")
+    for esc, name in zip(monitor.escs, names, strict=True):
+        monkeypatch.setattr(esc, "name", name)
+    head, *rows = texts(monitor, (80, 24))[1:4]
+    assert head.endswith(" mAh")
+    for esc, row in zip(monitor.escs, rows, strict=True):
+        assert row.endswith(f" {number(esc.number('consumed_charge'))}")
+        shortened = row.partition(" ")[0]
+        assert "…" in shortened and shortened[-1] == esc.name[-1], "the end is what differs"
+    wide = "\n".join(texts(monitor, (120, 24)))
+    assert all(name in wide for name in names)
+
+
+def test_a_name_is_shortened_in_its_middle() -> None:
+    assert shorten("left_front_1", 12) == "left_front_1"
+    assert [shorten("left_front_1", width) for width in (9, 6, 2, 1)] == [
+        "left…nt_1",
+        "lef…_1",
+        "l…",
+        "…",
+    ]
+
+
+def test_the_demo_is_shown_as_a_simulation() -> None:
+    source = DemoBus(1)
+    monitor = Monitor(source.bus)
+    assert "simulated ESC and faults" in texts(monitor, (80, 24), source)[0]
+    assert "simulated" not in texts(seen(1), (80, 24))[0]
 
 
 def test_a_value_that_is_not_available_is_a_dash() -> None:

@@ -92,6 +92,15 @@ def words(text: str) -> str:
     ).replace("rpm", "RPM")
 
 
+def shorten(name: str, width: int) -> str:
+    """A name of at most ``width`` characters: without its middle, because names often differ at an end."""
+    if len(name) <= width:
+        return name
+    tail = max(0, (width - 1) // 2)
+    head = max(0, width - 1 - tail)
+    return f"{name[:head]}…{name[len(name) - tail :]}"
+
+
 def number(value: float | None, digits: int = 0) -> str:
     """A formatted value in groups of three digits; a dash where it is not available."""
     return "-" if value is None else f"{value:,.{digits}f}".replace(",", " ")

@@ -14,6 +14,7 @@ from kontronik_can_gw.desk.monitor.lines import (
     cut,
     line,
     number,
+    shorten,
     table,
     words,
     wrapped,
@@ -42,8 +43,19 @@ _TROUBLES = {
 }
 _PAGE_WIDTHS = (16, 5, 8, 8, 8)
 """Minimum widths of a page's columns: name, unit, value, minimum, maximum."""
+_HISTORY_WIDTHS = (16, 5, 8)
+"""Minimum widths of the columns between name and history below the table of all ESCs."""
+_HISTORIES = QUANTITIES[:4]
+"""Quantities whose histories are shown below the table of all ESCs."""
+_NAME_WIDTH, _LINK_WIDTH, _STATE_WIDTH, _VALUE_WIDTH = 7, 9, 12, 5
+"""Minimum widths of the columns of the table of all ESCs. States are cut to their width."""
+_SHORT_STATE_WIDTHS = (10, 6)
+"""Widths of the states if names leave no room for the kept columns; the second one if names are cut, too."""
+_LAST_KEPT = next(i for i, each in enumerate(QUANTITIES) if each.source == "consumed_charge")
+"""Names are cut before a column up to this quantity is left out."""
 _ALARM_LINES, _FEW_ALARM_LINES = 6, 2
 """Kept for errors and warnings on a page, and below the table, where room is short."""
+_MAX_CHART_LINES = 8
 
 
 def screen(
@@ -58,10 +70,12 @@ def screen(
     escs = monitor.escs if page == 0 else monitor.escs[page - 1 : page]
     if len(escs) == 1:
         kept = len(alarms(escs, width, _ALARM_LINES))
-        body = _page(escs[0], width)[: max(2, room - 1 - kept)]
+        # errors come and go: the heights of the charts must not depend on them
+        body = _page(escs[0], width, room - 1 - _ALARM_LINES)[: max(2, room - 1 - kept)]
     else:
         kept = len(alarms(escs, width, _FEW_ALARM_LINES))
         body = cut(table_of(escs, width), max(2, room - 1 - kept))
+        body += _histories(escs, width, room - 1 - _ALARM_LINES - len(body))
     lines += [*body, line()]
     lines += alarms(escs, width, max(0, height - 1 - len(lines)))
     lines = [*lines, *[line()] * height][: height - 1]
@@ -95,7 +109,10 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
 
 def _title(monitor: Monitor, source: Source) -> Text:
     made = line((f" {source.name} ", "bold reverse"))
-    made.append(f"  {source.progress}" if source.is_file else f"  {monitor.file}", "dim")
+    if source.simulation:
+        made.append(f"  {source.simulation}", "bold yellow")
+    else:
+        made.append(f"  {source.progress}" if source.is_file else f"  {monitor.file}", "dim")
     if (state := monitor.gateway.text("gateway_state")) is not None:
         made = line(made, "  gateway ", (words(state), STATES.get(words(state), "yellow")))
     can_state = monitor.gateway.text("can_state") or "unknown"
@@ -126,11 +143,13 @@ def _state_part(esc: Esc) -> Part:
     return ("-", "dim") if esc.state is None else (words(esc.state), "bold cyan")
 
 
-def _name_part(esc: Esc) -> Part:
-    """The name, marked where there are errors or warnings."""
+def _name_part(esc: Esc, width: int | None = None) -> Part:
+    """The name, with a mark if there are errors or warnings. ``width``: the name is shortened to fit."""
     severities = {flag.severity for flag in alarms_of(esc.active)}
     mark = "!!" if Severity.ERROR in severities else "!" * (Severity.WARNING in severities)
-    return f"{esc.name} {mark}".rstrip(), _MARKS[mark]
+    suffix = f" {mark}" if mark else ""
+    name = esc.name if width is None else shorten(esc.name, width - len(suffix))
+    return name + suffix, _MARKS[mark]
 
 
 def _value_part(esc: Esc, quantity: Quantity) -> Part:
@@ -140,19 +159,27 @@ def _value_part(esc: Esc, quantity: Quantity) -> Part:
     return mark + number(value, quantity.digits), "dim" if value is None else _MARKS[mark]
 
 
-def sparkline(esc: Esc, quantity: Quantity, width: int) -> Text:
-    """The last ``width`` seconds of a value between its extremes, the newest at the right."""
+def sparkline(esc: Esc, quantity: Quantity, width: int, height: int = 1) -> list[Text]:
+    """The last ``width`` seconds of a value between its extremes, the newest at the right.
+
+    Returns ``height`` lines, the top one first.
+    """
     track = esc.tracks[quantity.source]
     values = list(track.history)[-width:] if width else []
     scale = [value for value in (*values, track.low, track.high) if value is not None]
     low, span = min(scale, default=0.0), max(scale, default=0.0) - min(scale, default=0.0)
-    made = line()
+    steps = len(_LEVELS) * height
+    made = [line() for _ in range(height)]
     for value in values:
         if value is None:  # not available
-            made.append(" ")
-            continue
-        step = round((value - low) / span * (len(_LEVELS) - 1)) if 0 < span < inf else 0
-        made.append(_LEVELS[step], _MARKS.get(quantity.mark(value) or "-", "cyan"))
+            filled, style = 0, ""
+        else:
+            part = (value - low) / span if 0 < span < inf else 0
+            filled = 1 + round(part * (steps - 1))
+            style = _MARKS.get(quantity.mark(value) or "-", "cyan")
+        for index, each in enumerate(made):
+            level = filled - len(_LEVELS) * (height - 1 - index)
+            each.append(_LEVELS[min(level, len(_LEVELS)) - 1] if level > 0 else " ", style)
     return made
 
 
@@ -182,8 +209,8 @@ def alarms(escs: Sequence[Esc], width: int, room: int = 999) -> list[Text]:
     return [line(("no errors, no warnings", "green") if known else ("errors: -", "dim"))][:room]
 
 
-def _page(esc: Esc, width: int) -> list[Text]:
-    """Everything of one ESC, the most important first."""
+def _page(esc: Esc, width: int, height: int) -> list[Text]:
+    """Everything of one ESC, the most important first. The charts use ``height`` lines if that is enough."""
     age, cells = esc.number("data_age"), esc.number("cell_count")
     head = line(_name_part(esc), "  ", _state_part(esc), "  link ", _link_part(esc))
     if age is not None:
@@ -195,14 +222,48 @@ def _page(esc: Esc, width: int) -> list[Text]:
     seconds = max(0, min(HISTORY_S, width - sum(_PAGE_WIDTHS) - len(_PAGE_WIDTHS)))
     heads = ("", "", "now", "min", "max", f"last {seconds} s")
     rows: list[list[Part]] = [[(text, "dim") for text in heads]]
-    for quantity in QUANTITIES:
-        if esc.has(quantity.source):
-            track = esc.tracks[quantity.source]
-            extremes = (number(each, quantity.digits) for each in (track.low, track.high))
-            names = (quantity.label, "dim"), (quantity.unit, "dim")
-            history = sparkline(esc, quantity, seconds)
-            rows.append([*names, _value_part(esc, quantity), *extremes, history])
+    shown = [quantity for quantity in QUANTITIES if esc.has(quantity.source)]
+    heights = _chart_heights(len(shown), height - len(rows) - 2)
+    for quantity, lines in zip(shown, heights, strict=True):
+        track = esc.tracks[quantity.source]
+        extremes = (number(each, quantity.digits) for each in (track.low, track.high))
+        names = (quantity.label, "dim"), (quantity.unit, "dim")
+        chart = sparkline(esc, quantity, seconds, lines)
+        rows += _chart_rows((*names, _value_part(esc, quantity), *extremes), chart)
     return [head, line((about, "dim")), *table(rows, width, 2, (*_PAGE_WIDTHS, seconds))]
+
+
+def _chart_heights(count: int, height: int) -> list[int]:
+    """Lines of each of ``count`` charts in ``height`` lines, at least one; the first ones get the rest."""
+    each, more = divmod(height, max(1, count))
+    lines = [each + (index < more) for index in range(count)]
+    return [max(1, min(_MAX_CHART_LINES, number)) for number in lines]
+
+
+def _chart_rows(cells: Sequence[Part], chart: Sequence[Text]) -> Iterator[list[Part]]:
+    """Rows of a table whose last column is a chart; the other cells are in the first row."""
+    blank = [""] * len(cells)
+    for index, part in enumerate(chart):
+        yield [*(blank if index else cells), part]
+
+
+def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
+    """Charts of the most important quantities of all ESCs after an empty line; [] if they do not fit."""
+    known = [each for each in _HISTORIES if any(esc.has(each.source) for esc in escs)]
+    shown = known[: max(0, height - 2) // max(1, len(escs))]
+    charts = [(each, esc) for each in shown for esc in escs if esc.has(each.source)]
+    names = max(len(esc.name) for esc in escs)
+    seconds = min(HISTORY_S, width - names - 1 - sum(_HISTORY_WIDTHS) - len(_HISTORY_WIDTHS))
+    if not charts or seconds <= 0:
+        return []
+    lines = min(_chart_heights(len(charts), height - 2))
+    heads = ("ESC", "", "", "now", f"last {seconds} s")
+    rows: list[list[Part]] = [[(text, "dim") for text in heads]]
+    for quantity, esc in charts:
+        about = esc.name, (quantity.label, "dim"), (quantity.unit, "dim")
+        chart = sparkline(esc, quantity, seconds, lines)
+        rows += _chart_rows((*about, _value_part(esc, quantity)), chart)
+    return [line(), *table(rows, width, 3, (names, *_HISTORY_WIDTHS, seconds))]
 
 
 def table_of(escs: Sequence[Esc], width: int) -> list[Text]:
@@ -210,11 +271,35 @@ def table_of(escs: Sequence[Esc], width: int) -> list[Text]:
     found = [q for q in QUANTITIES if any(esc.has(q.source) for esc in escs)]
     speeds = [q for q in found if q.unit == "1/min"]
     shown = [*speeds[:1], *(q for q in found if q.head and q not in speeds)]
-    heads = ("ESC", "link", "state", *(q.head or q.unit for q in shown))
-    rows: list[list[Part]] = [[(head, "dim") for head in heads]]
-    for esc in escs:
-        values = [_value_part(esc, quantity) for quantity in shown]
+    kept = sum(q in speeds or QUANTITIES.index(q) <= _LAST_KEPT for q in shown)
+    values: list[list[Part]] = [[(q.head or q.unit, "dim") for q in shown]]
+    values += [[_value_part(esc, q) for q in shown] for esc in escs]
+    links = [_link_part(esc) for esc in escs]
+    room = width - _widest(links, _LINK_WIDTH) - 2
+    for column in range(kept):
+        room -= _widest([row[column] for row in values], _VALUE_WIDTH) + 1
+    name_width, state_width = _name_and_state_widths(escs, room)
+    rows: list[list[Part]] = [[("ESC", "dim"), ("link", "dim"), ("state", "dim"), *values[0]]]
+    for esc, link, cells in zip(escs, links, values[1:], strict=True):
         state = line(_state_part(esc))
-        state.truncate(12, overflow="ellipsis")
-        rows.append([_name_part(esc), _link_part(esc), state, *values])
-    return table(rows, width, 3, (7, 9, 12, *[5] * len(shown)))
+        state.truncate(state_width, overflow="ellipsis")
+        rows.append([_name_part(esc, name_width), link, state, *cells])
+    least = (_NAME_WIDTH, _LINK_WIDTH, state_width, *[_VALUE_WIDTH] * len(shown))
+    return table(rows, width, 3, least)
+
+
+def _name_and_state_widths(escs: Sequence[Esc], room: int) -> tuple[int, int]:
+    """Widths of the columns of names and states that fit into ``room``, or the smallest ones."""
+    names = _widest([_name_part(esc) for esc in escs], _NAME_WIDTH)
+    short, shortest = _SHORT_STATE_WIDTHS
+    for state in (_STATE_WIDTH, short):
+        if names + state <= room:
+            return names, state
+    if _NAME_WIDTH + short <= room:
+        return room - short, short
+    return _NAME_WIDTH, max(shortest, min(short, room - _NAME_WIDTH))
+
+
+def _widest(parts: Sequence[Part], least: int) -> int:
+    """Width of a column with these cells."""
+    return max(least, *(line(part).cell_len for part in parts))
