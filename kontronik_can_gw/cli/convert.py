@@ -132,7 +132,7 @@ def _report(
         say(f"{where}: {summary}, in {seconds:.1f} s", args.command)
         if "times" in recording.provenance and form != BYTES:
             say(f"times are {recording.provenance['times']}", args.command)
-    for line in damage:
+    for line in (*damage, *(f"{args.input}: {note}" for note in recording.clock_notes)):
         say(line, args.command)
 
 

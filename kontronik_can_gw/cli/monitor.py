@@ -91,5 +91,7 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
                 f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out."
             )
         yield Recording(opened, args.speed or 1.0, at_once=args.once)
-        for line in dict.fromkeys(filter(None, [*opened.damage, opened.left_out])):
+        for line in dict.fromkeys(
+            filter(None, [*opened.damage, *opened.clock_notes, opened.left_out])
+        ):
             say(f"warning: {line}")

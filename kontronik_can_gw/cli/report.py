@@ -57,16 +57,19 @@ def main(args: argparse.Namespace) -> int:
             if not args.start and not args.end:
                 where = "by this DBC. Is -c or --dbc the right one?"
             raise RunError(*damage, f"{args.input}: no values {where}")
+        recording.begin_ns = flight.origin_ns
+        clock = {"Clock": "; ".join(recording.clock_notes)}
         page = render(
             flight,
             source=source.name,
-            provenance=recording.provenance,
+            provenance=recording.provenance | clock,
             wall_ns=recording.wall_ns(flight.origin_ns),
             damage=recording.damage,
         )
         write_output(args.output, page)
     if recording.left_out:
         damage.append(f"{args.input}: {recording.left_out}")
+    damage += [f"{args.input}: {note}" for note in recording.clock_notes]
     for line in damage:
         say(line, "report")
     return 0

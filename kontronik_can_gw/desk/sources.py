@@ -121,6 +121,7 @@ class Recording(Source):
         self._frames = opened.frames()
         self._next = next(self._frames, None)
         self._clock = self._first_ns = 0 if self._next is None else self._next.time_ns
+        opened.begin_ns = self._first_ns
         self._last_pump = time.monotonic()
         self.ended = self._next is None
 

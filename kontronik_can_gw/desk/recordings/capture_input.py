@@ -23,7 +23,7 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS, timed
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, timed
 from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ _PLAYED = frozenset({Kind.BYTES, Kind.ADVANCE, Kind.COUNTERS})
 """What a player plays, and by which frames of the turn before are certain."""
 _LOOK_FOR_HEADER = 1 << 25
 _MAX_DAMAGE = 50
+_STEP_NS = 100_000_000
+"""A smaller change of the wall clock is a correction and not reported."""
 
 
 class CaptureInput(PlayedInput):
@@ -76,6 +78,16 @@ class CaptureInput(PlayedInput):
     def wall_ns(self, time_ns: int) -> int | None:
         offsets = (offset for since, offset in reversed(self._offsets) if since <= time_ns)
         return time_ns + next(offsets, self._begun[1])
+
+    @property
+    def clock_steps(self) -> Sequence[ClockStep]:
+        steps = []
+        offset = self._begun[1]
+        for time_ns, after in self._offsets:
+            if abs(after - offset) > _STEP_NS:
+                steps.append(ClockStep(time_ns, after - offset))
+            offset = after
+        return steps
 
     @property
     def channel(self) -> str:

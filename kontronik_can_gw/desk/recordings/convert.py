@@ -34,8 +34,6 @@ SUFFIXES = {
 }
 ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """What may go to standard output or through a pipe: it is text, and is written from its beginning to its end."""
-_CLOCK_SET_NS = 1_000_000_000
-"""How far a clock must be set to be worth a word."""
 
 
 class Output:
@@ -109,6 +107,7 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     if found is None:
         return None
     origin_ns, blocks = found
+    recording.begin_ns = origin_ns
     fields = [recording.fields[index] for index in choice.columns]
     has_utc = recording.wall_ns(origin_ns) is not None
     table = Table(fields, has_utc, origin_ns, recording.provenance)
@@ -141,6 +140,7 @@ def to_log(
     if found is None:
         return None
     origin_ns, batches = found
+    recording.begin_ns = origin_ns
     wall_ns = recording.wall_ns(origin_ns)
     known = wall_ns, origin_ns, recording.channel, recording.provenance
     writer = CanLogWriter(out.open(), form, *known)
@@ -150,9 +150,6 @@ def to_log(
     summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
     for what, number in writer.left_out.items():
         summary += f"; {number} {what} left out, which {form} does not know"
-    moved = 0 if wall_ns is None else (recording.wall_ns(last_ns) or 0) - wall_ns - lasted
-    if abs(moved) > _CLOCK_SET_NS:
-        summary += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
     return summary
 
 

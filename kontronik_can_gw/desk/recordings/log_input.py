@@ -7,18 +7,15 @@ from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs import text
-from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Input, Sample
+from kontronik_can_gw.desk.recordings.log_clock import LogClock
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, Input, Sample
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
 from kontronik_can_gw.errors import RunError, UserError
 
 _BATCH = 256
 """Frames."""
-_BACK_NS = 10 * SECOND_NS
-_AHEAD_NS = 86_400 * SECOND_NS
-"""A step of time that is larger must be confirmed by the frame after it, or it is a damaged time."""
 _HEAD_LINES = 2000
 _BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
 _TEXTS: dict[str, tuple[Callable[[bytes], object], type[text.TextReader]]] = {
@@ -63,6 +60,7 @@ class CanLogInput(Input):
         except OSError as error:
             raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
         self._reader = _reader_of(self._format)(self._file)
+        self._clock = LogClock(self._reader)
 
     def batches(self) -> Iterator[list[TimedFrame]]:
         frames = self.frames()
@@ -74,32 +72,17 @@ class CanLogInput(Input):
         self._open()
         ours = self.reader.keys
         self.others = 0
+        clock = self._clock
         try:
-            for item in self._in_time():
+            for item in clock.frames():
                 self.others += item.frame.key not in ours
                 yield item
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
-        self.damage = self._reader.damage
-
-    def _in_time(self) -> Iterator[TimedFrame]:
-        """Left out is what has a time that leads far away and back: a digit or a bit of it is damaged."""
-        last: TimedFrame | None = None
-        wrong = 0
-        frames = iter(self._reader)
-        item = next(frames, None)
-        while item is not None:
-            after = next(frames, None)
-            # where two agree the clock was set, or the first frame was the damaged one
-            if last is None or _follows(item, last) or after is None or _follows(after, item):
-                last = item
-                yield item
-            else:
-                wrong += 1
-            item = after
-        if wrong:
-            plural = "s" if wrong > 1 else ""
-            self._reader.damage.append(f"{wrong} frame{plural} with an impossible time left out")
+        self.damage = [*self._reader.damage]
+        if clock.impossible:
+            plural = "s" if clock.impossible > 1 else ""
+            self.damage.append(f"{clock.impossible} frame{plural} with an impossible time left out")
 
     @cached_property
     def fields(self) -> Sequence[Field]:
@@ -112,14 +95,16 @@ class CanLogInput(Input):
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")
 
     def wall_ns(self, time_ns: int) -> int | None:
-        """0 is the start of a log whose times are Unix times; the start is known with the first frame."""
+        """Unix time as the log has it: it jumps where the clock was set."""
         start = self._reader.wall_start_ns
-        return None if start is None or start > LATEST_NS else start + time_ns
+        if start is None or start > LATEST_NS:
+            return None
+        return start + self._clock.logged_ns(time_ns)
+
+    @property
+    def clock_steps(self) -> Sequence[ClockStep]:
+        return self._clock.steps
 
     def close(self) -> None:
         self._reader.close()
         self._file.close()
-
-
-def _follows(item: TimedFrame, last: TimedFrame) -> bool:
-    return -_BACK_NS <= item.time_ns - last.time_ns <= _AHEAD_NS

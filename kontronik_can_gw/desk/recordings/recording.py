@@ -21,8 +21,21 @@ LATEST_NS = 1 << 62
 """No time of a recording, and no Unix time (2116), is later: it is damaged."""
 ROWS = 1024
 """Rows that Python makes a block of."""
+_LISTED_STEPS = 3
 _DISORDER_NS = 1_000_000_000
 """How far frames of several interfaces may stand out of order."""
+
+
+class ClockStep(NamedTuple):
+    """A jump of the wall clock while the recording was made.
+
+    ``time_ns``: the recording's time of the first frame after it. ``by_ns``: its size, negative if
+    the clock was set back. ``is_kept``: the times of the recording jump with it.
+    """
+
+    time_ns: int
+    by_ns: int
+    is_kept: bool = False
 
 
 class Sample(NamedTuple):
@@ -98,6 +111,18 @@ class Input(ABC):
         self.damage: list[str] = []
         self.others = 0
         """CAN frames that the layout does not have; complete when it was read to the end."""
+        self.begin_ns = 0
+        """Time 0 of the output, from which ``clock_notes`` count. Set by the conversion."""
+
+    @property
+    def clock_steps(self) -> Sequence[ClockStep]:
+        """Where the wall clock was set; complete when the recording has been read to its end."""
+        return ()
+
+    @property
+    def clock_notes(self) -> list[str]:
+        """One line for each kind of clock step, with its times and sizes; empty if there is none."""
+        return _described(self.clock_steps, self.begin_ns)
 
     @property
     def left_out(self) -> str:
@@ -169,6 +194,33 @@ class Input(ABC):
     def _wall_of(self, row: Sample) -> int | None:
         wall_ns = self.wall_ns(row.time_ns)
         return None if wall_ns is None else wall_ns - row.time_ns
+
+
+def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
+    kept = [step for step in steps if step.is_kept]
+    hidden = [step for step in steps if not step.is_kept]
+    notes = []
+    if hidden:
+        listed = [
+            f"{'back' if step.by_ns < 0 else 'ahead'} by {_by_and_at(step, begin_ns)}"
+            for step in hidden
+        ]
+        notes.append(f"the clock was set {_some_of(listed)}; times continue without the step")
+    if kept:
+        listed = [f"by {_by_and_at(step, begin_ns)}" for step in kept]
+        notes.append(
+            f"times jump ahead {_some_of(listed)}: a pause, or the clock was set; the jump is kept"
+        )
+    return notes
+
+
+def _by_and_at(step: ClockStep, begin_ns: int) -> str:
+    return f"{abs(step.by_ns) / 1e9:.3f} s at {(step.time_ns - begin_ns) / 1e9:.3f} s"
+
+
+def _some_of(listed: list[str]) -> str:
+    more = len(listed) - _LISTED_STEPS
+    return ", ".join(listed[:_LISTED_STEPS]) + (f" and {more} more times" if more > 0 else "")
 
 
 def timed(frames: "Frames | list[TimedFrame]") -> Iterator[TimedFrame]:

@@ -1,0 +1,156 @@
+"""Continuous times for the frames of a log whose clock was set while it was written.
+
+A log has the time of day of the machine that wrote it, or times since its start. One rule holds for
+every format:
+
+1. If ten frames in a row are more than 100 ms before the frames in front of them, the clock was set
+   back. The spacing of the frames continues, and the step is reported.
+2. Frames that go back less far, or fewer of them, are out of order and keep their times.
+3. A time that jumps ahead by more than 10 s is kept and reported: a pause looks the same as a clock
+   that was set ahead.
+4. A single time that leads far away and back is damaged, and its frame is left out.
+"""
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+
+from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.recording import ClockStep
+
+SECOND_NS = 1_000_000_000
+_DISORDER_NS = 100_000_000
+"""Frames of several interfaces may be this far out of order."""
+_STEP_FRAMES = 10
+"""Frames in a row that must agree on a step back."""
+_FAR_NS = 10 * SECOND_NS
+"""A single frame that is farther away than this from its neighbours has a damaged time."""
+_DAY_NS = 86_400 * SECOND_NS
+_LONE_NS = SECOND_NS
+"""A single frame this far ahead does not count when the next frame goes back."""
+_REMEMBERED = 256
+"""Frames in which the periods of the ids are looked up."""
+
+
+class LogClock:
+    """Gives the frames of a log continuous times, and remembers where the clock was set."""
+
+    def __init__(self, source: Iterable[TimedFrame]) -> None:
+        self.steps: list[ClockStep] = []
+        """Complete when all frames have been read."""
+        self.impossible = 0
+        """Frames that were left out because their time is damaged."""
+        self._source = iter(source)
+        self._ahead: deque[TimedFrame] = deque()
+        self._recent: deque[TimedFrame] = deque(maxlen=_REMEMBERED)
+        self._shift_ns = 0
+        """Added to the times of the log since the last step."""
+        self._shifted_since: list[int] = []
+        self._shifts: list[int] = []
+
+    def logged_ns(self, time_ns: int) -> int:
+        """The time that the log itself has for a continuous time."""
+        index = bisect_right(self._shifted_since, time_ns)
+        return time_ns - self._shifts[index - 1] if index else time_ns
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames in their order, at continuous times."""
+        last = before = None
+        while (item := self._next()) is not None:
+            time_ns = item.time_ns + self._shift_ns
+            if last is None or before is None:
+                if self._is_alone(item):
+                    self.impossible += 1
+                    continue
+                last = before = time_ns
+            elif time_ns - last > _FAR_NS:
+                if self._leads_back(item):
+                    self.impossible += 1
+                    continue
+                self.steps.append(ClockStep(time_ns, time_ns - last, is_kept=True))
+                last = before = time_ns
+            elif time_ns >= last:
+                before, last = last, time_ns
+            elif last - time_ns > _DISORDER_NS:
+                if last - before > _LONE_NS and time_ns >= before - _DISORDER_NS:
+                    last = max(before, time_ns)  # the frame before this one was too far ahead
+                elif (following := self._agreeing(last)) is not None:
+                    time_ns = self._set_back(item, following, last)
+                    last = before = time_ns
+                elif last - time_ns > _FAR_NS and not self._is_followed(item):
+                    self.impossible += 1
+                    continue
+            if self._shift_ns:
+                item = item._replace(time_ns=time_ns)
+            self._recent.append(item)
+            yield item
+
+    def _next(self) -> TimedFrame | None:
+        return self._ahead.popleft() if self._ahead else next(self._source, None)
+
+    def _look_ahead(self, count: int) -> Sequence[TimedFrame]:
+        """The next frames, which stay to be read; fewer at the end of the log."""
+        self._ahead.extend(islice(self._source, max(0, count - len(self._ahead))))
+        return list(islice(self._ahead, count))
+
+    def _is_alone(self, first: TimedFrame) -> bool:
+        """True if the log begins with a frame that is far later than the two after it, which agree."""
+        following = self._look_ahead(2)
+        if len(following) < 2 or first.time_ns - following[0].time_ns <= _FAR_NS:
+            return False
+        return _follows(following[1], following[0])
+
+    def _leads_back(self, item: TimedFrame) -> bool:
+        """True if the times after this one go back again."""
+        for after in self._look_ahead(2):
+            if after.time_ns < item.time_ns - _FAR_NS:
+                return True
+            if _follows(after, item):
+                return False
+        return False
+
+    def _is_followed(self, item: TimedFrame) -> bool:
+        following = self._look_ahead(1)
+        return not following or _follows(following[0], item)
+
+    def _agreeing(self, last: int) -> Sequence[TimedFrame] | None:
+        """The next frames if enough of them are before ``last``, too; None otherwise."""
+        following = self._look_ahead(_STEP_FRAMES - 1)
+        if len(following) < _STEP_FRAMES - 1:
+            return None
+        limit_ns = last - _DISORDER_NS - self._shift_ns
+        return following if all(one.time_ns < limit_ns for one in following) else None
+
+    def _set_back(self, item: TimedFrame, following: Sequence[TimedFrame], last: int) -> int:
+        """Record a step in front of ``item``; return the time at which the spacing continues."""
+        time_ns = max(last, self._due_ns(item, following, last))
+        by_ns = item.time_ns + self._shift_ns - time_ns
+        self._shift_ns -= by_ns
+        self._shifted_since.append(time_ns)
+        self._shifts.append(self._shift_ns)
+        self.steps.append(ClockStep(time_ns, by_ns))
+        return time_ns
+
+    def _due_ns(self, item: TimedFrame, following: Sequence[TimedFrame], last: int) -> int:
+        """When ``item`` was due, by the periods of the ids: the median of the guesses."""
+        guesses: dict[object, int] = {}
+        for one in (item, *following):
+            name = _name(one)
+            if name in guesses:
+                continue
+            earlier = (seen.time_ns for seen in reversed(self._recent) if _name(seen) == name)
+            times = [*islice(earlier, 2)]
+            if len(times) == 2:
+                guesses[name] = 2 * times[0] - times[1] - (one.time_ns - item.time_ns)
+        if not guesses:
+            return last
+        return sorted(guesses.values())[(len(guesses) - 1) // 2]
+
+
+def _name(item: TimedFrame) -> object:
+    return item.frame.key
+
+
+def _follows(item: TimedFrame, before: TimedFrame) -> bool:
+    return -_FAR_NS <= item.time_ns - before.time_ns <= _DAY_NS

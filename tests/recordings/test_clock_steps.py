@@ -1,0 +1,215 @@
+"""A clock that was set while the recording was made leaves the spacing of the frames as it was."""
+
+import csv
+import re
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import can
+import pytest
+from capture_bench import Bench, capture_file, made
+from command_line import run
+from log_files import SUFFIX, Item, message_of, opened, write_log
+from recordings import WALL_NS, candump_log
+
+from kontronik_can_gw.capture.format import Entry, Kind, numbers_data
+from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.recordings.log_clock import LogClock
+from kontronik_can_gw.desk.recordings.recording import ClockStep
+from kontronik_can_gw.frames import CanFrame
+
+MS = 1_000_000
+HOUR_NS = 3_600_000 * MS
+SET_BACK = "the clock was set back by 3600.000 s at {} s; times continue without the step"
+
+
+def _cyclic(count: int, period_ns: int = 10 * MS) -> list[Item]:
+    """Two messages each period; the second one 2 ms after the first."""
+    items: list[Item] = []
+    for number in range(count):
+        now = number * period_ns
+        items.append((now, CanFrame(0x688, bytes((number & 255,) * 8)), True))
+        items.append((now + 2 * MS, CanFrame(0x690, bytes((number & 255,) * 8)), True))
+    return items
+
+
+def _moved(items: list[Item], by_ns: Callable[[int], int]) -> list[Item]:
+    """The same frames, at times that are later by ``by_ns`` of each."""
+    return [(time_ns + by_ns(time_ns), *rest) for time_ns, *rest in items]  # type: ignore[misc]
+
+
+def _write_by_library(path: Path, items: list[Item]) -> None:
+    with can.Logger(path) as writer:
+        for item in items:
+            writer(message_of(item))
+
+
+@pytest.mark.parametrize("format_", ["candump", "asc", "trc", "blf", "mf4"])
+def test_spacing_continues_when_the_clock_is_set_back(tmp_path: Path, format_: str) -> None:
+    even = _cyclic(100)
+    stepped = _moved(even, lambda time_ns: HOUR_NS * (time_ns < 500 * MS))
+    path = tmp_path / f"log{SUFFIX[format_]}"
+    if format_ == "mf4":  # our writer only writes rising times
+        start_ns = 1_700_000_000 * 1000 * MS
+        _write_by_library(path, _moved(stepped, lambda _: start_ns))
+    else:
+        write_log(path, format_, stepped)
+    with opened(path) as log:
+        found = list(log.frames())
+        first_ns = log.begin_ns = found[0].time_ns
+        assert log.damage == []
+        assert log.clock_notes == [SET_BACK.format("0.500")]
+        ends = [log.wall_ns(found[index].time_ns) for index in (0, -1)]
+    times = [item.time_ns - first_ns for item in found]
+    # MF4 has floats
+    assert max(abs(a - b[0]) for a, b in zip(times, even, strict=True)) <= 2000 * (format_ == "mf4")
+    assert [item.frame for item in found] == [frame for _, frame, _ in even]
+    assert None not in ends
+    logged_ns = (ends[1] or 0) - (ends[0] or 0)  # the time of day is what the log has
+    assert abs(logged_ns - (even[-1][0] - HOUR_NS)) < 2000
+
+
+def _with_clock_set_back(log: Path, path: Path) -> Path:
+    """The candump log, the clock of which is set back by an hour after 1.5 s."""
+    first: list[float] = []
+
+    def moved(found: "re.Match[str]") -> str:
+        seconds = float(found[1])
+        first.append(seconds)
+        return f"({seconds - 3600 * (seconds >= first[0] + 1.5):.6f})"
+
+    path.write_text(re.sub(r"\((\d+\.\d+)\)", moved, log.read_text()))
+    return path
+
+
+def test_tables_reports_and_logs_are_those_of_a_steady_clock(tmp_path: Path) -> None:
+    even = candump_log(tmp_path / "even.log")
+    back = _with_clock_set_back(even, tmp_path / "back.log")
+    note = f"{back}: {SET_BACK.format('1.500')}"
+    tables = []
+    for log in (even, back):
+        done = run("convert", log, tmp_path / "out.csv", "--force")
+        assert (note in done.err) == (log is back), done.err
+        with (tmp_path / "out.csv").open() as file:
+            tables.append([row[:1] + row[2:] for row in csv.reader(file)])
+    assert len(tables[0]) > 250
+    assert tables[0] == tables[1]
+    for suffix in (".log", ".asc", ".blf", ".trc"):
+        written = []
+        for log in (even, back):
+            done = run("convert", "-q", log, tmp_path / f"out{suffix}", "--force")
+            assert (note in done.err) == (log is back), done.err
+            written.append((tmp_path / f"out{suffix}").read_bytes())
+        assert written[0] == written[1]
+    pages = []
+    for log in (even, back):
+        done = run("report", log, "-o", tmp_path / "out.html", "--force")
+        assert (note in done.err) == (log is back), done.err
+        page = (tmp_path / "out.html").read_text().replace(log.name, "NAME")
+        pages.append(
+            page.replace(f"<div><dt>Clock</dt><dd>{SET_BACK.format('1.500')}</dd></div>", "")
+        )
+    assert pages[0] == pages[1]
+    assert f"warning: {SET_BACK.format('1.500')}" in run("monitor", "--once", back).err
+
+
+def _read(
+    times: list[int], ids: Callable[[int], int] = lambda _: 0x100
+) -> tuple[list[int], LogClock]:
+    """The continuous times, in ms, of frames at these times."""
+    frames = [TimedFrame(t * MS, CanFrame(ids(n), b"")) for n, t in enumerate(times)]
+    clock = LogClock(frames)
+    return [item.time_ns // MS for item in clock.frames()], clock
+
+
+@pytest.mark.parametrize(
+    ("count", "by_ms", "is_step"), [(10, 111, True), (9, 111, False), (10, 110, False)]
+)
+def test_ten_frames_that_go_back_by_more_than_100_ms_are_a_step(
+    count: int, by_ms: int, is_step: bool
+) -> None:
+    """Each of ten frames at a period of 1 ms, which follow one at 100 ms."""
+    before = list(range(101))
+    back = [101 + number - by_ms for number in range(count)]
+    found, clock = _read([*before, *back, 200])
+    if is_step:
+        assert found == [*before, *range(101, 111), 200 + by_ms]
+        assert clock.steps == [ClockStep(101 * MS, -by_ms * MS)]
+        assert clock.logged_ns(100 * MS) == 100 * MS
+        assert clock.logged_ns(102 * MS) == (102 - by_ms) * MS
+    else:
+        assert found == [*before, *back, 200]
+        assert clock.steps == []
+    assert clock.impossible == 0
+
+
+def test_a_second_step_adds_to_the_first() -> None:
+    times = [*range(1000, 1200), *range(500, 700), *range(100, 300)]
+    found, clock = _read(times)
+    assert found == [*range(1000, 1600)]
+    assert [step.by_ns // MS for step in clock.steps] == [-700, -600]
+    assert clock.logged_ns(1599 * MS) == 299 * MS
+
+
+def test_the_gap_at_a_step_is_taken_from_the_periods_of_the_ids() -> None:
+    """Frame 0x200 comes every 100 ms, in between 0x100 every 10 ms; the step falls before a 0x200."""
+    even = sorted(
+        [*((t, 0x100) for t in range(0, 1000, 10)), *((t + 3, 0x200) for t in range(0, 1000, 100))]
+    )
+    times = [t if t < 503 else t - 400 for t, _ in even]
+    found, clock = _read(times, lambda number: even[number][1])
+    assert found == [t for t, _ in even]
+    assert clock.steps == [ClockStep(503 * MS, -400 * MS)]
+
+
+@pytest.mark.parametrize("ahead_ms", [3000, 40_000])
+def test_one_frame_ahead_of_the_others_is_no_step(ahead_ms: int) -> None:
+    times = [*range(500), 500 + ahead_ms, *range(501, 1000)]
+    found, clock = _read(times)
+    assert clock.steps == []
+    if ahead_ms > 10_000:  # its time is damaged
+        del times[500]
+    assert found == times
+    assert clock.impossible == (ahead_ms > 10_000)
+
+
+def test_a_jump_ahead_is_kept_and_reported(tmp_path: Path) -> None:
+    items = _moved(_cyclic(100), lambda time_ns: HOUR_NS * (time_ns >= 500 * MS))
+    path = tmp_path / "ahead.log"
+    write_log(path, "candump", items)
+    done = run("convert", path, tmp_path / "out.blf")
+    jump = "by 3600.008 s at 3600.500 s: a pause, or the clock was set; the jump is kept"
+    assert f"{path}: times jump ahead {jump}" in done.err
+    with opened(tmp_path / "out.blf") as log:
+        times = [item.time_ns for item in log.frames()]
+    assert [time_ns - times[0] for time_ns in times] == [time_ns for time_ns, *_ in items]
+
+
+@pytest.mark.parametrize(("by_s", "words"), [(-3600, "back"), (7200, "ahead")])
+def test_a_clock_set_during_a_capture_is_reported(tmp_path: Path, by_s: int, words: str) -> None:
+    bench = Bench(*made()).live(3, 4)
+    paths = []
+    for name in ("steady", "set"):
+        entries = list(bench.entries)
+        if name == "set":
+            middle = len(entries) // 2
+            now = entries[middle].time_ns
+            wall_ns = WALL_NS + now - entries[0].time_ns + by_s * 1000 * MS
+            entries.insert(middle + 1, Entry(now, Kind.CLOCK, 0, numbers_data(wall_ns)))
+        paths.append(tmp_path / f"{name}.kcap")
+        paths[-1].write_bytes(capture_file(bench.setup, entries, wall_ns=WALL_NS))
+    note = f"set.kcap: the clock was set {words} by {abs(by_s)}.000 s at "
+    tables = []
+    for path in paths:
+        done = run("convert", path, tmp_path / "out.csv", "--force")
+        assert (note in done.err) == (path is paths[1]), done.err
+        with (tmp_path / "out.csv").open() as file:
+            tables.append([row[:1] + row[2:] for row in csv.reader(file)])
+    assert tables[0] == tables[1]
+    done = run("convert", "-q", paths[1], tmp_path / "out.asc")
+    assert note in done.err
+    with open_input(tmp_path / "out.asc") as log:
+        times = [item.time_ns for item in log.frames()]
+    assert max(b - a for a, b in pairwise(times)) < 1000 * MS
