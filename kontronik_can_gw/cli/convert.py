@@ -7,7 +7,7 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, REMOVED_OPTIONS, option
+from kontronik_can_gw.cli.arguments import LAYOUT, LOG_CHANNEL, REMOVED_OPTIONS, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.desk import given_layout, watched
 from kontronik_can_gw.desk.recordings.convert import (
@@ -54,6 +54,7 @@ OPTIONS = (
     option("--force", "write over OUT if it is there"),
     option("-q --quiet", "no summary"),
     LAYOUT,
+    LOG_CHANNEL,
     "a part of it",
     option("--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"),
     option("--until S", "up to this time after the start, in seconds", type=_seconds_ns, dest="end"),
@@ -73,6 +74,8 @@ does not. - is standard output, for text. Parquet needs pyarrow, mf4-log needs a
 
 A table has a row at each telemetry frame, or at each group of CAN frames that belong together, and a column for each value by its
 name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]). What is not available is empty in CSV, null elsewhere.
+A CAN log of several channels needs --channel for a table if more than one has messages of the DBC. Another log keeps all channels:
+can0 is 1 in formats that have numbers.
 Of a damaged recording everything that is intact is converted, and a summary says what is not.
 OUT takes its name only when it is whole; until then it is called OUT.part.
 
@@ -104,6 +107,8 @@ def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input
     target = None if args.output == "-" else Path(args.output)
     begun = time.monotonic()
     with opened_by(Path(args.input), given_layout(args)) as recording:
+        if args.channel is not None:
+            recording.select_channel(args.channel)
         conversion = _conversion(args, form, recording)
         try:
             with Output(target) as out:

@@ -23,7 +23,7 @@ OPTIONS = (
     option("FILE", "a recording instead of the bus", type=Path, nargs="?"),
     LAYOUT,
     option("--interface NAME", "python-can interface (default socketcan)"),
-    option("--channel NAME", "channel of the interface (default can0)"),
+    option("--channel NAME", "channel of the interface (default can0); of a CAN log, as can0 or 1: the one to play"),
     option("--speed FACTOR", "play FILE faster by this factor (0.01 to 1000, default 1)", type=number_from(0.01, 1000, "factor")),
     option("--once", "one line of JSON with everything, then end"),
     option("--timeout S", f"--once: maximum time to wait (default {_ONCE_S:g})", type=number_from(0.1, 3600)),
@@ -55,10 +55,8 @@ frame came (--once), or something cannot be opened; 2 wrong usage
 def main(args: argparse.Namespace) -> int:
     if args.file is None and args.speed is not None:
         raise UserError("--speed: is for a FILE, not for the bus. Leave it out.")
-    if args.file is not None and (args.interface is not None or args.channel is not None):
-        raise UserError(
-            f"{args.file}: is played, so --interface and --channel mean nothing. Leave them out."
-        )
+    if args.file is not None and args.interface is not None:
+        raise UserError(f"{args.file}: is played, so --interface means nothing. Leave it out.")
     if args.timeout is not None and not args.once:
         raise UserError("--timeout: is for --once. Leave it out.")
     stop = Event()
@@ -90,6 +88,8 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
             raise UserError(
                 f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out."
             )
+        if args.channel is not None:
+            opened.select_channel(args.channel)
         yield Recording(opened, args.speed or 1.0, at_once=args.once)
         for line in dict.fromkeys(
             filter(None, [*opened.damage, *opened.clock_notes, opened.left_out])

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
+from kontronik_can_gw.cli.arguments import LAYOUT, LOG_CHANNEL, number_from, option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.desk import given_layout, watched, write_output
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
@@ -18,6 +18,7 @@ OPTIONS = (
     option("-o --output FILE", "page to write, or - for standard output", required=True),
     option("--force", "replace FILE if it exists"),
     LAYOUT,
+    LOG_CHANNEL,
     option("--from S", "begin at this time in seconds after the start", type=_SECONDS, dest="start"),
     option("--until S", "end at this time in seconds after the start", type=_SECONDS, dest="end"),
 )
@@ -47,6 +48,8 @@ def main(args: argparse.Namespace) -> int:
     source = Path(args.input)
     _check_target(source, args.output, force=args.force)
     with open_input(source, given_layout(args)) as recording:
+        if args.channel is not None:
+            recording.select_channel(args.channel)
         flight = _analysed(recording, args)
         if flight is None:
             say("stopped: nothing is written")

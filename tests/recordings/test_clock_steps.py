@@ -14,10 +14,9 @@ from log_files import SUFFIX, Item, message_of, opened, write_log
 from recordings import WALL_NS, candump_log
 
 from kontronik_can_gw.capture.format import Entry, Kind, numbers_data
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.log_clock import LogClock
-from kontronik_can_gw.desk.recordings.recording import ClockStep
+from kontronik_can_gw.desk.recordings.recording import ClockStep, LogFrame
 from kontronik_can_gw.frames import CanFrame
 
 MS = 1_000_000
@@ -119,7 +118,7 @@ def _read(
     times: list[int], ids: Callable[[int], int] = lambda _: 0x100
 ) -> tuple[list[int], LogClock]:
     """The continuous times, in ms, of frames at these times."""
-    frames = [TimedFrame(t * MS, CanFrame(ids(n), b"")) for n, t in enumerate(times)]
+    frames = [LogFrame(t * MS, CanFrame(ids(n), b"")) for n, t in enumerate(times)]
     clock = LogClock(frames)
     return [item.time_ns // MS for item in clock.frames()], clock
 

@@ -150,6 +150,8 @@ def to_log(
     summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
     for what, number in writer.left_out.items():
         summary += f"; {number} {what} left out, which {form} does not know"
+    if writer.channels.changes:
+        summary += f"; channels: {writer.channels.changes}"
     return summary
 
 

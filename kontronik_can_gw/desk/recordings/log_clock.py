@@ -16,8 +16,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 
-from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.recording import ClockStep
+from kontronik_can_gw.desk.recordings.recording import ClockStep, LogFrame
 
 SECOND_NS = 1_000_000_000
 _DISORDER_NS = 100_000_000
@@ -36,14 +35,14 @@ _REMEMBERED = 256
 class LogClock:
     """Gives the frames of a log continuous times, and remembers where the clock was set."""
 
-    def __init__(self, source: Iterable[TimedFrame]) -> None:
+    def __init__(self, source: Iterable[LogFrame]) -> None:
         self.steps: list[ClockStep] = []
         """Complete when all frames have been read."""
         self.impossible = 0
         """Frames that were left out because their time is damaged."""
         self._source = iter(source)
-        self._ahead: deque[TimedFrame] = deque()
-        self._recent: deque[TimedFrame] = deque(maxlen=_REMEMBERED)
+        self._ahead: deque[LogFrame] = deque()
+        self._recent: deque[LogFrame] = deque(maxlen=_REMEMBERED)
         self._shift_ns = 0
         """Added to the times of the log since the last step."""
         self._shifted_since: list[int] = []
@@ -54,7 +53,7 @@ class LogClock:
         index = bisect_right(self._shifted_since, time_ns)
         return time_ns - self._shifts[index - 1] if index else time_ns
 
-    def frames(self) -> Iterator[TimedFrame]:
+    def frames(self) -> Iterator[LogFrame]:
         """The frames in their order, at continuous times."""
         last = before = None
         while (item := self._next()) is not None:
@@ -86,22 +85,22 @@ class LogClock:
             self._recent.append(item)
             yield item
 
-    def _next(self) -> TimedFrame | None:
+    def _next(self) -> LogFrame | None:
         return self._ahead.popleft() if self._ahead else next(self._source, None)
 
-    def _look_ahead(self, count: int) -> Sequence[TimedFrame]:
+    def _look_ahead(self, count: int) -> Sequence[LogFrame]:
         """The next frames, which stay to be read; fewer at the end of the log."""
         self._ahead.extend(islice(self._source, max(0, count - len(self._ahead))))
         return list(islice(self._ahead, count))
 
-    def _is_alone(self, first: TimedFrame) -> bool:
+    def _is_alone(self, first: LogFrame) -> bool:
         """True if the log begins with a frame that is far later than the two after it, which agree."""
         following = self._look_ahead(2)
         if len(following) < 2 or first.time_ns - following[0].time_ns <= _FAR_NS:
             return False
         return _follows(following[1], following[0])
 
-    def _leads_back(self, item: TimedFrame) -> bool:
+    def _leads_back(self, item: LogFrame) -> bool:
         """True if the times after this one go back again."""
         for after in self._look_ahead(2):
             if after.time_ns < item.time_ns - _FAR_NS:
@@ -110,11 +109,11 @@ class LogClock:
                 return False
         return False
 
-    def _is_followed(self, item: TimedFrame) -> bool:
+    def _is_followed(self, item: LogFrame) -> bool:
         following = self._look_ahead(1)
         return not following or _follows(following[0], item)
 
-    def _agreeing(self, last: int) -> Sequence[TimedFrame] | None:
+    def _agreeing(self, last: int) -> Sequence[LogFrame] | None:
         """The next frames if enough of them are before ``last``, too; None otherwise."""
         following = self._look_ahead(_STEP_FRAMES - 1)
         if len(following) < _STEP_FRAMES - 1:
@@ -122,7 +121,7 @@ class LogClock:
         limit_ns = last - _DISORDER_NS - self._shift_ns
         return following if all(one.time_ns < limit_ns for one in following) else None
 
-    def _set_back(self, item: TimedFrame, following: Sequence[TimedFrame], last: int) -> int:
+    def _set_back(self, item: LogFrame, following: Sequence[LogFrame], last: int) -> int:
         """Record a step in front of ``item``; return the time at which the spacing continues."""
         time_ns = max(last, self._due_ns(item, following, last))
         by_ns = item.time_ns + self._shift_ns - time_ns
@@ -132,7 +131,7 @@ class LogClock:
         self.steps.append(ClockStep(time_ns, by_ns))
         return time_ns
 
-    def _due_ns(self, item: TimedFrame, following: Sequence[TimedFrame], last: int) -> int:
+    def _due_ns(self, item: LogFrame, following: Sequence[LogFrame], last: int) -> int:
         """When ``item`` was due, by the periods of the ids: the median of the guesses."""
         guesses: dict[object, int] = {}
         for one in (item, *following):
@@ -148,9 +147,9 @@ class LogClock:
         return sorted(guesses.values())[(len(guesses) - 1) // 2]
 
 
-def _name(item: TimedFrame) -> object:
-    return item.frame.key
+def _name(item: LogFrame) -> object:
+    return item.channel, item.frame.key
 
 
-def _follows(item: TimedFrame, before: TimedFrame) -> bool:
+def _follows(item: LogFrame, before: LogFrame) -> bool:
     return -_FAR_NS <= item.time_ns - before.time_ns <= _DAY_NS

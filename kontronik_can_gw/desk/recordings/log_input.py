@@ -10,13 +10,15 @@ from kontronik_can_gw.desk.recordings.can_logs import text
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.log_clock import LogClock
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, Input, Sample
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, Input, LogFrame, Sample
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
 from kontronik_can_gw.errors import RunError, UserError
 
 _BATCH = 256
 """Frames."""
 _HEAD_LINES = 2000
+_LOOK_FOR_CHANNELS = 10_000
+"""Frames in which further channels are looked for, once there are too many."""
 _BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
 _TEXTS: dict[str, tuple[Callable[[bytes], object], type[text.TextReader]]] = {
     "candump": (text.candump_line, text.CandumpReader),
@@ -52,6 +54,9 @@ class CanLogInput(Input):
     def __init__(self, path: Path, layout: BusLayout, format_: str) -> None:
         super().__init__(str(path), layout)
         self._path, self._format = path, format_
+        self._selected: str | None = None
+        self._channels: dict[str, None] = {}
+        """Channels of the frames that have been read."""
         self._open()
 
     def _open(self) -> None:
@@ -62,27 +67,65 @@ class CanLogInput(Input):
         self._reader = _reader_of(self._format)(self._file)
         self._clock = LogClock(self._reader)
 
-    def batches(self) -> Iterator[list[TimedFrame]]:
-        frames = self.frames()
+    def select_channel(self, name: str) -> None:
+        self._selected = name
+
+    def batches(self) -> Iterator[list[LogFrame]]:
+        frames = self._logged()
         while some := list(islice(frames, _BATCH)):
             yield some
 
     def frames(self) -> Iterator[TimedFrame]:
+        """The frames of one channel: the selected one, or the only one with messages of the DBC.
+
+        UserError if several channels have such messages and none is selected. Frames of other
+        channels that are not in the DBC are among them.
+        """
+        ours, chosen = self.reader.keys, self._selected
+        self.others = 0
+        logged = self._logged()
+        for time_ns, frame, received, channel in logged:
+            if frame.key not in ours:
+                self.others += 1
+            elif chosen is None:
+                chosen = channel
+            elif channel != chosen:
+                raise self._ambiguous(logged)
+            yield TimedFrame(time_ns, frame, received)
+
+    def _logged(self) -> Iterator[LogFrame]:
+        """All frames, or those of the selected channel. UserError if the log does not have it."""
         self.close()
         self._open()
-        ours = self.reader.keys
-        self.others = 0
-        clock = self._clock
+        clock, selected = self._clock, self._selected
+        self._channels = {}
+        before = None
         try:
             for item in clock.frames():
-                self.others += item.frame.key not in ours
-                yield item
+                if item.channel != before:
+                    before = item.channel
+                    self._channels[before] = None
+                if selected is None or item.channel == selected:
+                    yield item
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
         self.damage = [*self._reader.damage]
         if clock.impossible:
             plural = "s" if clock.impossible > 1 else ""
             self.damage.append(f"{clock.impossible} frame{plural} with an impossible time left out")
+        if self._channels and selected is not None and selected not in self._channels:
+            listed = ", ".join(sorted(self._channels))
+            raise UserError(f"{self._path}: has no channel {selected}. It has: {listed}.")
+
+    def _ambiguous(self, logged: Iterator[LogFrame]) -> UserError:
+        """The error for several channels with messages of the DBC, of which it lists all."""
+        for _ in islice(logged, _LOOK_FOR_CHANNELS):
+            pass
+        file = Path(self.bus.layout.file).name
+        listed = ", ".join(sorted(self._channels))
+        return UserError(
+            f"{self._path}: several channels have messages of {file}. Choose one with --channel: {listed}."
+        )
 
     @cached_property
     def fields(self) -> Sequence[Field]:

@@ -12,7 +12,7 @@ from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample
+from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample, timed
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.gateway import Gateway, MakeOutput
 from kontronik_can_gw.native import load
@@ -49,6 +49,10 @@ class PlayedInput(Input):
         self, gateway: Gateway, player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
         """Give all that was recorded to a gateway, or to the player of its core; the CAN frames that were sent and received."""
+
+    def frames(self) -> Iterator[TimedFrame]:
+        for frames in self.batches():
+            yield from timed(frames)
 
     def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
         def make(_: Sequence[MakeOutput] = ()) -> Gateway:

@@ -7,16 +7,20 @@ from functools import cached_property
 from itertools import chain, groupby, islice, takewhile
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.fields import Field, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames, Rows
 
+Batch: TypeAlias = "list[TimedFrame] | list[LogFrame] | Frames"
+"""Frames in their order; ``Frames`` were all sent."""
 LATEST_NS = 1 << 62
 """No time of a recording, and no Unix time (2116), is later: it is damaged."""
 ROWS = 1024
@@ -24,6 +28,15 @@ ROWS = 1024
 _LISTED_STEPS = 3
 _DISORDER_NS = 1_000_000_000
 """How far frames of several interfaces may stand out of order."""
+
+
+class LogFrame(NamedTuple):
+    """A TimedFrame of a CAN log. ``channel``: its name or number; empty for the gateway's own bus."""
+
+    time_ns: int
+    frame: CanFrame
+    received: bool = False
+    channel: str = ""
 
 
 class ClockStep(NamedTuple):
@@ -147,14 +160,19 @@ class Input(ABC):
         """The columns of the rows: values by name."""
         return fields_of_values(self.bus.escs)
 
-    def frames(self) -> Iterator[TimedFrame]:
-        """The CAN frames that were sent (or would have been) and received."""
-        for frames in self.batches():
-            yield from timed(frames)
+    def select_channel(self, name: str) -> None:
+        """Read only one channel of a CAN log. UserError for other recordings."""
+        raise UserError(
+            f"{self.name}: is no CAN log, so --channel {name} means nothing. Leave it out."
+        )
 
     @abstractmethod
-    def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
-        """The same frames, many at once; ``Frames`` were all sent."""
+    def frames(self) -> Iterator[TimedFrame]:
+        """The CAN frames of one bus that were sent (or would have been) and received."""
+
+    @abstractmethod
+    def batches(self) -> "Iterator[Batch]":
+        """The frames for a log, many at once: all channels, unless one was selected."""
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
         """Rows of the values of ``chosen`` fields, in that order; None: of all."""

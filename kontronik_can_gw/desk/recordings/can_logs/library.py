@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.recordings.can_logs.text import (
     OLDEST_WALL_S,
@@ -23,6 +22,7 @@ from kontronik_can_gw.desk.recordings.can_logs.text import (
     LogReader,
     frame_of,
 )
+from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.lean import without_asammdf
 
@@ -43,15 +43,16 @@ class LibraryReader(LogReader):
     """Frames of a log by one of python-can's readers."""
 
     _reader: Any = None
+    _first_channel = 0
 
-    def __iter__(self) -> Iterator[TimedFrame]:
+    def __iter__(self) -> Iterator[LogFrame]:
         done = wrong = 0
         try:
             with warnings.catch_warnings(action="ignore"):
                 for message in self._reader or ():
                     done += 1
                     try:
-                        if (item := frame_of(message)) is not None:
+                        if (item := frame_of(message, self._first_channel)) is not None:
                             yield item
                     except ValueError:
                         wrong += 1
@@ -79,6 +80,8 @@ class _SoundObjects(BLFReader):
 class BlfReader(LibraryReader):
     """BLF."""
 
+    _first_channel = 1  # python-can subtracts it
+
     def __init__(self, file: BinaryIO) -> None:
         super().__init__(file)
         size = os.fstat(file.fileno()).st_size
@@ -96,7 +99,7 @@ class BlfReader(LibraryReader):
             self.wall_start_ns = round(reader.start_timestamp * 1000) * _MS
         reader.start_timestamp = 0.0
 
-    def __iter__(self) -> Iterator[TimedFrame]:
+    def __iter__(self) -> Iterator[LogFrame]:
         yield from super().__iter__()
         if self._reader is not None and self._reader._tail.strip(b"\0"):
             self.damage.append("the last frame is cut off")

@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Any, BinaryIO
 
-from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
@@ -28,7 +27,7 @@ _HEAD_LINES = 200
 _SHOWN = 8
 
 
-def checked(item: TimedFrame) -> TimedFrame:
+def checked(item: LogFrame) -> LogFrame:
     """The frame. ValueError where none with this id and number of bytes exists on a CAN bus, or its time is no log's."""
     frame, size = item.frame, len(item.frame.data)
     in_range = 0 <= frame.can_id <= (0x1FFFFFFF if frame.extended else 0x7FF)
@@ -38,8 +37,11 @@ def checked(item: TimedFrame) -> TimedFrame:
     return item
 
 
-def frame_of(message: Any) -> TimedFrame | None:
-    """The frame of a message of python-can; None for one without data. ValueError where it is damaged."""
+def frame_of(message: Any, first_channel: int = 0) -> LogFrame | None:
+    """The frame of a message of python-can; None for one without data. ValueError if it is damaged.
+
+    ``first_channel``: number in the log of the channel that python-can calls 0.
+    """
     if message.is_error_frame or message.is_remote_frame:
         return None
     data, dlc = bytes(message.data), message.dlc
@@ -49,11 +51,12 @@ def frame_of(message: Any) -> TimedFrame | None:
         raise ValueError
     frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
     time_ns = round(message.timestamp * SECOND_NS)
-    return checked(TimedFrame(time_ns, frame, message.is_rx))
+    channel = "1" if message.channel is None else str(message.channel + first_channel)
+    return checked(LogFrame(time_ns, frame, message.is_rx, channel))
 
 
 class LogReader:
-    """Gives the TimedFrames of an open log. ``damage``: what is not intact, a line each; complete at its end."""
+    """Gives the LogFrames of an open log. ``damage``: what is not intact, a line each; complete at its end."""
 
     wall_start_ns: int | None = None
     """Unix time of the log's time 0; None where it does not say."""
@@ -65,7 +68,7 @@ class LogReader:
     def close(self) -> None:
         """Release what is held beside the file."""
 
-    def __iter__(self) -> Iterator[TimedFrame]:
+    def __iter__(self) -> Iterator[LogFrame]:
         raise NotImplementedError
 
 
@@ -77,7 +80,7 @@ class TextReader(LogReader):
         self._read_head([file.readline(LONGEST_LINE) for _ in range(_HEAD_LINES)])
         file.seek(0)
 
-    def __iter__(self) -> Iterator[TimedFrame]:
+    def __iter__(self) -> Iterator[LogFrame]:
         number, last, count = 1, 0, 0
         shown: list[str] = []
         while line := self._file.readline(LONGEST_LINE):
@@ -99,7 +102,7 @@ class TextReader(LogReader):
         """Find out what the log says of itself."""
         raise NotImplementedError
 
-    def _frame(self, line: bytes) -> TimedFrame | None:
+    def _frame(self, line: bytes) -> LogFrame | None:
         """The frame of a line; None for a line without one. ValueError, LookupError where it is damaged."""
         raise NotImplementedError
 
@@ -117,7 +120,7 @@ def _nanoseconds(text: bytes) -> int:
 _ID = rb"(?:(?P<none>[2367ABEFabef][0-9A-Fa-f]{7})|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))"
 """``none``: the id of an error frame."""
 _LINE = re.compile(
-    rb"[ \t]*\((?P<time>\d+\.\d+)\)[ \t]+[\x21-\x7e]{1,64}[ \t]+"
+    rb"[ \t]*\((?P<time>\d+\.\d+)\)[ \t]+(?P<channel>[\x21-\x7e]{1,64})[ \t]+"
     + _ID
     + rb"#(?:(?P<fd>#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2})*)(?:_[0-9A-Fa-f])?"
     rb"|(?P<remote>[Rr][0-9A-Fa-f]{0,2}))(?:[ \t]+(?P<dir>[RTrt]))?\s*"
@@ -136,7 +139,7 @@ class CandumpReader(TextReader):
         if first is not None and float(first["time"]) >= OLDEST_WALL_S:
             self.wall_start_ns = 0
 
-    def _frame(self, line: bytes) -> TimedFrame | None:
+    def _frame(self, line: bytes) -> LogFrame | None:
         match = candump_line(line)
         if match is None:
             raise ValueError
@@ -146,7 +149,8 @@ class CandumpReader(TextReader):
         data = bytes.fromhex((found["data"] or b"").decode())
         frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, found["fd"] is not None)
         received = (found["dir"] or b"")[:1] in (b"R", b"r")
-        return TimedFrame(_nanoseconds(found["time"]), frame, received)
+        channel = found["channel"].decode("ascii")
+        return LogFrame(_nanoseconds(found["time"]), frame, received, channel)
 
 
 # --- Vector ASC
@@ -180,7 +184,7 @@ class AscReader(TextReader):
             elif _asc_frame(line):
                 break
 
-    def _frame(self, line: bytes) -> TimedFrame | None:
+    def _frame(self, line: bytes) -> LogFrame | None:
         words = line.lower().split()
         if words[0].startswith(b"//") or words[0] in _HEADS:
             return None
@@ -190,13 +194,13 @@ class AscReader(TextReader):
         if fd := words[1:2] == [b"canfd"]:
             if b"errorframe" in words:
                 return None
-            direction, can_id, *rest = words[3:]
+            channel, direction, can_id, *rest = words[2:]
             rest = rest if rest[0] in (b"0", b"1") else rest[1:]  # its symbolic name
             dlc, size, data = int(rest[2], 16), int(rest[3]), rest[4:]
             if dlc and not size:  # a remote frame
                 return None
         elif len(words) > 4 and words[3] in _DIRECTIONS:
-            can_id, direction, kind, *data = words[2:]
+            channel, can_id, direction, kind, *data = words[1:]
             if kind == b"r":
                 return None
             if kind != b"d":
@@ -209,7 +213,8 @@ class AscReader(TextReader):
         extended = can_id.endswith(b"x")
         number = int(can_id.removesuffix(b"x"), self._base)
         content = bytes(int(byte, self._base) for byte in data[:size])
-        return TimedFrame(time_ns, CanFrame(number, content, extended, fd), direction == b"rx")
+        frame = CanFrame(number, content, extended, fd)
+        return LogFrame(time_ns, frame, direction == b"rx", str(int(channel)))
 
 
 def asc_time(words: list[str]) -> int | None:
@@ -257,7 +262,7 @@ class TrcReader(TextReader):
             self.wall_start_ns = round(parser._start_time * 1e6) * 1000
         parser._start_time = 0.0
 
-    def _frame(self, line: bytes) -> TimedFrame | None:
+    def _frame(self, line: bytes) -> LogFrame | None:
         text = line.decode("ascii").strip()
         if text.startswith(";"):
             return None

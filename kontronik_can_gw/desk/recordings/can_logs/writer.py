@@ -5,19 +5,19 @@ The same frames give the same bytes, but for MF4: no other file says when it was
 
 import io
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import IO, TYPE_CHECKING, Any
 
+from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
-from kontronik_can_gw.desk.recordings.recording import timed
+from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.lean import without_asammdf
 
 if TYPE_CHECKING:
     from can import Message
 
-    from kontronik_can_gw.capture.replay import TimedFrame
-    from kontronik_can_gw.native.offline import Frames
+    from kontronik_can_gw.desk.recordings.recording import Batch
 
 _MS = 1_000_000
 _LATEST_NS = 1 << 61
@@ -31,7 +31,7 @@ class CanLogWriter:
     ``provenance``: for the header of MF4, as it is known at the end.
     """
 
-    write: "Callable[[Frames | list[TimedFrame]], None]"
+    write: "Callable[[Batch], None]"
     """Add frames."""
 
     def __init__(
@@ -49,6 +49,8 @@ class CanLogWriter:
         """Write what is held back, and the end. The file stays open."""
         self.discard: Callable[[], object] = lambda: None
         """Release what is held, where the log is not to be kept."""
+        self.channels = Channels(channel)
+        """The numbers or names of the channels that have been written."""
         self._base_ns, start_ns = origin_ns, 0
         if wall_ns is not None:
             # Vector's and PEAK's headers count milliseconds, those of MF4 are read as microseconds
@@ -57,7 +59,7 @@ class CanLogWriter:
             self._base_ns = start_ns - wall_ns + origin_ns
         match format_:
             case "candump":
-                self._candump(file, (wall_ns or 0) - origin_ns, channel)
+                self._candump(file, (wall_ns or 0) - origin_ns)
             case "asc":
                 self._asc(file, None if wall_ns is None else start_ns)
             case "blf":
@@ -67,20 +69,22 @@ class CanLogWriter:
             case _:
                 self._mf4(file, start_ns, provenance or {})
 
-    def _candump(self, file: IO[bytes], offset_ns: int, channel: str) -> None:
+    def _candump(self, file: IO[bytes], offset_ns: int) -> None:
         half = 500 + offset_ns
+        name_of = self.channels.name_of
 
-        def write(frames: "Frames | list[TimedFrame]") -> None:
+        def write(frames: "Batch") -> None:
             if not isinstance(frames, list) and 0 <= frames.times[0] + half < _LATEST_NS:
-                file.write(frames.candump(half, channel))
+                file.write(frames.candump(half, name_of("")))
                 return
-            for time_ns, (can_id, data, extended, fd, *_), received in timed(frames):
+            for time_ns, frame, received, channel in _logged(frames):
+                can_id, data, extended, fd, *_ = frame
                 us = (time_ns + half) // 1000
                 flags = "#1" if fd else ""  # with a switched bit rate, as the gateway sends them
                 name = f"{can_id:08X}" if extended else f"{can_id:03X}"
                 end = "R" if received else "T"
-                line = f"({us // 1000000}.{us % 1000000:06d}) {channel} {name}#{flags}{data.hex().upper()} {end}\n"
-                file.write(line.encode("ascii"))
+                stamp = f"({us // 1000000}.{us % 1000000:06d}) {name_of(channel)}"
+                file.write(f"{stamp} {name}#{flags}{data.hex().upper()} {end}\n".encode("ascii"))
 
         self.write = write
 
@@ -151,7 +155,6 @@ class CanLogWriter:
         writer._start_time = writer.last_timestamp = 0.0
 
         def take(message: "Message") -> None:
-            message.channel = 1
             # a master channel only rises
             message.timestamp = max(message.timestamp, writer.last_timestamp)
             writer.on_message_received(message)
@@ -162,15 +165,26 @@ class CanLogWriter:
                 writer._mdf.save(file, compression=2)  # stop() closes the file
                 writer._mdf.close()
 
-        self._through(take)
+        self._through(take, first_channel=1)
         self.close, self.discard = close, writer._mdf.close
 
-    def _through(self, take: "Callable[[Message], None]", more_ns: float = 0.0) -> None:
-        """Write by one of python-can's writers. Times go in seconds since the start, for which a float is exact enough."""
+    def _through(
+        self,
+        take: "Callable[[Message], None]",
+        more_ns: float = 0.0,
+        first_channel: int = 0,
+    ) -> None:
+        """Write with one of python-can's writers.
+
+        Times are seconds since the start of the log, which a float holds exactly enough.
+        ``first_channel``: the number that the writer expects for channel 1.
+        """
         from can import Message
 
-        def write(frames: "Frames | list[TimedFrame]") -> None:
-            for time_ns, frame, received in timed(frames):
+        number_of = self.channels.number_of
+
+        def write(frames: "Batch") -> None:
+            for time_ns, frame, received, channel in _logged(frames):
                 take(
                     Message(
                         (max(time_ns - self._base_ns, 0) + more_ns) / SECOND_NS,
@@ -180,10 +194,18 @@ class CanLogWriter:
                         is_fd=frame.fd,
                         bitrate_switch=frame.fd,
                         is_rx=received,
+                        channel=number_of(channel) - 1 + first_channel,
                     )
                 )
 
         self.write = write
+
+
+def _logged(frames: "Batch") -> Iterator[LogFrame]:
+    """The frames one by one, with their channels."""
+    if not isinstance(frames, list):
+        return (LogFrame(time_ns, frame) for time_ns, frame in frames)
+    return (item if isinstance(item, LogFrame) else LogFrame(*item) for item in frames)
 
 
 class _Unclosed:
