@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
+from kontronik_can_gw.desk.recordings.recording import counted
 from kontronik_can_gw.errors import RunError
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     table = Table(fields, has_utc, origin_ns, recording.provenance)
     count, last_ns = _write_all(_table_writer(out.open(), form, table), blocks, out)
     lasted = last_ns - origin_ns
-    return f"{_many(count, 'row')} of {_many(len(fields), 'value')}, up to {lasted / 1e9:.3f} s"
+    return f"{counted(count, 'row')} of {counted(len(fields), 'value')}, up to {lasted / 1e9:.3f} s"
 
 
 def _table_writer(file: IO[bytes], form: str, table: "Table") -> Any:
@@ -146,10 +147,10 @@ def to_log(
     writer = CanLogWriter(out.open(), form, *known)
     count, last_ns = _write_all(writer, batches, out)
     lasted = last_ns - origin_ns
-    frames_written = _many(count - sum(writer.left_out.values()), "CAN frame")
+    frames_written = counted(count - sum(writer.left_out.values()), "CAN frame")
     summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
     for what, number in writer.left_out.items():
-        summary += f"; {number} {what} left out, which {form} does not know"
+        summary += f"; {counted(number, what)} left out, which {form} does not know"
     if writer.channels.changes:
         summary += f"; channels: {writer.channels.changes}"
     return summary
@@ -182,8 +183,4 @@ def to_bytes(recording: "Input", out: Output, esc: int) -> str | None:
     if not count:
         return None
     out.is_whole = True
-    return f"{_many(count, 'byte')} of {recording.bus.escs[esc].name}"
-
-
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+    return f"{counted(count, 'byte')} of {recording.bus.escs[esc].name}"

@@ -1,6 +1,7 @@
 """Frames as a CAN tool logged them, as a recording; the format of a log is found out by its content."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -10,7 +11,14 @@ from kontronik_can_gw.desk.recordings.can_logs import text
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.log_clock import LogClock
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, Input, LogFrame, Sample
+from kontronik_can_gw.desk.recordings.recording import (
+    ERROR,
+    LATEST_NS,
+    ClockStep,
+    Input,
+    LogFrame,
+    Sample,
+)
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -57,6 +65,9 @@ class CanLogInput(Input):
         self._selected: str | None = None
         self._channels: dict[str, None] = {}
         """Channels of the frames that have been read."""
+        self._chosen: str | None = None
+        self._without_data: Counter[tuple[str, str]] = Counter()
+        """Error frames and remote frames by channel and kind."""
         self._open()
 
     def _open(self) -> None:
@@ -76,7 +87,7 @@ class CanLogInput(Input):
             yield some
 
     def frames(self) -> Iterator[TimedFrame]:
-        """The frames of one channel: the selected one, or the only one with messages of the DBC.
+        """The data frames of one channel: the selected one, or the only one with messages of the DBC.
 
         UserError if several channels have such messages and none is selected. Frames of other
         channels that are not in the DBC are among them.
@@ -84,11 +95,15 @@ class CanLogInput(Input):
         ours, chosen = self.reader.keys, self._selected
         self.others = 0
         logged = self._logged()
-        for time_ns, frame, received, channel in logged:
+        for item in logged:
+            time_ns, frame, received, channel = item
+            if frame.remote or frame.can_id & ERROR:
+                self._without_data[channel, item.kind] += 1
+                continue
             if frame.key not in ours:
                 self.others += 1
             elif chosen is None:
-                chosen = channel
+                self._chosen = chosen = channel
             elif channel != chosen:
                 raise self._ambiguous(logged)
             yield TimedFrame(time_ns, frame, received)
@@ -99,6 +114,8 @@ class CanLogInput(Input):
         self._open()
         clock, selected = self._clock, self._selected
         self._channels = {}
+        self._chosen = selected
+        self._without_data.clear()
         before = None
         try:
             for item in clock.frames():
@@ -126,6 +143,14 @@ class CanLogInput(Input):
         return UserError(
             f"{self._path}: several channels have messages of {file}. Choose one with --channel: {listed}."
         )
+
+    @property
+    def without_data(self) -> Mapping[str, int]:
+        found: Counter[str] = Counter()
+        for (channel, kind), number in sorted(self._without_data.items()):
+            if self._chosen in (None, channel):
+                found[kind] += number
+        return found
 
     @cached_property
     def fields(self) -> Sequence[Field]:

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import chain, groupby, islice, takewhile
 from operator import itemgetter
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 Batch: TypeAlias = "list[TimedFrame] | list[LogFrame] | Frames"
 """Frames in their order; ``Frames`` were all sent."""
+ERROR = 0x20000000
+"""Marks the id of an error frame, as SocketCAN does. No other id has this bit."""
 LATEST_NS = 1 << 62
 """No time of a recording, and no Unix time (2116), is later: it is damaged."""
 ROWS = 1024
@@ -31,12 +33,23 @@ _DISORDER_NS = 1_000_000_000
 
 
 class LogFrame(NamedTuple):
-    """A TimedFrame of a CAN log. ``channel``: its name or number; empty for the gateway's own bus."""
+    """A frame of a CAN log, which may be a remote frame or an error frame, too.
+
+    ``channel``: its name or number; empty for the gateway's own bus. The id of an error frame is
+    ERROR and SocketCAN's class of the error, if the log has it.
+    """
 
     time_ns: int
     frame: CanFrame
     received: bool = False
     channel: str = ""
+
+    @property
+    def kind(self) -> str:
+        """What it is, for counts that people read."""
+        if self.frame.can_id & ERROR:
+            return "error frame"
+        return "remote frame" if self.frame.remote else "CAN frame"
 
 
 class ClockStep(NamedTuple):
@@ -138,12 +151,22 @@ class Input(ABC):
         return _described(self.clock_steps, self.begin_ns)
 
     @property
+    def without_data(self) -> Mapping[str, int]:
+        """Number of error frames and of remote frames by ``LogFrame.kind``, as far as it was read."""
+        return {}
+
+    @property
     def left_out(self) -> str:
-        """What became of ``others`` in tables, pages and screens; empty where there are none."""
-        if not self.others:
-            return ""
-        file = Path(self.bus.layout.file).name
-        return f"{self.others} CAN frames left out that {file} does not have (-c or --dbc gives another)"
+        """Which frames are not part of tables, pages and screens; empty if all are."""
+        parts = []
+        if self.others:
+            file = Path(self.bus.layout.file).name
+            parts.append(
+                f"{self.others} CAN frames left out that {file} does not have (-c or --dbc gives another)"
+            )
+        if counts := [counted(number, kind) for kind, number in self.without_data.items()]:
+            parts.append(f"{' and '.join(counts)} left out")
+        return "; ".join(parts)
 
     @property
     def channel(self) -> str:
@@ -212,6 +235,11 @@ class Input(ABC):
     def _wall_of(self, row: Sample) -> int | None:
         wall_ns = self.wall_ns(row.time_ns)
         return None if wall_ns is None else wall_ns - row.time_ns
+
+
+def counted(count: int, noun: str) -> str:
+    """A number with its noun: "1 row", "2 rows"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:

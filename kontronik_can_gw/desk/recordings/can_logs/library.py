@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 logging.getLogger("can.io").setLevel(logging.CRITICAL)  # what it says is said here
 _MIN_OBJECT, _MAX_OBJECT = 32, 1 << 20
 """Bytes of an object in a container of a BLF file: a larger one would gather all that follows it."""
+_ERROR_OBJECTS = tuple(number.to_bytes(4, "little") for number in (2, 104))
+"""Types CAN_ERROR and CAN_FD_ERROR_64, which python-can does not read."""
 _MS = 1_000_000
 
 
@@ -52,8 +54,7 @@ class LibraryReader(LogReader):
                 for message in self._reader or ():
                     done += 1
                     try:
-                        if (item := frame_of(message, self._first_channel)) is not None:
-                            yield item
+                        yield frame_of(message, self._first_channel)
                     except ValueError:
                         wrong += 1
         except Exception as error:  # whatever a damaged file makes of it
@@ -67,14 +68,28 @@ class _SoundObjects(BLFReader):
 
     def _parse_container(self, data: bytes) -> "Iterator[Message]":
         data, self._tail = self._tail + data, b""
-        at = 0
+        at = begin = 0
         while (found := data.find(b"LOBJ", at, at + 8)) >= 0 and found + 12 <= len(data):
             size = int.from_bytes(data[found + 8 : found + 12], "little")
             if not _MIN_OBJECT <= size <= _MAX_OBJECT:
-                yield from super()._parse_container(data[:found])
+                yield from super()._parse_container(data[begin:found])
                 raise BLFParseError(f"an object of {size} bytes")
             at = found + size
-        yield from super()._parse_container(data)
+            if data[found + 12 : found + 16] in _ERROR_OBJECTS and at <= len(data):
+                yield from super()._parse_container(data[begin:found])
+                self._tail = b""
+                yield _error_message(data[found:at])
+                begin = at
+        yield from super()._parse_container(data[begin:])
+
+
+def _error_message(data: bytes) -> "Message":
+    """The error frame of an object that python-can does not read. The channel is its first byte."""
+    from can import Message
+
+    flags, time = struct.unpack_from("<L4xQ", data, 16)
+    unit = 1e-5 if flags == 1 else 1e-9
+    return Message(time * unit, is_error_frame=True, channel=data[32] - 1)
 
 
 class BlfReader(LibraryReader):

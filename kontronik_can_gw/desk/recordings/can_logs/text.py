@@ -1,17 +1,17 @@
 """Readers of candump logs, Vector ASC and PEAK TRC. A line that cannot be read is counted, the next one is read again.
 
 Times stay whole numbers of nanoseconds, of TRC of microseconds. ASC, which has no public specification, is read as python-can reads it;
-the lines of TRC by python-can itself. Error and remote frames and other events are left out.
+the lines of TRC by python-can itself. Events other than frames are left out.
 """
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from typing import Any, BinaryIO
 
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.desk.recordings.recording import ERROR, LATEST_NS, LogFrame
+from kontronik_can_gw.frames import MAX_EXTENDED_ID, CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
 SECOND_NS = 1_000_000_000
@@ -22,6 +22,7 @@ MAX_S = 1 << 31
 LONGEST_LINE = 4096
 """Bytes; a line of any of these formats is far shorter."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+_BUS_ERROR = 0x80
 _HEAD_LINES = 200
 """Lines in which a log's head is looked for."""
 _SHOWN = 8
@@ -30,29 +31,49 @@ _SHOWN = 8
 def checked(item: LogFrame) -> LogFrame:
     """The frame. ValueError where none with this id and number of bytes exists on a CAN bus, or its time is no log's."""
     frame, size = item.frame, len(item.frame.data)
-    in_range = 0 <= frame.can_id <= (0x1FFFFFFF if frame.extended else 0x7FF)
+    can_id = frame.can_id
+    if can_id & ERROR:
+        can_id &= ~ERROR
+        in_range = 0 <= can_id <= MAX_EXTENDED_ID and not frame.extended
+    else:
+        in_range = 0 <= can_id <= (MAX_EXTENDED_ID if frame.extended else 0x7FF)
     is_long = item.time_ns > LATEST_NS
     if is_long or not in_range or not (size in FD_LENGTHS if frame.fd else size <= 8):
         raise ValueError
     return item
 
 
-def frame_of(message: Any, first_channel: int = 0) -> LogFrame | None:
-    """The frame of a message of python-can; None for one without data. ValueError if it is damaged.
+def frame_of(message: Any, first_channel: int = 0) -> LogFrame:
+    """The frame of a message of python-can. ValueError if it is damaged.
 
     ``first_channel``: number in the log of the channel that python-can calls 0.
     """
-    if message.is_error_frame or message.is_remote_frame:
-        return None
     data, dlc = bytes(message.data), message.dlc
-    if (dlc > 15 and not message.is_fd) or len(data) != (dlc if message.is_fd else min(dlc, 8)):
-        raise ValueError
     if not abs(message.timestamp) < MAX_S:
         raise ValueError
-    frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
+    if message.is_error_frame:
+        frame = error_frame(message.arbitration_id, data)
+    elif message.is_remote_frame:
+        frame = remote_frame(message.arbitration_id, dlc, message.is_extended_id)
+    elif (dlc > 15 and not message.is_fd) or len(data) != (dlc if message.is_fd else min(dlc, 8)):
+        raise ValueError
+    else:
+        frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
     time_ns = round(message.timestamp * SECOND_NS)
     channel = "1" if message.channel is None else str(message.channel + first_channel)
     return checked(LogFrame(time_ns, frame, message.is_rx, channel))
+
+
+def error_frame(class_: int = 0, data: bytes = b"") -> CanFrame:
+    """An error frame as SocketCAN has it: with 8 bytes, and as a bus error if no class is known."""
+    return CanFrame(ERROR | (class_ & MAX_EXTENDED_ID or _BUS_ERROR), data[:8].ljust(8, b"\0"))
+
+
+def remote_frame(can_id: int, dlc: int, extended: bool) -> CanFrame:
+    """A remote frame. ValueError if the number of bytes that it asks for is impossible."""
+    if not 0 <= dlc <= 15:
+        raise ValueError
+    return CanFrame(can_id, bytes(min(dlc, 8)), extended, remote=True)
 
 
 class LogReader:
@@ -117,8 +138,8 @@ def _nanoseconds(text: bytes) -> int:
 
 # --- candump
 
-_ID = rb"(?:(?P<none>[2367ABEFabef][0-9A-Fa-f]{7})|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))"
-"""``none``: the id of an error frame."""
+_ID = rb"(?:(?P<error>[2367ABEFabef][0-9A-Fa-f]{7})|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))"
+"""``error``: the id of an error frame, which has the bit ERROR."""
 _LINE = re.compile(
     rb"[ \t]*\((?P<time>\d+\.\d+)\)[ \t]+(?P<channel>[\x21-\x7e]{1,64})[ \t]+"
     + _ID
@@ -144,10 +165,15 @@ class CandumpReader(TextReader):
         if match is None:
             raise ValueError
         found = match.groupdict()
-        if found["none"] or found["remote"]:
-            return None
         data = bytes.fromhex((found["data"] or b"").decode())
-        frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, found["fd"] is not None)
+        if found["error"]:
+            frame = error_frame(int(found["error"], 16), data)
+        elif found["remote"]:
+            dlc = int(found["remote"][1:2] or b"0", 16)
+            frame = remote_frame(int(found["id"], 16), dlc, len(found["id"]) == 8)
+        else:
+            is_fd = found["fd"] is not None
+            frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, is_fd)
         received = (found["dir"] or b"")[:1] in (b"R", b"r")
         channel = found["channel"].decode("ascii")
         return LogFrame(_nanoseconds(found["time"]), frame, received, channel)
@@ -191,21 +217,24 @@ class AscReader(TextReader):
         time_ns = _nanoseconds(words[0])
         if self._relative:
             time_ns = self._now = self._now + time_ns
+        is_remote = False
+        if b"errorframe" in words[2:5]:
+            channel = words[2] if words[1] == b"canfd" else words[1]
+            return LogFrame(time_ns, error_frame(), b"tx" not in words[2:5], str(int(channel)))
         if fd := words[1:2] == [b"canfd"]:
-            if b"errorframe" in words:
-                return None
             channel, direction, can_id, *rest = words[2:]
             rest = rest if rest[0] in (b"0", b"1") else rest[1:]  # its symbolic name
             dlc, size, data = int(rest[2], 16), int(rest[3]), rest[4:]
-            if dlc and not size:  # a remote frame
-                return None
+            is_remote = bool(dlc and not size)
         elif len(words) > 4 and words[3] in _DIRECTIONS:
             channel, can_id, direction, kind, *data = words[1:]
-            if kind == b"r":
-                return None
-            if kind != b"d":
+            is_remote = kind == b"r"
+            if not is_remote and kind != b"d":
                 raise ValueError
-            size, data = min(8, int(data[0], self._base)), data[1:]
+            # older files have no length of a remote frame
+            has_dlc = not is_remote or (bool(data) and data[0].isalnum() and len(data[0]) <= 2)
+            dlc = int(data[0], self._base) if has_dlc else 0
+            size, data = 0 if is_remote else min(8, dlc), data[1:]
         else:  # an event of another kind
             return None
         if len(data) < size or direction not in _DIRECTIONS:
@@ -214,6 +243,8 @@ class AscReader(TextReader):
         number = int(can_id.removesuffix(b"x"), self._base)
         content = bytes(int(byte, self._base) for byte in data[:size])
         frame = CanFrame(number, content, extended, fd)
+        if is_remote:
+            frame = remote_frame(number, dlc, extended)
         return LogFrame(time_ns, frame, direction == b"rx", str(int(channel)))
 
 
@@ -241,6 +272,15 @@ _NEWER_TRC = re.compile(r"\$FILEVERSION=(?!1\.0\s)")
 """python-can reads a file without a version as 1.0, and does not know that some say so."""
 
 
+_TRC_COLUMNS = {
+    "": {"O": 1, "T": 4},
+    "10": {"O": 1, "T": 4},
+    "11": {"O": 1, "T": 2},
+    "13": {"O": 1, "B": 2, "T": 3},
+}
+"""Columns of time, bus, and type of an error frame, by version; later versions name them."""
+
+
 class TrcReader(TextReader):
     """PEAK TRC, file versions 1.0, 1.1, 1.3, 2.0 and 2.1."""
 
@@ -258,6 +298,8 @@ class TrcReader(TextReader):
         if parser.file_version is TRCFileVersion.UNKNOWN and _NEWER_TRC.search(head):
             parser._parse_cols = lambda _: None
             self.damage.append("its file version is not known")
+        version = "".join(filter(str.isdigit, parser.file_version.name))
+        self._columns = _TRC_COLUMNS.get(version, parser.columns)
         if parser._start_time >= OLDEST_WALL_S:
             self.wall_start_ns = round(parser._start_time * 1e6) * 1000
         parser._start_time = 0.0
@@ -266,8 +308,20 @@ class TrcReader(TextReader):
         text = line.decode("ascii").strip()
         if text.startswith(";"):
             return None
-        message = self._parser._parse_cols(tuple(text.split(maxsplit=self._parser._num_columns)))
-        if message is not None and message.is_fd:  # its length, not the code, as in other formats
+        columns = tuple(text.split(maxsplit=self._parser._num_columns))
+        if self._is_error(columns):
+            time_ns = round(float(columns[self._columns["O"]]) * 1_000) * 1_000
+            channel = columns[self._columns["B"]] if "B" in self._columns else "1"
+            return LogFrame(time_ns, error_frame(), True, channel)
+        message = self._parser._parse_cols(columns)
+        if message is None:
+            return None
+        if message.is_fd:  # its length, not the code, as in other formats
             message.dlc = self._length_of_code(message.dlc)
-        found = None if message is None else frame_of(message)
-        return found and found._replace(time_ns=round(found.time_ns, -3))
+        found = frame_of(message)
+        return found._replace(time_ns=round(found.time_ns, -3))
+
+    def _is_error(self, columns: Sequence[str]) -> bool:
+        """True for the line of an error frame, which python-can does not read."""
+        place = self._columns.get("T")
+        return place is not None and columns[place : place + 1] in (("ERROR",), ("Error",), ("ER",))

@@ -5,13 +5,14 @@ The same frames give the same bytes, but for MF4: no other file says when it was
 
 import io
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
-from kontronik_can_gw.desk.recordings.recording import LogFrame
+from kontronik_can_gw.desk.recordings.recording import ERROR, LogFrame
 from kontronik_can_gw.lean import without_asammdf
 
 if TYPE_CHECKING:
@@ -43,8 +44,8 @@ class CanLogWriter:
         channel: str = "can0",
         provenance: Mapping[str, str] | None = None,
     ) -> None:
-        self.left_out: dict[str, int] = {}
-        """Frames that the format does not know, by what they are."""
+        self.left_out: Counter[str] = Counter()
+        """Number of frames that the format does not know, by their kind."""
         self.close: Callable[[], object] = lambda: None
         """Write what is held back, and the end. The file stays open."""
         self.discard: Callable[[], object] = lambda: None
@@ -80,11 +81,15 @@ class CanLogWriter:
             for time_ns, frame, received, channel in _logged(frames):
                 can_id, data, extended, fd, *_ = frame
                 us = (time_ns + half) // 1000
-                flags = "#1" if fd else ""  # with a switched bit rate, as the gateway sends them
-                name = f"{can_id:08X}" if extended else f"{can_id:03X}"
+                name = f"{can_id:08X}" if extended or can_id & ERROR else f"{can_id:03X}"
+                content = data.hex().upper()
+                if frame.remote:
+                    content = f"R{len(data) or ''}"
+                elif fd:  # with a switched bit rate, as the gateway sends them
+                    content = f"#1{content}"
                 end = "R" if received else "T"
                 stamp = f"({us // 1000000}.{us % 1000000:06d}) {name_of(channel)}"
-                file.write(f"{stamp} {name}#{flags}{data.hex().upper()} {end}\n".encode("ascii"))
+                file.write(f"{stamp} {name}#{content} {end}\n".encode("ascii"))
 
         self.write = write
 
@@ -134,8 +139,15 @@ class CanLogWriter:
         writer.write_header(start_ns // _MS / 1000)
 
         def take(message: "Message") -> None:
-            if message.is_fd:
-                self.left_out["CAN FD frames"] = self.left_out.get("CAN FD frames", 0) + 1
+            if message.is_error_frame:
+                self.left_out["error frame"] += 1
+            elif message.is_fd:
+                self.left_out["CAN FD frame"] += 1
+            elif message.is_remote_frame:  # python-can does not write these
+                number = int(cast(int, message.channel)) + 1
+                line = writer._format_message(message, number).replace(" DT ", " RR ", 1)
+                writer.msgnr += 1
+                writer.log_event(line, message.timestamp)
             else:
                 writer.on_message_received(message)
 
@@ -188,9 +200,12 @@ class CanLogWriter:
                 take(
                     Message(
                         (max(time_ns - self._base_ns, 0) + more_ns) / SECOND_NS,
-                        frame.can_id,
+                        frame.can_id & ~ERROR,
                         frame.extended,
-                        data=frame.data,
+                        is_remote_frame=frame.remote,
+                        is_error_frame=bool(frame.can_id & ERROR),
+                        dlc=len(frame.data),
+                        data=None if frame.remote else frame.data,
                         is_fd=frame.fd,
                         bitrate_switch=frame.fd,
                         is_rx=received,
