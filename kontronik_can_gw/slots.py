@@ -74,6 +74,10 @@ class Slot(Protocol):
     def is_news(self) -> bool:
         """True if what is in it has changed since its last frame."""
 
+    @property
+    def is_pending(self) -> bool:
+        """True if a frame is going to be handed over with the next ``take``."""
+
     def configure(self, settings: SlotSettings | None, now: int) -> None:
         """Other settings, or none. A slot that is given some while it is started begins as at its start."""
 
@@ -111,6 +115,10 @@ class PythonSlot:
         self._last_ns = -NEVER
         self._last_watched = -1
         self._timer_due = self._deferred_until = NEVER
+
+    @property
+    def is_pending(self) -> bool:
+        return self.number in self._owner.pending
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
         before, self._settings = self._settings, settings

@@ -36,7 +36,7 @@ ON_BOTH_CORES = (
     *("gateway", "golden/test_golden.py::test_no_frame_has_changed"),
     *("dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
     *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
-    *("canopen/test_dialogues.py", "runtime/test_hold_ups.py"),
+    *("canopen/test_dialogues.py", "canopen/test_sync_at_once.py", "runtime/test_hold_ups.py"),
     *("runtime/test_esc_input.py", "runtime/test_snapshot.py"),
     *("recordings/test_plain_bytes.py", "recordings/test_tables.py"),
 )

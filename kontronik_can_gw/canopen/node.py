@@ -15,9 +15,10 @@ from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects
 from kontronik_can_gw.canopen.lss import Identity, LssSlave
 from kontronik_can_gw.canopen.nmt import Consumer, Nmt, Producer
-from kontronik_can_gw.canopen.pdo import SyncConsumer, Tpdos
+from kontronik_can_gw.canopen.pdo import Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Parameters, Stored
+from kontronik_can_gw.canopen.sync import SyncConsumer
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -67,10 +68,10 @@ class Node:
         )
         self.lss = LssSlave(self.identity, partial(self._send, LSS_ANSWER))
         bind_values(dictionary, esc, gateway)
-        self.tpdos = Tpdos(dictionary, partial(owner.slot, number), taken)
+        self.tpdos = Tpdos(dictionary, partial(owner.slot, number), gateway, taken)
         changed = partial(owner.settings_changed, number)
         self._esc_objects = EscObjects(self, gateway, changed)
-        self._timers = (self._producer, self.consumer, self.sdo, self.emergencies)
+        self._timers = (self._producer, self.consumer, self.sdo, self.emergencies, self.tpdos)
         dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
         dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS
         dictionary.written = self._on_download

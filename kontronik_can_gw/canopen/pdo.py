@@ -11,9 +11,11 @@ carry the link status: those go on, with all ones (80..0h for signed types) for 
 from collections.abc import Callable, Sequence
 
 from kontronik_can_gw.canopen.bound_values import bits_of, compile_pdo
-from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, SYNC, Taken, check_free
+from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, Taken, check_free
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Variable, key
+from kontronik_can_gw.canopen.sync import LAST_SYNC_TYPE, SyncTransmission
 from kontronik_can_gw.esc.telemetry import MS, SECOND, Event
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ
 from kontronik_can_gw.slots import Slot, SlotPlan, SlotSettings
@@ -22,14 +24,21 @@ COMMUNICATION, MAPPING = 0x1800, 0x1A00
 MAX_TPDOS = 512
 COB_ID, TYPE, INHIBIT, EVENT_TIMER, SYNC_START = 1, 2, 3, 5, 6
 EVENT_TYPES = (254, 255)
-_FRAME_BIT, _PRODUCER_BIT = 1 << 29, 1 << 30
+_FRAME_BIT = 1 << 29
 _MAX_BITS = 64
 
 
 class Tpdo:
-    """One transmit PDO of one node."""
+    """One transmit PDO of one node. ``status`` counts the PDOs that were replaced."""
 
-    def __init__(self, number: int, dictionary: Dictionary, slot: Slot, taken: Taken) -> None:
+    def __init__(
+        self,
+        number: int,
+        dictionary: Dictionary,
+        slot: Slot,
+        status: GatewayStatus,
+        taken: Taken,
+    ) -> None:
         self.number = number
         self.cob_id = 0
         self.valid = False
@@ -45,9 +54,7 @@ class Tpdo:
         self._slot = slot
         self._plan: SlotPlan | None = None
         self._started = False
-        self._sync_start = 0
-        self._syncs = 0
-        self._sync_waits = False
+        self.sync = SyncTransmission(slot, status)
         bind, written, check_entry = dictionary.bind, self.configure, self._check_entry
         bind(index, COB_ID, check=self._check_cob_id, written=written)
         bind(index, TYPE, check=self._check_type, written=written)
@@ -93,7 +100,7 @@ class Tpdo:
         self.type = number(index, TYPE)
         self.inhibit_ns = number(index, INHIBIT) * MS // 10
         self.event_ns = number(index, EVENT_TIMER) * MS
-        self._sync_start = number(index, SYNC_START)
+        self.sync.configure(self.type, number(index, SYNC_START))
         self.mapped = self._resolve_all(number(mapping))
 
     def check(self) -> None:
@@ -113,7 +120,7 @@ class Tpdo:
             times = (self.inhibit_ns, self.event_ns)
             settings = SlotSettings(self._plan, self.cob_id, by_event, *times)
         if not was_running:
-            self._begin_syncs()
+            self.sync.begin()
         self._slot.configure(settings, now)
 
     def reset(self, node_id: int, now: int) -> list[int]:
@@ -176,7 +183,7 @@ class Tpdo:
 
     def _check_type(self, value: int) -> None:
         """A new 180xh:2. Reserved types and 252, 253 (on request by RTR) are refused: 06090030h."""
-        if 241 <= value <= 253:
+        if LAST_SYNC_TYPE < value < EVENT_TYPES[0]:
             raise SdoAbort(Abort.VALUE)
 
     def _check_while_invalid(self, _value: int) -> None:
@@ -187,7 +194,7 @@ class Tpdo:
     def _check_sync_start(self, value: int) -> None:
         """A new 180xh:6."""
         self._check_while_invalid(value)
-        if value > 240:
+        if value > LAST_SYNC_TYPE:
             raise SdoAbort(Abort.VALUE)
 
     def _check_count(self, count: int) -> None:
@@ -214,12 +221,13 @@ class Tpdo:
     def start(self, now: int) -> None:
         """The node has become OPERATIONAL: event-driven PDOs say once what is."""
         self._started = True
-        self._begin_syncs()
+        self.sync.begin()
         self._slot.start(now)
 
     def stop(self) -> None:
         """No PDO outside OPERATIONAL."""
         self._started = False
+        self.sync.stop()
         self._slot.stop()
 
     def on_download(self, variable: Variable, now: int) -> None:
@@ -233,26 +241,9 @@ class Tpdo:
             self._slot.news(now)
 
     def on_sync(self, counter: int, now: int, answer: bool) -> None:
-        """A SYNC message; ``counter`` 0 where it has none. Without ``answer`` it is only counted."""
-        if not self._running or self.type > 240:
-            return
-        if self._sync_waits and counter:
-            if counter != self._sync_start:
-                return
-            self._sync_waits = False  # this SYNC counts as the first
-        if self.type == 0:
-            if self._slot.is_news and answer:
-                self._slot.send(now)
-            return
-        self._syncs += 1
-        if self._syncs >= self.type:
-            self._syncs = 0
-            if answer:
-                self._slot.send(now)
-
-    def _begin_syncs(self) -> None:
-        self._syncs = 0
-        self._sync_waits = self._sync_start != 0
+        """Counts a SYNC, see SyncTransmission."""
+        if self._running:
+            self.sync.on_sync(counter, now, answer)
 
 
 def _check_length(mapped: Sequence[Variable]) -> None:
@@ -261,15 +252,26 @@ def _check_length(mapped: Sequence[Variable]) -> None:
 
 
 class Tpdos(list[Tpdo]):
-    """All transmit PDOs of a node, in ascending numbers, as many as the EDS has. ``slot`` gives a further slot of the core."""
+    """All transmit PDOs of a node in ascending order, as many as the EDS has.
 
-    def __init__(self, dictionary: Dictionary, slot: Callable[[], Slot], taken: Taken) -> None:
+    ``slot`` returns another slot of the core.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        slot: Callable[[], Slot],
+        status: GatewayStatus,
+        taken: Taken,
+    ) -> None:
         super().__init__(
-            Tpdo(number, dictionary, slot(), taken)
+            Tpdo(number, dictionary, slot(), status, taken)
             for number in range(MAX_TPDOS)
             if dictionary.get(COMMUNICATION + number) is not None
         )
         self._held_up_ns = -NEVER
+        self.due = NEVER
+        """When ``advance`` has something to do, or earlier."""
 
     def release_ids(self) -> None:
         """What PDOs had is free for another."""
@@ -282,9 +284,19 @@ class Tpdos(list[Tpdo]):
             tpdo.stop()
 
     def on_sync(self, counter: int, now: int, at: int) -> None:
-        """A SYNC message that came ``at``; one from before a hold-up is counted, but not answered."""
+        """Counts a SYNC that arrived ``at``. A SYNC from before a hold-up is not answered."""
+        answer = at > self._held_up_ns
         for tpdo in self:
-            tpdo.on_sync(counter, now, answer=at > self._held_up_ns)
+            tpdo.on_sync(counter, now, answer)
+            self.due = min(self.due, tpdo.sync.due)
+
+    def advance(self, now: int) -> None:
+        """Sends the PDOs that wait for their turn after SYNCs that were read at once."""
+        if now < self.due:
+            return
+        for tpdo in self:
+            tpdo.sync.advance(now)
+        self.due = min((tpdo.sync.due for tpdo in self), default=NEVER)
 
     def held_up(self, now: int) -> None:
         """The process was held up until ``now``."""
@@ -294,39 +306,3 @@ class Tpdos(list[Tpdo]):
         """Send once more what is sent on change only."""
         for tpdo in self:
             tpdo.repeat(now)
-
-
-class SyncConsumer:
-    """Which SYNC message a node follows (CiA 301, 7.2.5): objects 1005h COB-ID and 1019h counter overflow."""
-
-    def __init__(self, dictionary: Dictionary, taken: Taken) -> None:
-        self._dictionary = dictionary
-        self._taken = taken
-        dictionary.bind(0x1005, check=self._check_cob_id)
-        dictionary.bind(0x1019, check=_check_overflow)
-
-    @property
-    def cob_id(self) -> int:
-        """11 bits of 1005h."""
-        return self._dictionary.number(0x1005) & 0x7FF
-
-    def counter(self, data: bytes) -> int | None:
-        """The counter of a SYNC message, 0 where it has none.
-
-        None if its length is not what 1019h says: 1 byte with a counter, else none.
-        """
-        if len(data) != (1 if self._dictionary.number(0x1019) else 0):
-            return None
-        return data[0] if data else 0
-
-    def _check_cob_id(self, value: int) -> None:
-        """A new 1005h. SdoAbort 06090030h for a producer (there is none), 29-bit ids, reserved bits and restricted ids."""
-        if value & (_PRODUCER_BIT | _FRAME_BIT | 0x1FFFF800):
-            raise SdoAbort(Abort.VALUE)
-        check_free(value & 0x7FF, SYNC, self._taken)
-
-
-def _check_overflow(value: int) -> None:
-    """A new 1019h: 0 (no counter) or 2..240, else SdoAbort 06090030h."""
-    if value == 1 or value > 240:
-        raise SdoAbort(Abort.VALUE)

@@ -901,6 +901,11 @@ int kcg_slot_is_news(const kcg *g, uint32_t slot)
     return (g->sending[g->plan->messages + slot].page & NEWS) != 0;
 }
 
+int kcg_slot_is_pending(const kcg *g, uint32_t slot)
+{
+    return g->sending[g->plan->messages + slot].why != 0;
+}
+
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot)
 {
     return g->last[g->plan->message[g->plan->messages + slot].first_word + 1];

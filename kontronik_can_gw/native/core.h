@@ -192,6 +192,7 @@ void kcg_slot_stop(kcg *g, uint32_t slot);
 void kcg_slot_news(kcg *g, uint32_t slot, int64_t now);
 void kcg_slot_send(kcg *g, uint32_t slot, int64_t now);
 int kcg_slot_is_news(const kcg *g, uint32_t slot);
+int kcg_slot_is_pending(const kcg *g, uint32_t slot);
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
 /* The stream of an ESC has ended: what is held is decided. Frames in it are in g->found, and not taken. */
 void kcg_end(kcg *g, int esc);

@@ -97,6 +97,10 @@ class NativeSlot:
     def is_news(self) -> bool:
         return bool(self._call("is_news")) if self.is_in_c else self._python.is_news
 
+    @property
+    def is_pending(self) -> bool:
+        return bool(self._call("is_pending")) if self.is_in_c else self._python.is_pending
+
     def configure(self, settings: SlotSettings | None, now: int) -> None:
         was_in_c = self.is_in_c
         self.is_in_c = settings is not None and self._write(settings)

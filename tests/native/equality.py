@@ -287,6 +287,8 @@ class Both:
 
     def compare(self) -> None:
         """What came out, each time; the state of the ESCs, which keeps what is wrong, now and then."""
+        for slot in self.slots:
+            assert slot.both[0].is_pending == slot.both[1].is_pending
         frames, others = self.python.take(self.now), self.native.take(self.now)
         if any(slot.settings and not slot.both[1].is_in_c for slot in self.slots):  # type: ignore[attr-defined]
             frames.sort()  # such slots are handed over before the others

@@ -161,6 +161,30 @@ def test_what_is_sent_is_what_a_replay_in_python_sends(
     assert (sum(number == 0x98040A2A for number, _ in replayed) > 20) == has_nodes
 
 
+def test_syncs_read_at_once_are_all_answered_in_the_run_and_in_its_replay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    it = Recorded(1, monkeypatch, has_nodes=True)
+    for at, can_id, data in (
+        (100, 0x601, "23 00 18 01 81 01 00 c0"),  # 1800h:1: off
+        (110, 0x601, "2f 00 18 02 02 00 00 00"),  # every second SYNC
+        (120, 0x601, "2f 00 1a 00 00 00 00 00"),
+        (130, 0x601, "23 00 1a 01 08 02 20 20"),  # the live counter
+        (140, 0x601, "2f 00 1a 00 01 00 00 00"),
+        (150, 0x601, "23 00 18 01 81 01 00 40"),
+        *[(1000, 0x80, "")] * 8,
+        *[(1500, 0x80, "")] * 3,
+        *[(1800, 0x80, "")],
+    ):
+        it.bus.came(can_id, bytes.fromhex(data), it.begun + at * MS)
+    sent, replayed = it.sent(), it.replayed(monkeypatch)
+    pdos = [(number, data) for number, data in sent if number == 0x181 and len(data) == 1]
+    assert len(pdos) == 6
+    assert pdos == [
+        (number, data) for number, data in replayed if number == 0x181 and len(data) == 1
+    ]
+
+
 @pytest.mark.parametrize("has_nodes", [True, False])
 def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebody_wants_it(
     has_nodes: bool, monkeypatch: pytest.MonkeyPatch

@@ -1,0 +1,127 @@
+"""SYNC, consumer side: the SYNC of a node, and when its TPDOs of types 0 to 240 are sent (CiA 301, 7.2.5)."""
+
+from kontronik_can_gw.canopen.cob_ids import SYNC, Taken, check_free
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
+from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.output import NEVER
+from kontronik_can_gw.slots import Slot
+
+MAX_WAITING = 32
+"""At most this many frames of one TPDO wait for their turn after SYNCs that were read at once."""
+LAST_SYNC_TYPE = 240
+_FRAME_BIT, _PRODUCER_BIT = 1 << 29, 1 << 30
+
+
+class SyncTransmission:
+    """Counts SYNCs for one TPDO and sends it. ``status`` counts the PDOs that a newer one replaced.
+
+    Several SYNCs may be read in one turn of the loop, after a delay. With type 1 the newest PDO
+    replaces the earlier ones of that turn. With types 2 to 240 every PDO is sent, one for each call
+    of ``advance``, so that each carries the values of its own turn.
+    """
+
+    def __init__(self, slot: Slot, status: GatewayStatus) -> None:
+        self.due = NEVER
+        """When ``advance`` has something to do."""
+        self._slot = slot
+        self._status = status
+        self._type = 0
+        self._start_value = 0
+        self._has_begun = True
+        self._count = 0
+        self._waiting = 0
+
+    def configure(self, transmission_type: int, start_value: int) -> None:
+        """Takes over 180xh:2 and 180xh:6. The count of SYNCs goes on."""
+        if transmission_type != self._type:
+            self.stop()
+        self._type = transmission_type
+        self._start_value = start_value
+
+    def begin(self) -> None:
+        """Starts the count of SYNCs again."""
+        self.stop()
+        self._count = 0
+        self._has_begun = self._start_value == 0
+
+    def stop(self) -> None:
+        """Discards the PDOs that wait for their turn."""
+        self._waiting = 0
+        self.due = NEVER
+
+    def on_sync(self, counter: int, now: int, answer: bool) -> None:
+        """Counts a SYNC and sends the PDO if it is due.
+
+        ``counter`` is 0 if the SYNC has none. Without ``answer`` the SYNC is only counted.
+        """
+        if self._type > LAST_SYNC_TYPE:
+            return
+        if not self._has_begun and counter:
+            if counter != self._start_value:
+                return
+            self._has_begun = True  # this SYNC counts as the first
+        if self._type == 0:
+            if self._slot.is_news and answer:
+                self._slot.send(now)
+            return
+        self._count += 1
+        if self._count >= self._type:
+            self._count = 0
+            if answer:
+                self._send(now)
+
+    def advance(self, now: int) -> None:
+        """Sends one PDO that waits, if the one before it has been handed over."""
+        if now < self.due or self._slot.is_pending:
+            return
+        self._waiting -= 1
+        self.due = now + 1 if self._waiting else NEVER
+        self._slot.send(now)
+
+    def _send(self, now: int) -> None:
+        if not self._slot.is_pending and not self._waiting:
+            self._slot.send(now)
+        elif self._type == 1 or self._waiting >= MAX_WAITING:
+            self._status.replaced_frames += 1
+        else:
+            self._waiting += 1
+            self.due = min(self.due, now + 1)
+
+
+class SyncConsumer:
+    """The SYNC that a node follows: objects 1005h (COB-ID) and 1019h (counter overflow)."""
+
+    def __init__(self, dictionary: Dictionary, taken: Taken) -> None:
+        self._dictionary = dictionary
+        self._taken = taken
+        dictionary.bind(0x1005, check=self._check_cob_id)
+        dictionary.bind(0x1019, check=_check_overflow)
+
+    @property
+    def cob_id(self) -> int:
+        """11 bits of 1005h."""
+        return self._dictionary.number(0x1005) & 0x7FF
+
+    def counter(self, data: bytes) -> int | None:
+        """Returns the counter of a SYNC, or 0 if 1019h sets none. Returns None for a wrong length.
+
+        A SYNC has one byte of data if 1019h sets a counter, and no data otherwise.
+        """
+        if len(data) != (1 if self._dictionary.number(0x1019) else 0):
+            return None
+        return data[0] if data else 0
+
+    def _check_cob_id(self, value: int) -> None:
+        """Checks a new 1005h.
+
+        SdoAbort 06090030h for a SYNC producer, 29-bit ids, reserved bits and restricted ids.
+        """
+        if value & (_PRODUCER_BIT | _FRAME_BIT | 0x1FFFF800):
+            raise SdoAbort(Abort.VALUE)
+        check_free(value & 0x7FF, SYNC, self._taken)
+
+
+def _check_overflow(value: int) -> None:
+    """Checks a new 1019h: 0 (no counter) or 2 to 240, otherwise SdoAbort 06090030h."""
+    if value == 1 or value > 240:
+        raise SdoAbort(Abort.VALUE)
