@@ -37,7 +37,11 @@ from kontronik_can_gw.canopen.sdo_transfers import (
 from kontronik_can_gw.output import NEVER
 
 TIMEOUT_NS = 2_000_000_000
-"""A transfer ends with 05040000h this long after the last frame of either side."""
+"""A transfer ends with 05040000h this long after the last frame of either side.
+
+A segment of a block download that is out of sequence does not count: it may be the request of a
+new master, after the one that began the transfer has died.
+"""
 BURST = 4
 """Paced block upload segments sent without a pause."""
 
@@ -87,15 +91,19 @@ class SdoServer:
             return
         if now >= self._deadline:
             self._abort(Abort.TIMEOUT)
+        is_segment = self._sub_block.next_segment is not None and data[0] != _CLIENT_ABORT
         try:
-            if self._sub_block.next_segment is not None and data[0] != _CLIENT_ABORT:
+            if is_segment:
                 self._sub_block.seen(now)
                 self._go_on(data, now)
             elif not self._sub_block.swallow(data[0], now):
                 self._serve(data, now)
         except SdoAbort as abort:
             self._abort(abort.code)
-        self._deadline = NEVER if self._transfer is None else now + TIMEOUT_NS
+        if self._transfer is None:
+            self._deadline = NEVER
+        elif not is_segment or self._sub_block.is_in_sequence:
+            self._deadline = now + TIMEOUT_NS
 
     def confirm(self, code: Abort | None, ticket: int | None = None) -> None:
         """The result of a download that returned False: ``code`` is why it failed, None that it is done.

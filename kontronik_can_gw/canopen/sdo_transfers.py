@@ -26,11 +26,13 @@ class SubBlock:
     def __init__(self) -> None:
         self.next_segment: int | None = None
         """Number of the segment that follows, 0: none; None: no sub-block is open."""
+        self.is_in_sequence = True
+        """False if the last segment was not the one that had to follow."""
         self._in_flight = 0  # number of the next one, 0: none
         self._until = 0
 
     def seen(self, now: int) -> None:
-        """A segment of the open one."""
+        """Notes the time of a segment of the open sub-block."""
         self._until = now + IN_FLIGHT_NS
 
     def close(self) -> None:
@@ -99,17 +101,16 @@ def block_download(
         sub_block.next_segment = number + 1 if number < BLOCK_SIZE else 0
         if not number:
             raise SdoAbort(Abort.SEQUENCE)
-        if taken := number == accepted + 1:
+        sub_block.is_in_sequence = number == accepted + 1
+        if sub_block.is_in_sequence:
             accepted = number
             data += request[1:]
-            if (
-                not last
-            ):  # how many bytes of the last segment count is not known before the end request
+            if not last:  # only the end request tells how many bytes of the last segment count
                 _check_limit(data, limit)
         if last or number == BLOCK_SIZE:
             answer = bytes((0xA2, accepted, BLOCK_SIZE, 0, 0, 0, 0, 0))
             accepted, sub_block.next_segment = 0, 1
-            complete = bool(last) and taken
+            complete = bool(last) and sub_block.is_in_sequence
     sub_block.next_segment = None
     request = yield answer
     if request[0] & 0xE1 != 0xC1:
