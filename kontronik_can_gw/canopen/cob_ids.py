@@ -121,6 +121,6 @@ def _on_sync(node: "Node", data: bytes, now: int, at: int) -> None:
     if not node.nmt.communicates:
         return
     counter = node.sync.counter(data)
-    node.emergencies.set(GatewayError.SYNC_LENGTH, counter is None, now)
+    node.emergencies.set(GatewayError.SYNC_LENGTH, counter is None, now, at=at)
     if counter is not None:
         node.tpdos.on_sync(counter, now, at)

@@ -1,8 +1,9 @@
 """Emergencies: error register 1001h, history 1003h, COB-ID 1014h, inhibit time 1015h (CiA 301, 7.2.7 and 7.5.2.2/4/17/18)."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from operator import itemgetter
 from struct import Struct
 
 from kontronik_can_gw.canopen import objects as at
@@ -28,6 +29,10 @@ class Emergencies:
     """State of one node's errors.
 
     ``send`` is called with COB-ID and the 8 bytes of each emergency.
+
+    Emergencies are sent in the order in which the errors happened. The loss of telemetry may be
+    noticed late, after a hold-up of the process, and before the frames that waited are read. From
+    then on emergencies are delayed until ``advance``, which every turn of the loop ends with.
     """
 
     def __init__(
@@ -54,6 +59,9 @@ class Emergencies:
         self._unreported: dict[Condition, None] = {}
         self._last_is_error = False  # what was sent last is an error, not 0000h
         self._pending: deque[tuple[Condition | None, bytes]] = deque(maxlen=_MAX_PENDING)
+        self._delayed: list[tuple[int, Condition, bytes]] = []
+        """Time, condition and data of emergencies that ``advance`` sorts and reports."""
+        self._delayed_since = NEVER
         self._open = False
         self._last_ns = -NEVER
         self._risen = False  # since the last reset something was wrong
@@ -86,10 +94,12 @@ class Emergencies:
 
     @property
     def due(self) -> int:
-        return self._last_ns + self._inhibit_ns if self._pending else NEVER
+        """When ``advance`` has something to do."""
+        pending = self._last_ns + self._inhibit_ns if self._pending else NEVER
+        return min(self._delayed_since, pending)
 
-    def set_word(self, word: int, now: int, force: bool = False) -> None:
-        """The ESC's error word of a new live frame (or, with ``force``, a new mask)."""
+    def set_word(self, word: int, now: int, at: int | None = None, force: bool = False) -> None:
+        """Follows the ESC's error word of a live frame that arrived ``at``, or a new mask (``force``)."""
         if word == self._word and not force:
             return
         self._word = word
@@ -99,15 +109,24 @@ class Emergencies:
             del self._active[condition]
         for condition in wanted:
             if condition not in self._active:
-                self._rise(condition, now)
+                self._rise(condition, now, at)
         self._end(now)
 
-    def set(self, error: GatewayError, present: bool, now: int, detail: int | None = None) -> None:
-        """One of the gateway's own findings begins or ends."""
+    def set(
+        self,
+        error: GatewayError,
+        present: bool,
+        now: int,
+        detail: int | None = None,
+        at: int | None = None,
+    ) -> None:
+        """Begins or ends one of the gateway's own findings, which happened ``at`` (None: now)."""
         code, which = error.value
         condition = Condition(code, FROM_GATEWAY, which if detail is None else detail)
         if present and condition not in self._active:
-            self._rise(condition, now)
+            if error is GatewayError.TELEMETRY_LOST and self._open:
+                self._delayed_since = min(self._delayed_since, now)
+            self._rise(condition, now, at)
         elif not present and condition in self._active:
             del self._active[condition]
             self._end(now)
@@ -125,10 +144,11 @@ class Emergencies:
                 self._report(condition)
         self._unreported = {}
         self._end(now)
-        self.advance(now)
+        self._send_pending(now)
 
     def close(self) -> None:
-        """No emergencies (STOPPED): what is pending is reported later, if it is still true then."""
+        """Sends no more emergencies (STOPPED). Pending ones are reported later if still true then."""
+        self._report_delayed()
         self._open = False
         self._unreported |= dict.fromkeys(each for each, _ in self._pending if each is not None)
         self._pending.clear()
@@ -161,7 +181,34 @@ class Emergencies:
             self.open(now)
 
     def advance(self, now: int) -> None:
-        """Send what is pending, no closer than the inhibit time."""
+        """Reports what was delayed, in order, and sends what the inhibit time permits."""
+        if self._delayed_since != NEVER:
+            self._report_delayed()
+            self._end(now)
+        self._send_pending(now)
+
+    def _report_delayed(self) -> None:
+        """Reports the delayed emergencies, and orders the history, by the times of the errors."""
+        now, self._delayed_since = self._delayed_since, NEVER
+        delayed = sorted(self._delayed, key=itemgetter(0))
+        if delayed != self._delayed:
+            self._sort_newest([condition for _, condition, _ in delayed])
+        self._delayed = []
+        if delayed:
+            self._pending += [(condition, data) for _, condition, data in delayed]
+            self._send_pending(now)
+
+    def _sort_newest(self, conditions: Sequence[Condition]) -> None:
+        """Puts the newest entries of 1003h, and the errors that are still there, into this order."""
+        for _ in conditions[: len(self.history)]:
+            self.history.popleft()
+        for condition in conditions:
+            self._note(condition)
+            if condition in self._active:
+                del self._active[condition]
+                self._active[condition] = None
+
+    def _send_pending(self, now: int) -> None:
         while self._pending and now >= self._last_ns + self._inhibit_ns:
             condition, data = self._pending.popleft()
             if not (cob_id := self.cob_id) & INVALID_BIT:
@@ -169,13 +216,16 @@ class Emergencies:
                 self._last_is_error = condition is not None
                 self._last_ns = now
 
-    def _rise(self, condition: Condition, now: int) -> None:
+    def _rise(self, condition: Condition, now: int, at: int | None) -> None:
         self._active[condition] = None
         self._risen = True
         self._note(condition)
-        if self._open:
+        if self._delayed_since != NEVER:
+            happened_ns = now if at is None else at
+            self._delayed.append((happened_ns, condition, self._data_of(condition)))
+        elif self._open:
             self._report(condition)
-            self.advance(now)
+            self._send_pending(now)
         else:
             self._unreported[condition] = None
 
@@ -183,21 +233,24 @@ class Emergencies:
         self.history.appendleft(condition.detail << 24 | condition.source << 16 | condition.code)
 
     def _end(self, now: int) -> None:
-        """Take back what was reported, or is still pending, when nothing is wrong any more."""
+        """Reports 0000h if an error was reported, or is pending, and none is left."""
+        if self._delayed_since != NEVER:
+            return
         last_is_error = self._pending[-1][0] is not None if self._pending else self._last_is_error
         if last_is_error and self._open and not self._active:
             self._report(None)
-            self.advance(now)
+            self._send_pending(now)
 
     def _report(self, condition: Condition | None) -> None:
+        # a full queue drops its oldest entry
+        self._pending.append((condition, self._data_of(condition)))
+
+    def _data_of(self, condition: Condition | None) -> bytes:
         if condition is None:
-            data = _DATA.pack(0, self.register, FROM_GATEWAY, 0)
-        else:
-            code, source, detail = condition
-            last = detail if source == FROM_GATEWAY else self._word
-            data = _DATA.pack(code, self.register, source, last)
-        # the newest is never the one that finds no room
-        self._pending.append((condition, data))
+            return _DATA.pack(0, self.register, FROM_GATEWAY, 0)
+        code, source, detail = condition
+        last = detail if source == FROM_GATEWAY else self._word
+        return _DATA.pack(code, self.register, source, last)
 
     # --- objects
 

@@ -48,7 +48,8 @@ class EscObjects:
         """Something of the ESC changed: bits of telemetry.Event."""
         live = self._esc.live
         if events & Event.STATE and live is not None and self._errors is not None:
-            self._node.emergencies.set_word(self._errors.of(live), now)
+            errors = self._errors.of(live)
+            self._node.emergencies.set_word(errors, now, at=self._esc.live_ns)
         if events & (Event.LINK | Event.INFO) or self._live is (live is None):
             self._follow_link(events, now)
 
@@ -58,7 +59,8 @@ class EscObjects:
         if events & Event.LINK:
             if link is LinkState.PORT_ERROR:
                 found.set(GatewayError.PORT_GONE, True, now)
-            found.set(GatewayError.TELEMETRY_LOST, link is LinkState.LOST, now)
+            expired_ns = esc.live_bound_ns + esc.settings.timeout_ns
+            found.set(GatewayError.TELEMETRY_LOST, link is LinkState.LOST, now, at=expired_ns)
             found.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
             found.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
         if events & Event.INFO and esc.info is not None and expected is not None:

@@ -143,10 +143,13 @@ class _Watched:
 class Consumer:
     """The watch over other nodes (1016h).
 
-    ``changed`` is called with a node-ID, whether its heartbeat is lost (or no longer), and the time.
+    ``changed`` is called with a node-ID, whether its heartbeat is lost (or no longer), the time,
+    and the time at which that happened.
     """
 
-    def __init__(self, dictionary: Dictionary, changed: Callable[[int, bool, int], None]) -> None:
+    def __init__(
+        self, dictionary: Dictionary, changed: Callable[[int, bool, int, int], None]
+    ) -> None:
         self._dictionary = dictionary
         self._changed = changed
         self._watched: dict[int, _Watched] = {}
@@ -183,7 +186,7 @@ class Consumer:
         watched.due = at + watched.timeout
         if watched.lost:
             watched.lost = False
-            self._changed(node_id, False, now)
+            self._changed(node_id, False, now, at)
 
     def advance(self, now: int) -> None:
         """Let time pass."""
@@ -192,10 +195,12 @@ class Consumer:
 
     def _judge(self, until: int, now: int) -> None:
         late = {node_id: each for node_id, each in self._watched.items() if until >= each.due}
+        times = {node_id: watched.due for node_id, watched in late.items()}
         for watched in late.values():
-            watched.due, watched.lost = NEVER, True
-        for node_id in late:
-            self._changed(node_id, True, now)
+            watched.due = NEVER
+            watched.lost = True
+        for node_id, due in times.items():
+            self._changed(node_id, True, now, due)
 
     def _configure(self) -> None:
         """Take over 1016h. A watch that stays as it was goes on."""
@@ -210,7 +215,7 @@ class Consumer:
         self._configure()
         for node_id, old in before.items():
             if old.lost and self._watched.get(node_id) is not old:
-                self._changed(node_id, False, now)
+                self._changed(node_id, False, now, now)
 
     def _check(self, own: Variable, value: int) -> None:
         """A new entry. SdoAbort 06040043h where another entry watches the node already (CiA 301, 7.5.2.19)."""

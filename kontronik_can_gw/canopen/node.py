@@ -189,9 +189,9 @@ class Node:
             for tpdo in self.tpdos:
                 tpdo.start(now)
 
-    def _watch_changed(self, node_id: int, lost: bool, now: int) -> None:
-        """A watched heartbeat stays away, or no longer."""
-        self.emergencies.set(GatewayError.HEARTBEAT_LOST, lost, now, node_id)
+    def _watch_changed(self, node_id: int, lost: bool, now: int, at: int) -> None:
+        """Reports that a watched heartbeat is missing since ``at``, or is back."""
+        self.emergencies.set(GatewayError.HEARTBEAT_LOST, lost, now, node_id, at)
         if lost:
             self.nmt.behave(1, now)
 

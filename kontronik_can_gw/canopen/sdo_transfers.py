@@ -105,7 +105,7 @@ def block_download(
         if sub_block.is_in_sequence:
             accepted = number
             data += request[1:]
-            if not last:  # only the end request tells how many bytes of the last segment count
+            if not last:  # how many bytes of the last segment count is in the end request
                 _check_limit(data, limit)
         if last or number == BLOCK_SIZE:
             answer = bytes((0xA2, accepted, BLOCK_SIZE, 0, 0, 0, 0, 0))

@@ -29,6 +29,8 @@ from wire_world import (
 
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.esc.kontronik import codec
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
@@ -615,3 +617,55 @@ def test_within_a_turn_the_rest_is_late_but_answers_are_not_lost(
         if int.from_bytes(data[:3], "little") == number and can_id == SPEED
     ] == []
     assert any(can_id == SPEED for can_id, _ in late), "and told that there is nothing"
+
+
+LOST, UNDERVOLTAGE, SYNC_LENGTH, HEARTBEAT_LOST = "1075", "2032", "4082", "3081"
+
+
+def emergencies(bench: Bench) -> list[str]:
+    """The codes of the emergencies that were sent, as they are on the bus."""
+    return [data[:2].hex() for can_id, data in bench.take() if can_id == EMCY]
+
+
+@pytest.mark.parametrize(
+    ("came_ms", "codes"),
+    [(100, [SYNC_LENGTH, LOST]), (380, [LOST, SYNC_LENGTH])],
+)
+def test_an_emergency_of_a_hold_up_has_the_place_of_its_time(
+    bench: Bench, came_ms: int, codes: list[str]
+) -> None:
+    """Telemetry ends with the hold-up and is lost 250 ms later."""
+    bench.world.bus.came(0x80, b"\x01", bench.world.now + came_ms * MS)
+    bench.hold_up()
+    assert emergencies(bench) == codes
+    history = [bench.ask(f"40 03 10 0{sub} {ZEROS}")[12:17] for sub in (1, 2)]
+    assert [each.replace(" ", "") for each in history] == codes[::-1]
+
+
+def test_an_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> None:
+    """The frames that waited are younger than the time-out, the one before them is not."""
+    start = bench.world.now
+    wire = bench.wire
+    for at in range(10, 300, 10):
+        data = codec.encode(LiveData(operating_errors=1 << 0), codec.Layout.V4)
+        first = start + at * MS
+        wire.put(data, [first + n * NS_PER_BYTE for n in range(1, len(data) + 1)])
+    bench.hold_up(300 * MS)
+    sent = emergencies(bench)
+    assert sent[:2] == [UNDERVOLTAGE, LOST]
+
+
+def test_a_heartbeat_that_was_seen_to_be_late_precedes_the_loss(bench: Bench) -> None:
+    bench.write(WATCH[1], "23 16 10 01 64 00 05 00")  # node 5: 100 ms
+    bench.world.bus.came(0x705, b"\x05")
+    bench.speed_until(20 * MS)
+    bench.world.bus.came(0x705, b"\x05", bench.world.now + 350 * MS)
+    bench.hold_up()
+    assert emergencies(bench)[:2] == [HEARTBEAT_LOST, LOST]
+
+
+def test_the_loss_is_reported_before_the_node_stops_because_of_it(bench: Bench) -> None:
+    bench.write("2f 29 10 02 02 00 00 00")  # 1029h:2: STOPPED
+    bench.run(SECOND)
+    assert emergencies(bench) == [LOST]
+    assert bench.state is NmtState.STOPPED
