@@ -128,8 +128,14 @@ class Identity:
             self._boot(now)
 
     def _check_node_id(self, value: int) -> None:
-        if not 1 <= value <= 127:
-            raise SdoAbort(Abort.VALUE)
+        """Checks a new 2101h:2.
+
+        The EDS permits 255, because tools add its $NODEID for a node that has no node-ID yet.
+        """
+        if value > 127:
+            raise SdoAbort(Abort.TOO_HIGH)
+        if value < 1:
+            raise SdoAbort(Abort.TOO_LOW)
         if self._taken(value):
             raise SdoAbort(Abort.INCOMPATIBLE)
 

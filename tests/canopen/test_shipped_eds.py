@@ -173,3 +173,13 @@ def test_dcfchk_has_no_finding_in_the_eds_and_in_its_dcf(
     assert dcfchk(SHIPPED, node_id) == dcfchk(file, node_id) == ""
     file.write_bytes(with_key(SHIPPED_TEXT, "2100", "SubNumber", "0x8").encode("ascii"))
     assert "1 extra sub-object(s) for object 0x2100" in dcfchk(file, 1), "it can find something"
+
+
+def test_defaults_fit_their_limits_for_a_node_without_a_node_id(shipped: Eds) -> None:
+    """Lely's dcf2c adds 255 for $NODEID if the file is of no node yet, and warns of an overflow."""
+    relative = [entry for entry in shipped.entries if entry.relative]
+    assert len(relative) > 5
+    for entry in relative:
+        assert isinstance(entry.default, int)
+        _, largest = reader.range_of(entry.data_type)
+        assert entry.default + 255 <= (largest if entry.high is None else entry.high), entry.place
