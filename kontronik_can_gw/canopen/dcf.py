@@ -38,7 +38,7 @@ def without(eds_data: bytes, indices: Container[int]) -> bytes:
         section.set("SupportedObjects", len(left))
         for number, value in enumerate(left, 1):
             section.set(str(number), value)
-    return text_of(sections).encode("ascii")
+    return text_of(sections).encode("ascii", "replace")
 
 
 def dcf(

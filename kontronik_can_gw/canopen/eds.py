@@ -4,13 +4,18 @@ Refused is what cannot be read, or only in several ways: limits, types, defaults
 key and remedy, one mistake of each section at once. What concerns other readers of the file only (lists of objects, counts, ObjectType,
 [DeviceInfo]) is not looked at. ``check`` judges whether a node can be built from the entries.
 
-Choices where CiA 306 leaves room: section and key names in any case; LF as well as CR LF; a key without a value is a key that is not
+Files of usual Windows editors are read too: with a byte order mark, with letters beyond ASCII in names and comments, with CR as line end,
+with a trailing Ctrl-Z. Such letters are replaced by ASCII ones; 1021h has the file as it is.
+
+Choices where CiA 306 leaves room: section and key names in any case; LF and CR as well as CR LF; a key without a value is a key that is not
 there; an object has sub-indices where it has sections of them, else it is a variable; section names that it does not know are ignored.
 Types of 24, 40, 48 and 56 bits and times are refused.
 """
 
+import codecs
 import re
 import struct
+import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -65,6 +70,11 @@ _HEADING = re.compile(r"\s*\[([^\]]*)\]")
 _COMMENT = re.compile(r"(?:^|\s);.*|^\s*#.*")
 OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
 """The section of an object or of one of its sub-indices."""
+_CTRL_Z = re.compile(r"[\s\x1a]*\x1a\s*\Z")
+"""The end of a file as DOS editors mark it."""
+_EXACT_KEYS = frozenset({"defaultvalue", "parametervalue"})
+"""Keys whose values nodes send: no letter of them may be replaced."""
+_PLAIN_LETTERS = {"\u00b5": "u", "\u03bc": "u", "\u00b0": "deg", "\u00df": "ss"}
 _NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
 
 
@@ -94,30 +104,59 @@ class Section:
         return found
 
 
+def decode_text(data: bytes) -> str:
+    """Returns the text of an EDS with LF as line end, as UTF-16 or UTF-8 if it is that, else as Windows-1252."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        text = data.decode("utf-16", "replace")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("cp1252", "replace")
+    return _CTRL_Z.sub("", text.replace("\r\n", "\n").replace("\r", "\n"))
+
+
+def _to_ascii(text: str) -> str:
+    """Replaces letters beyond ASCII by the nearest ones, and others by "?"."""
+    if text.isascii():
+        return text
+    for letter, plain in _PLAIN_LETTERS.items():
+        text = text.replace(letter, plain)
+    parts = unicodedata.normalize("NFKD", text)
+    bare_letters = "".join(each for each in parts if not unicodedata.combining(each))
+    return bare_letters.encode("ascii", "replace").decode("ascii")
+
+
 def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
     """The sections by their names in lower case, those of objects in one spelling. What is wrong is added to ``problems``."""
     found: dict[str, Section] = {}
     section, where = Section(""), ""
-    for number, raw in enumerate(data.split(b"\n"), 1):
-        if not raw.isascii():
-            text = raw.decode("ascii", "backslashreplace").strip()
-            problems.append(f"line {number} is not ASCII: {text}. Write it in plain letters.")
-        line = raw.decode("ascii", "replace")
+    for line in decode_text(data).split("\n"):
         if heading := _HEADING.match(line):
-            section = Section(heading[1].strip())
+            section = Section(_to_ascii(heading[1].strip()))
             where = f"[{section.name}] "
             if found.setdefault(_spelling(section.name), section) is not section:
                 problems.append(f"{where}this section is there twice. Remove one.")
         elif text := bare(line):
             key, equals, value = (part.strip() for part in text.partition("="))
+            if not value.isascii():
+                if key.lower() in _EXACT_KEYS:
+                    what = f"{_quoted(text)} has letters beyond ASCII. Write it in plain letters."
+                    problems.append(where + what)
+                value = _to_ascii(value)
             if not (equals and key and where):
-                what = f"'{text}' is neither a section, nor key=value, nor a comment after ';'."
+                what = f"'{_quoted(text)}' is neither a section, nor key=value, nor a comment after ';'."
                 problems.append(where + what)
             elif key.lower() in section.keys:
-                problems.append(f"{where}{key}: this key is there twice. Remove one.")
+                problems.append(f"{where}{_quoted(key)}: this key is there twice. Remove one.")
             else:
                 section.set(key, value)
     return found
+
+
+def _quoted(text: str) -> str:
+    """A text of the file as a mistake quotes it."""
+    return text.encode("ascii", "backslashreplace").decode("ascii")
 
 
 def text_of(sections: Mapping[str, Section]) -> str:
@@ -195,8 +234,9 @@ class Eds:
 
 def load(data: bytes, name: str) -> Eds:
     """Read an EDS by CiA 306. UserError with the mistakes: file, section, key, what is wrong and what to do."""
-    known = (b"[fileinfo]", b"[deviceinfo]", b"[mandatoryobjects]")
-    if not any(section in data.lower() for section in known):
+    known = ("[fileinfo]", "[deviceinfo]", "[mandatoryobjects]")
+    text = decode_text(data[: MAX_BYTES + 1]).lower()
+    if not any(section in text for section in known):
         raise UserError(
             f"{name}: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects]."
         )

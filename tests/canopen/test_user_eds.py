@@ -4,6 +4,7 @@ behaves as the shipped default.
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -291,3 +292,65 @@ def test_the_session_hears_every_service() -> None:
     assert heard == {"701", "081", "181", "281", "381", "481", "7E4"}
     codes = {line.split()[2][:4] for line in whole() if line.split()[1] == "081"}
     assert codes == {"0000", "2032", "4081", "4082", "1075"}
+
+
+# --- what editors on Windows write ----------------------------------------------------------------------------------
+
+LATIN = SHIPPED.replace(
+    "ParameterName=Battery voltage", "ParameterName=Akkuspannung gr\u00f6\u00dfer 5\u00b0"
+).replace("[FileInfo]", "; f\u00fcr den Pr\u00fcfstand\r\n[FileInfo]", 1)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pytest.param(b"\xef\xbb\xbf" + SHIPPED.encode(), id="UTF-8 byte order mark"),
+        pytest.param(SHIPPED.encode("utf-16"), id="UTF-16 with byte order mark"),
+        pytest.param(SHIPPED.replace("\r\n", "\r").encode(), id="CR line ends"),
+        pytest.param(SHIPPED.replace("\r\n", "\n").encode(), id="LF line ends"),
+        pytest.param(SHIPPED.encode() + b"\x1a", id="Ctrl-Z"),
+        pytest.param(SHIPPED.encode() + b"\r\n\x1a\r\n", id="Ctrl-Z on a line"),
+        pytest.param(LATIN.encode("latin-1"), id="Latin-1"),
+        pytest.param(LATIN.encode("utf-8"), id="UTF-8"),
+        pytest.param(LATIN.encode("utf-8-sig").replace(b"\r\n", b"\r") + b"\x1a", id="all at once"),
+    ],
+)
+def test_files_of_windows_editors_give_the_same_node(data: bytes) -> None:
+    assert problems(data) == ()
+    eds = reader.load(data, "mine.eds")
+    assert eds.data == data
+    plain = shipped_eds().entries
+    names = {entry.name for entry in eds.entries} - {entry.name for entry in plain}
+    assert names <= {"Akkuspannung grosser 5deg"}
+    assert [replace(entry, name="") for entry in eds.entries] == [
+        replace(entry, name="") for entry in plain
+    ]
+
+
+def test_a_dcf_of_a_file_with_other_letters_is_ascii() -> None:
+    data = LATIN.encode("latin-1")
+    text = dcf.dcf(reader.load(data, "mine.eds"), 1, 250_000, {}, "left", "left.dcf")
+    assert text.isascii()
+    assert "ParameterName=Akkuspannung grosser 5deg" in text
+    assert problems(dcf.without(data, {0x606C})) == ()
+
+
+@pytest.mark.parametrize("coding", ["latin-1", "utf-8-sig", "utf-16"])
+def test_a_mistake_in_a_file_of_a_windows_editor_is_one_line(coding: str) -> None:
+    text = LATIN.replace("LowLimit=0x01", "LowLimit=\u00fcbel", 1).replace("\r\n", "\r")
+    (found,) = problems((text + "\x1a").encode(coding))
+    assert found.startswith("mine.eds: [") and "LowLimit=ubel: not a number" in found
+
+
+def test_a_default_text_with_other_letters_is_refused() -> None:
+    text = with_object(variable(9, DefaultValue="Gr\u00fc\u00dfe"))
+    (found,) = problems(text.encode("latin-1"))
+    assert found == (
+        "mine.eds: [2200] DefaultValue=Gr\\xfc\\xdfe has letters beyond ASCII. Write it in plain letters."
+    )
+
+
+def test_a_key_with_other_letters_is_no_known_key() -> None:
+    text = with_object(variable(5).replace("AccessType", "\u00c4ccessType"))
+    (found,) = problems(text.encode("latin-1"))
+    assert "[2200] AccessType=" in found
