@@ -57,7 +57,11 @@ class Gateway:
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
         )
+        self.output_frames: list[CanFrame] = []
+        """Frames of all outputs, oldest first."""
         for output in self.outputs:
+            self.output_frames += output.frames
+            output.frames = self.output_frames
             output.take_slots(self.core.slot)
         self.has_outputs = bool(self.outputs)
         """False: nothing but the layout's messages is sent, and no id to receive ever changes."""
@@ -206,18 +210,14 @@ class Gateway:
     @property
     def frames_wait(self) -> bool:
         """True while ``take_frames`` has something to do."""
-        for output in self.outputs:
-            if output.frames:
-                return True
-        return self.core.is_pending
+        return bool(self.output_frames) or self.core.is_pending
 
     def take_frames(self, now: int) -> list[CanFrame]:
-        """The frames to send: those of the outputs, oldest first, then those of the core that are due, with the values of now."""
+        """The frames to send: the outputs' frames, oldest first, then the core's due frames, packed with current values."""
         frames = self.core.take(now)
-        for output in reversed(self.outputs):
-            if output.frames:
-                frames = output.frames + frames
-                output.frames.clear()
+        if self.output_frames:
+            frames = self.output_frames + frames
+            self.output_frames.clear()
         return frames
 
     def not_sent(self, now: int) -> None:

@@ -27,7 +27,10 @@ class Owner(NamedTuple):
 
 
 class Output:
-    """One way onto the bus. Frames are appended to ``frames``, oldest first; the owner empties it."""
+    """One way onto the bus. Frames are appended to ``frames``, oldest first; the owner empties it.
+
+    All outputs of a gateway share one list, so that their frames keep their order. Do not replace it.
+    """
 
     name = ""
     """Of what ``facts`` says."""

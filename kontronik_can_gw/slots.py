@@ -2,7 +2,8 @@
 
 What makes a slot's frame pending: events of its ESC, its timer (which each frame sent restarts), its owner. It is packed when it is handed
 over, so the newest wins; the inhibit time is the minimum distance between two. A slot with ``watched`` bits is made pending by events that
-change these only. Slots are handed over before the messages of the layout: in the order in which they became due, then of their number.
+change these only. Slots are handed over before the messages of the layout, in the order in which they became due. Slots that became due
+at the same time are ordered by their ``place``.
 
 A paced slot is a measurement at a rate. It goes with the first event after its inhibit time, else by its timer; its distance is the mean of
 both on average. It rests while the first of its signals is not available. A slot with a ``seed`` is a transfer (signals/transfer.py):
@@ -94,11 +95,24 @@ class Slot(Protocol):
         """Let it be handed over, whatever its inhibit time is."""
 
 
-class PythonSlot:
-    """A slot in plain Python. ``number``: its place among all."""
+Place = tuple[int, int]
+"""Index of the ESC, and number of the slot among this ESC's slots."""
 
-    def __init__(self, owner: "Slots", esc: int, number: int) -> None:
-        self.number = number
+
+class PendingSlot(NamedTuple):
+    """A slot that was pending, with the frames to hand over."""
+
+    since: int
+    place: Place
+    frames: list[CanFrame]
+
+
+class PythonSlot:
+    """A slot in plain Python."""
+
+    def __init__(self, owner: "Slots", place: Place) -> None:
+        esc = place[0]
+        self.place = place
         self.sent = 0
         self.is_news = False
         self.due = NEVER
@@ -157,7 +171,7 @@ class PythonSlot:
         if not self._started or settings is None:
             return
         self.is_news = True
-        if not settings.by_event or self.number in self._owner.pending:
+        if not settings.by_event or self.place in self._owner.pending:
             return
         if now >= (until := self._last_ns + settings.inhibit_ns):
             self._deferred_until = NEVER
@@ -172,7 +186,7 @@ class PythonSlot:
 
     def on_event(self, now: int) -> None:
         """An event of ``triggers`` happened."""
-        if (settings := self._settings) is None or self.number in self._owner.pending:
+        if (settings := self._settings) is None or self.place in self._owner.pending:
             return
         if self._deferred_until == NEVER and (pack := settings.plan.pack_watched) is not None:
             watched = pack(self._escs, self._owner.status, now, 0, 0)
@@ -237,7 +251,7 @@ class PythonSlot:
         self.triggers = 0
         self.is_news = False
         self._timer_due = self._deferred_until = NEVER
-        self._owner.pending.pop(self.number, None)
+        self._owner.pending.pop(self.place, None)
         self._set_due()
 
     def _set_due(self) -> None:
@@ -255,33 +269,33 @@ class Slots:
     ) -> None:
         self.escs = escs
         self.status = status
-        self.pending: dict[int, int] = {}
-        """Numbers of the slots that ``take`` hands over, and since when."""
+        self.pending: dict[Place, int] = {}
+        """The slots that ``take`` hands over, and the time since when each is pending."""
         self.moved: set[int] = set()
         """ESCs with slots of which ``due`` changed."""
         self._packs_at_once = packs_at_once
         self._packed: list[CanFrame] = []
-        self._slots: list[PythonSlot] = []
         self._of: list[list[PythonSlot]] = [[] for _ in escs]
         self._due = [NEVER] * len(escs)
 
     def add(self, esc: int) -> PythonSlot:
-        """A further slot of an ESC."""
-        slot = PythonSlot(self, esc, len(self._slots))
-        self._slots.append(slot)
-        self._of[esc].append(slot)
+        """Adds a slot of an ESC."""
+        slots = self._of[esc]
+        slot = PythonSlot(self, (esc, len(slots)))
+        slots.append(slot)
         return slot
 
     def first_of(self, can_id: int) -> PythonSlot:
         """The slot that numbers the transfers of an id."""
-        return next(slot for slot in self._slots if slot.can_id == can_id)
+        return next(slot for slots in self._of for slot in slots if slot.can_id == can_id)
 
     @property
     def triggers(self) -> int:
         """The events that ``on_event`` is to be given."""
         found = Event.NONE
-        for slot in self._slots:
-            found |= slot.triggers
+        for slots in self._of:
+            for slot in slots:
+                found |= slot.triggers
         return found
 
     def on_event(self, esc: int, events: int, now: int) -> None:
@@ -293,7 +307,7 @@ class Slots:
     def let_go(self, slot: PythonSlot, now: int) -> None:
         """Let a slot be handed over."""
         if not self._packs_at_once:
-            self.pending.setdefault(slot.number, now)
+            self.pending.setdefault(slot.place, now)
         else:
             self._packed += slot.frames(now)
 
@@ -320,10 +334,18 @@ class Slots:
         return bool(self.pending or self._packed)
 
     def take(self, now: int) -> list[CanFrame]:
-        """The frames of what is pending."""
+        """The frames of pending slots, in their order."""
         frames, self._packed = self._packed, []
-        if self.pending:
-            pending, self.pending = self.pending, {}
-            for number, _ in sorted(pending.items(), key=itemgetter(1, 0)):
-                frames += self._slots[number].frames(now)
+        for slot in self.take_each(now):
+            frames += slot.frames
         return frames
+
+    def take_each(self, now: int) -> list[PendingSlot]:
+        """The pending slots in their order, each with its frames."""
+        if not self.pending:
+            return []
+        pending, self.pending = self.pending, {}
+        return [
+            PendingSlot(since, (esc, number), self._of[esc][number].frames(now))
+            for (esc, number), since in sorted(pending.items(), key=itemgetter(1, 0))
+        ]

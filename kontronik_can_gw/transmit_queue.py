@@ -1,7 +1,6 @@
-"""What waits to be sent: a slot for each CAN id (and multiplexer page), where the newest value wins, and a queue that keeps its order."""
+"""Frames that wait to be sent. For each CAN id and multiplexer page the newest frame wins; ``queued`` frames are all sent, in order."""
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from operator import itemgetter
 
@@ -27,92 +26,118 @@ class Sent(Enum):
 
 
 class TransmitQueue:
-    """Frames that wait to be sent: slots in the order in which their ids began to wait, ``queued`` frames in the order of ``put``.
+    """Frames that wait to be sent.
 
-    While both wait they take turns, so that neither a long SDO block nor fast PDOs keep the other from the bus.
+    1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that frame's place.
+    2. Frames of a step are sent in the order of ``put_all``: those of the outputs, then slots, then messages.
+    3. If the interface did not take all of them, queued and other frames alternate until nothing waits. Neither a flood
+       of answers nor fast measurements can then keep the other kind from the bus.
     """
 
     def __init__(self) -> None:
-        self._slots: dict[tuple[int, bool, int], CanFrame] = {}
-        self._queue: deque[CanFrame] = deque()
+        self._waiting: dict[tuple[int, ...], CanFrame] = {}
+        """In the order of ``put_all``. The key of a queued frame is a number of its own."""
+        self._queued = 0
+        """Number of queued frames in ``_waiting``."""
+        self._next_number = 0
+        self._has_leftovers = False
+        """The interface took only a part of what waited."""
         self._queue_has_turn = True
         self.replaced = 0
-        """Frames of slots that gave way to a newer one of their id or to an older transfer, or cleared; its owner may set it back to 0."""
+        """Frames that were replaced by a newer one, or gave way to an older transfer, or were cleared. The owner may reset it."""
         self.dropped = 0
-        """Queued frames that were lost: the queue was full, or cleared; likewise."""
+        """Queued frames that were lost because the queue was full, or cleared. The owner may reset it."""
 
     def __len__(self) -> int:
-        return len(self._slots) + len(self._queue)
+        return len(self._waiting)
 
     def put_all(self, frames: Sequence[CanFrame]) -> int:
-        """Let frames wait: after the queued ones, or in place of an older one of the id. Returns how many were lost by it."""
+        """Adds frames. Returns how many frames were lost: replaced, or queued beyond ``QUEUE_LENGTH``."""
+        waiting = self._waiting
+        count = len(waiting) + len(frames)
         dropped = 0
+        self._has_leftovers = self._has_leftovers and bool(waiting)
         if any(map(_is_queued, frames)):
-            room = QUEUE_LENGTH - len(self._queue)
-            queued = [frame for frame in frames if frame.queued]
-            self._queue += queued[:room]
-            dropped = len(queued[room:])
-            self.dropped += dropped
-            frames = [frame for frame in frames if not frame.queued]
-        slots = self._slots
-        count = len(slots) + len(frames)
-        if slots:
-            frames = [frame for frame in frames if not self._has_begun(frame)]
-        slots.update(zip(map(_slot_of, frames), frames, strict=True))
-        replaced = count - len(slots)
-        self.replaced += replaced
-        return replaced + dropped
+            dropped = self._put_with_queued(frames)
+        else:
+            if waiting:
+                frames = [frame for frame in frames if not self._has_begun(frame)]
+            waiting.update(zip(map(_slot_of, frames), frames, strict=True))
+        lost = count - len(waiting)
+        self.dropped += dropped
+        self.replaced += lost - dropped
+        return lost
+
+    def _put_with_queued(self, frames: Iterable[CanFrame]) -> int:
+        """Adds frames, some of them queued. Returns how many queued frames found no room."""
+        dropped = 0
+        for frame in frames:
+            if not frame.queued:
+                if not self._has_begun(frame):
+                    self._waiting[_slot_of(frame)] = frame
+            elif self._queued < QUEUE_LENGTH:
+                self._waiting[(self._next_number,)] = frame
+                self._next_number += 1
+                self._queued += 1
+            else:
+                dropped += 1
+        return dropped
 
     def _has_begun(self, frame: CanFrame) -> bool:
-        """True for a part of a transfer while an older one is on its way: its first frame is gone, others wait. It ends as it began."""
+        """True for a part of a transfer while an older one is being sent: its first frame has left, others wait."""
         can_id, _, extended, _, page, _, _ = frame
         if page < FIRST_PART:
             return False
         first = page - (page - FIRST_PART) % PARTS
-        waiting = [(can_id, extended, first + part) in self._slots for part in range(PARTS)]
+        waiting = [(can_id, extended, first + part) in self._waiting for part in range(PARTS)]
         return any(waiting) and not waiting[0]
 
     def in_order(self) -> list[CanFrame]:
-        """All that wait, in the order in which they are to be sent."""
-        slots = list(self._slots.values())
-        if not self._queue:
-            return slots
-        first, second = (
-            (list(self._queue), slots) if self._queue_has_turn else (slots, list(self._queue))
-        )
-        by_turns = [frame for pair in zip(first, second, strict=False) for frame in pair]
-        both = len(by_turns) // 2
-        return by_turns + first[both:] + second[both:]
+        """All waiting frames, in the order in which they are to be sent."""
+        frames = list(self._waiting.values())
+        if not (self._has_leftovers and self._queued):
+            return frames
+        queued = [frame for frame in frames if frame.queued]
+        others = [frame for frame in frames if not frame.queued]
+        first, second = (queued, others) if self._queue_has_turn else (others, queued)
+        alternating = [frame for pair in zip(first, second, strict=False) for frame in pair]
+        both = len(alternating) // 2
+        return alternating + first[both:] + second[both:]
 
     def remove(self, frames: Sequence[CanFrame], count: int) -> None:
-        """Forget the first ``count`` of ``frames``, which ``in_order`` gave: they were sent. The next one stays first of its kind."""
-        if self._queue and count and len(frames) > 1:
+        """Removes the first ``count`` of ``frames``, which ``in_order`` returned: they were sent. A next frame keeps its turn."""
+        if self._queued and count and len(frames) > 1:
             self._queue_has_turn = not frames[count - 1].queued
-        if count == len(frames):
-            self._slots.clear()
-            self._queue.clear()
+        self._has_leftovers = count < len(frames)
+        if not self._has_leftovers:
+            self._waiting.clear()
+            self._queued = 0
             return
+        numbers = iter([key for key in self._waiting if len(key) == 1])
         for frame in frames[:count]:
             if frame.queued:
-                self._queue.popleft()
+                del self._waiting[next(numbers)]
+                self._queued -= 1
             else:
-                del self._slots[_slot_of(frame)]
+                del self._waiting[_slot_of(frame)]
 
     def take_all(self) -> list[CanFrame]:
-        """All that wait, in order; nothing waits any more."""
+        """Removes and returns all waiting frames, in order."""
         frames = self.in_order()
         self.remove(frames, len(frames))
         return frames
 
     def drop_measurements(self) -> bool:
-        """Drop what waits in slots; True where something did."""
-        count = len(self._slots)
+        """Drops all frames that are not queued. Returns True if there were any."""
+        count = len(self._waiting) - self._queued
         self.replaced += count
-        self._slots.clear()
+        self._waiting = {key: frame for key, frame in self._waiting.items() if frame.queued}
         return bool(count)
 
     def clear(self) -> None:
-        """Drop what waits: it is old by the time it could go."""
+        """Drops all frames: they would be too old by the time they could be sent."""
         self.drop_measurements()
-        self.dropped += len(self._queue)
-        self._queue.clear()
+        self.dropped += self._queued
+        self._waiting.clear()
+        self._queued = 0
+        self._has_leftovers = False

@@ -1105,15 +1105,36 @@ static int goes_before(const kcg *g, uint32_t i, uint32_t other)
     return since < its || (since == its && i < other);
 }
 
-/* Slots first, each by the time since when they are pending, then by their index: as a rule they are in that order. */
+/* Let the entry at `at` of the heap pending[0..size) sink until no child of it is to be sent later. */
+static void sink_pending(kcg *g, uint32_t at, uint32_t size)
+{
+    uint16_t moved = g->pending[at];
+    for (uint32_t child; (child = 2 * at + 1) < size; at = child) {
+        if (child + 1 < size && goes_before(g, g->pending[child], g->pending[child + 1]))
+            child++;
+        if (!goes_before(g, moved, g->pending[child]))
+            break;
+        g->pending[at] = g->pending[child];
+    }
+    g->pending[at] = moved;
+}
+
+/* Sort: slots first, each by the time since when it is pending, then by index. Usually they are in that order already, which takes
+   one pass; a heap sort bounds the time otherwise. */
 static void sort_pending(kcg *g)
 {
-    for (uint32_t k = 1; k < g->pendings; k++) {
-        uint32_t i = g->pending[k];
-        uint32_t at = k;
-        for (; at && goes_before(g, i, g->pending[at - 1]); at--)
-            g->pending[at] = g->pending[at - 1];
-        g->pending[at] = (uint16_t)i;
+    uint32_t size = g->pendings, k = 1;
+    while (k < size && !goes_before(g, g->pending[k], g->pending[k - 1]))
+        k++;
+    if (k >= size)
+        return;
+    for (k = size / 2; k--;)
+        sink_pending(g, k, size);
+    for (k = size; k-- > 1;) {
+        uint16_t last = g->pending[0];
+        g->pending[0] = g->pending[k];
+        g->pending[k] = last;
+        sink_pending(g, 0, k);
     }
 }
 

@@ -12,7 +12,7 @@ from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, held_settings
-from kontronik_can_gw.native.slots import NativeSlot, reserve
+from kontronik_can_gw.native.slots import NativeSlot, merge, reserve
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import END_OF_TIME, Tables
 from kontronik_can_gw.native.turns import Turns
@@ -23,6 +23,7 @@ from kontronik_can_gw.slots import Slot, Slots
 _MAX_FRAMES = 256
 _LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"
 _Plan, _Esc, _Core = structure("kcg_plan"), structure("kcg_esc"), structure("kcg")
+_Sending = structure("kcg_sending")
 
 
 def _array(kind: Any, rows: Any) -> Any:
@@ -42,7 +43,7 @@ def _check(esc: int, now: int, escs: int = 1) -> None:
 class NativeCore:
     """As Core. NotInCore where the core in C cannot express the layout or an ESC's settings.
 
-    ``slots``: of each ESC in C; further ones, and those with values that C does not know, are in Python and are handed over first.
+    ``slots``: number of slots of each ESC that C runs. Python runs further slots, and slots with values that C does not have.
     """
 
     language = "C"
@@ -60,6 +61,7 @@ class NativeCore:
         if tables.wire not in ("", library.kcg_wire().decode()):
             raise NotInCore(f"fields on the wire: {tables.wire}")
         self._places = reserve(tables, slots)
+        self.slots_of_esc = len(self._places[0])
         self.library = library
         self._make(tables, now)
         self.status = cast(GatewayStatus, NativeStatus.from_buffer(self.state.gateway))
@@ -82,16 +84,21 @@ class NativeCore:
         )
         self.watched = _array(c.c_uint64, tables.watched)
         self._kept = [*arrays.values(), self.watched]
-        self._plan = _Plan(
+        self.plan = _Plan(
             *map(c.addressof, arrays.values()), *tables.counts.values(), c.addressof(self.watched)
         )
-        size = self.library.kcg_size(c.byref(self._plan))
+        size = self.library.kcg_size(c.byref(self.plan))
         self._memory = (c.c_uint64 * (size // 8 + 1))()
         settings = _array(Settings, tables.settings)
-        self.core = self.library.kcg_init(self._memory, c.byref(self._plan), settings, now)
+        self.core = self.library.kcg_init(self._memory, c.byref(self.plan), settings, now)
         self.state = _Core.from_buffer(self._memory)
         begin = self.state.esc - c.addressof(self._memory)
         self.esc_states = (_Esc * len(tables.settings)).from_buffer(self._memory, begin)
+        count = self.plan.messages + self.plan.slots
+        begin = self.state.sending - c.addressof(self._memory)
+        self.sending = (_Sending * count).from_buffer(self._memory, begin)
+        begin = self.state.pending - c.addressof(self._memory)
+        self.pending = (c.c_uint16 * count).from_buffer(self._memory, begin)
         self._frames = (Frame * _MAX_FRAMES)()
         self._raw = memoryview(self._frames).cast("B")
 
@@ -169,11 +176,15 @@ class NativeCore:
         return bool(self.state.pendings) or self._slots.is_pending
 
     def take(self, now: int) -> list[CanFrame]:
-        frames = [*self._slots.take(now)]
+        frames: list[CanFrame] = []
+        in_python = self._slots.take_each(now)
         library, core = self.library, self.core
         while count := library.kcg_take(core, now, self._frames, _MAX_FRAMES):
-            frames += frames_in(self._raw, 0, count)
+            found = frames_in(self._raw, 0, count)
+            frames += merge(self, found, in_python) if in_python else found
             library.kcg_sent(core, now, count)
+        for slot in in_python:
+            frames += slot.frames
         return frames
 
     def apply(self, esc: int, settings: EscSettings) -> None:

@@ -4,12 +4,12 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.slots import PythonSlot, SlotPlan, SlotSettings
+from kontronik_can_gw.slots import PendingSlot, PythonSlot, SlotPlan, SlotSettings
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.core import NativeCore
@@ -19,6 +19,8 @@ MAX_SIGNALS = 8
 _MAX_PLANS = 256
 """Kept."""
 _WORD = (1 << 64) - 1
+_MAX_IN_ONE_FRAME = 7
+"""Bytes of a transfer of one frame."""
 
 
 class Place(NamedTuple):
@@ -63,6 +65,36 @@ def _add(tables: Tables, esc: int) -> Place:
     tables.esc_of.append(esc)
     tables.watched.append(0)
     return place
+
+
+def merge(
+    core: "NativeCore", frames: list[CanFrame], in_python: list[PendingSlot]
+) -> list[CanFrame]:
+    """The frames that kcg_take returned, with Python's slots at their places among them.
+
+    Slots that were placed are removed from ``in_python``; slots that remain come after all frames.
+    """
+    merged: list[CanFrame] = []
+    first_slot = core.plan.messages
+    at = place = 0
+    while at < len(frames):
+        index = core.pending[place]
+        place += 1
+        key = None
+        if index >= first_slot:
+            key = core.sending[index].since, divmod(index - first_slot, core.slots_of_esc)
+        while in_python and (key is None or in_python[0][:2] < key):
+            merged += in_python.pop(0).frames
+        end = at + _count_frames(core.messages[index])
+        merged += frames[at:end]
+        at = end
+    return merged
+
+
+def _count_frames(message: Any) -> int:
+    """The number of frames of a row of kcg_message."""
+    is_long = message.flags & KCG.TRANSFER and message.length > _MAX_IN_ONE_FRAME
+    return (int(message.length) + 8) // 7 if is_long else 1
 
 
 @lru_cache(_MAX_PLANS)

@@ -127,11 +127,10 @@ class NativePoller(Poller):
         state.due = min(state.due, core.deadline_in_python())
         if state.now >= (min(state.due, due) if is_due else state.due):
             return False
-        for output in outputs:
-            if output.frames:
-                if not turns.speak(output.frames):
-                    return False
-                output.frames.clear()
+        if frames := gateway.output_frames:
+            if not turns.speak(frames):
+                return False
+            frames.clear()
         return True
 
     def _watches(self) -> bool:

@@ -290,9 +290,6 @@ class Both:
         for slot in self.slots:
             assert slot.both[0].is_pending == slot.both[1].is_pending
         frames, others = self.python.take(self.now), self.native.take(self.now)
-        if any(slot.settings and not slot.both[1].is_in_c for slot in self.slots):  # type: ignore[attr-defined]
-            frames.sort()  # such slots are handed over before the others
-            others.sort()
         assert frames == others, _difference(frames, others)
         self.count += len(frames)
         assert self.events[0] == self.events[1], self.events

@@ -40,8 +40,25 @@ def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     send(queue, sent, 2)
     queue.put_all([queued(7)])
     queue.clear()
-    assert (len(queue), queue.dropped, queue.replaced) == (0, 10 + QUEUE_LENGTH, 0)
+    assert (len(queue), queue.dropped, queue.replaced) == (0, 10 + QUEUE_LENGTH - 1, 1)
     assert send(queue, sent, 9) == 0
+
+
+def test_frames_of_a_step_keep_their_order_and_leftovers_alternate() -> None:
+    queue, sent = TransmitQueue(), list[CanFrame]()
+    step = [queued(1, 0x81), slot(0x18040A2A), queued(2, 0x82), slot(0x181), slot(0x182)]
+    queue.put_all(step)
+    assert queue.in_order() == step
+    queue.put_all([queued(3, 0x83), slot(0x181, 9), slot(0x183)])
+    in_order = [*step[:3], slot(0x181, 9), step[4], queued(3, 0x83), slot(0x183)]
+    assert queue.in_order() == in_order, "not all were put before the interface was asked"
+    assert send(queue, sent, 1) == 1
+    queue.put_all([queued(4, 0x84)])
+    send(queue, sent, 100)
+    expected = [in_order[0], slot(0x18040A2A), queued(2, 0x82), slot(0x181, 9), queued(3, 0x83)]
+    assert sent == [*expected, slot(0x182), queued(4, 0x84), slot(0x183)]
+    queue.put_all(step)
+    assert queue.in_order() == step, "nothing is left over any more"
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(1, 7)), max_size=60))
@@ -78,6 +95,7 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
     queue, sent = TransmitQueue(), list[CanFrame]()
     put: list[CanFrame] = []
     newest: dict[int, CanFrame] = {}  # slots that wait
+    has_leftovers = False
     for number, step in enumerate(steps):
         if isinstance(step, tuple):
             frame = CanFrame(step[1], number.to_bytes(2, "little"), queued=step[0])
@@ -86,13 +104,14 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
                 newest[frame.can_id] = frame
             queue.put_all([frame])
             continue
-        before, both = len(sent), 0 < len(newest) < len(queue)
+        before, both = len(sent), has_leftovers and 0 < len(newest) < len(queue)
         for _ in range(step if one_by_one else 1):
             send(queue, sent, 1 if one_by_one else step)
         now_sent = sent[before:]
         for frame in now_sent:
             if not frame.queued:
                 assert newest.pop(frame.can_id) == frame, "not the newest of its id"
+        has_leftovers = len(queue) > 0
         if both:
             lines = [frame.queued for frame in now_sent]
             shorter = min(Counter(lines).values()) if len(set(lines)) == 2 else 0
