@@ -25,7 +25,7 @@ from kontronik_can_gw.printable import printable
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
     "run": "the gateway: ESC telemetry in, CAN frames and CANopen out",
-    "status": "show the state of a running gateway",
+    "status": "show the state of the running gateways",
     "check": "check a configuration and print what it will send",
     "doctor": "check machine, ports, CAN interface and configuration, with remedies",
     "service": "install the gateway as a systemd service, or remove it",

@@ -3,12 +3,13 @@
 import argparse
 import ipaddress
 import threading
+from functools import partial
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import CONFIG, option
 from kontronik_can_gw.cli.common import announced_config, say, stopping_on_signals
 from kontronik_can_gw.desk.libraries import missing_library
-from kontronik_can_gw.desk.monitor.status import status_file
+from kontronik_can_gw.desk.monitor.status import look_at_first, possible_files
 
 
 def _loopback(text: str) -> tuple[str, int]:
@@ -43,12 +44,16 @@ def main(args: argparse.Namespace) -> int:
         from kontronik_can_gw.desk.metrics import server_of
     except ImportError:
         raise missing_library("metrics", "metrics") from None
-    file = args.file or status_file(args.config or announced_config())
+    config = None if args.file else args.config or announced_config()
+    files = [args.file] if args.file else possible_files(config)
+    if len(files) == 1:  # no other gateway's file can be meant
+        config = None
+    look = partial(look_at_first, files, config=config)
     host, port = args.listen
-    stopped, server = threading.Event(), server_of(file, host, port)
+    stopped, server = threading.Event(), server_of(look, host, port)
     with server, stopping_on_signals(stopped.set):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         shown = f"[{host}]" if ":" in host else host
-        say(f"http://{shown}:{server.server_port}/metrics serves {file}")
+        say(f"http://{shown}:{server.server_port}/metrics serves {config or files[0]}")
         stopped.wait()
     return 0

@@ -101,7 +101,7 @@ class _Run:
         from kontronik_can_gw.runtime.facts import program_facts
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.native_poller import poller_for
-        from kontronik_can_gw.runtime.statistics import Statistics, default_file
+        from kontronik_can_gw.runtime.statistics import open_statistics
 
         path = config_file(self._args.config)
         program = program_facts(path)
@@ -114,8 +114,7 @@ class _Run:
         _begin_realtime(config.run.realtime_priority, wait)
         gateway, recorder = self._gateway(loaded)
         try:
-            file = config.statistics_path or default_file()
-            statistics = None if file is None else Statistics(file)
+            statistics = open_statistics(config.statistics_path, path)
         except UserError:
             if loaded.store is not None:
                 loaded.store.close(0)

@@ -1,4 +1,4 @@
-"""``status``: shows the state of a running gateway, from the statistics file that it replaces each second."""
+"""``status``: shows the state of running gateways, from the file that each of them replaces every second."""
 
 import argparse
 import time
@@ -7,7 +7,16 @@ from pathlib import Path
 from rich.console import Console
 
 from kontronik_can_gw.cli.arguments import JSON, default_config, option
-from kontronik_can_gw.desk.monitor.status import RUN_FOLDER, lines_of, look_at, status_file
+from kontronik_can_gw.desk.monitor.status import (
+    NOT_RUNNING,
+    TROUBLE,
+    Seen,
+    lines_of,
+    look_at,
+    look_at_first,
+    possible_files,
+    published_files,
+)
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.runtime.snapshot import PROGRAM
@@ -29,32 +38,43 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "Default: all gateways that run as a service; without any, that of gateway.toml. "
-    "Live: watch kontronik-can-gw status. Exit code 0: running and healthy; "
-    "1: running, but an ESC is not heard or nothing gets onto the CAN bus; 2: wrong usage; 3: not running, or no answer for 3 s."
+    "Without options it shows all gateways of this user and of the system. "
+    "Live: watch kontronik-can-gw status. Exit code 0: running and healthy; 1: running, but an ESC is not heard, nothing "
+    "gets onto the CAN bus, or one of several gateways does not answer; 2: wrong usage; 3: no gateway runs, or it has not "
+    "answered for 3 s."
 )
 
 
 def main(args: argparse.Namespace) -> int:
     now = time.monotonic_ns()
-    files = sorted(RUN_FOLDER.glob(f"{PROGRAM}*/status.json"))
-    config = args.config or (None if args.file or files else default_config())
-    if args.file or config:
-        files = [args.file or status_file(config)]
-    seen = [look_at(file, now, None if args.file else config) for file in files]
+    seen = _chosen(args, now) or [look_at(file, now) for file in published_files()]
+    if not seen and (config := default_config()) is not None:
+        seen = [look_at_first(possible_files(config), now, config)]
     if args.json:
         print(printable_json({"gateways": [each.as_json() for each in seen]}))
     if not seen:
         raise NotRunning(
-            f"no gateway runs as a service. Start it: sudo systemctl start {PROGRAM}; "
-            "or name the file of another one: --file, or statistics.file in its configuration."
+            "no gateway of this user or of the system runs. Start one: kontronik-can-gw run -c FILE, "
+            f"or as a service: sudo systemctl start {PROGRAM}"
         )
+    codes = {each.code for each in seen}
+    # one that has stopped is a fault as long as another one runs
+    code = NOT_RUNNING if codes == {NOT_RUNNING} else min(max(codes), TROUBLE)
     if args.json:
-        return max(each.code for each in seen)
+        return code
     if all(each.document is None for each in seen):
         raise NotRunning(*(each.sentence for each in seen))
     console = Console(highlight=False, soft_wrap=True)
     for number, each in enumerate(seen):
         for text in ([""] if number else []) + list(lines_of(each)):
             console.print(text)
-    return max(each.code for each in seen)
+    return code
+
+
+def _chosen(args: argparse.Namespace, now: int) -> list[Seen]:
+    """Return the gateway that the options name, or an empty list without them."""
+    if args.file:
+        return [look_at(args.file, now)]
+    if args.config:
+        return [look_at_first(possible_files(args.config), now, args.config)]
+    return []

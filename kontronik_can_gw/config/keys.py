@@ -83,7 +83,7 @@ class StatisticsConfig:
 
     file: str | None = key(TEXT, None,
         "JSON file that is replaced each second, relative to this configuration "
-        "(default: status.json in the service's runtime folder; without one none)")
+        "(default: a file in the runtime folder, where `status` finds it)")
 
 
 @dataclass(frozen=True)

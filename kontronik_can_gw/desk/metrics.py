@@ -7,14 +7,18 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from prometheus_client import CollectorRegistry, Metric, make_wsgi_app
 from prometheus_client.exposition import ThreadingWSGIServer
 
-from kontronik_can_gw.desk.monitor.status import FOREIGN, MALFORMED, NOT_RUNNING, look_at
+from kontronik_can_gw.desk.monitor.status import (
+    FOREIGN,
+    MALFORMED,
+    NOT_RUNNING,
+    Seen,
+)
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import LinkState
@@ -175,13 +179,19 @@ class _Handler(WSGIRequestHandler):
 
 
 def server_of(
-    file: Path, host: str, port: int, clock: Callable[[], int] = time.monotonic_ns
+    look: Callable[[int], Seen], host: str, port: int, clock: Callable[[], int] = time.monotonic_ns
 ) -> WSGIServer:
-    """What serves a status file's metrics at an address. RunError with one clear line where it cannot listen."""
+    """Return a server of the metrics of one gateway at an address. RunError if it cannot listen there.
+
+    ``look`` returns the gateway's status at a monotonic time.
+    """
 
     def answer(environ: dict[str, Any], start: Callable[..., Any]) -> Iterable[bytes]:
-        status, seen = "503 Service Unavailable", look_at(file, clock())
-        reason = f"{file}: {seen.sentence.removeprefix(f'{file}: ')}"
+        status, seen = "503 Service Unavailable", look(clock())
+        file = seen.file
+        reason = seen.sentence
+        if seen.document is not None:
+            reason = f"{file}: {reason}"
         if _LOOPBACK.fullmatch(environ.get("HTTP_HOST", "")) is None:
             # no web page may have a browser ask (DNS rebinding)
             status = "403 Forbidden"

@@ -20,11 +20,10 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.disk import reason_of
 from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.folders import make_runtime_folder, runtime_folder
 
 log = logging.getLogger("kontronik_can_gw")
 
-SYSTEM_FOLDER = Path("/run/kontronik-can-gw/lock")
-"""Made by tmpfiles.d for the service's user; root's gateways lock there too, and containers that have it mounted."""
 PREFIX = ""
 """Before the names of all locks, for tests that run side by side."""
 _MAX_NAME = 200
@@ -33,15 +32,6 @@ _MAX_NAME = 200
 
 class Taken(Exception):
     """Another process has the lock."""
-
-
-def lock_folder() -> Path:
-    """Where this user's gateways lock: together with the service where they may, else in the user's own runtime folder."""
-    shared = SYSTEM_FOLDER if SYSTEM_FOLDER.exists() else SYSTEM_FOLDER.parent
-    if os.geteuid() == 0 or os.access(shared, os.W_OK):
-        return SYSTEM_FOLDER
-    own = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.geteuid()}"
-    return Path(own, "kontronik-can-gw", "lock")
 
 
 def file_name(name: str) -> str:
@@ -102,11 +92,10 @@ class Locks:
         self.hold(())
 
     def _take(self, name: str) -> bool:
-        """Have one lock, or do without; False where another gateway has it."""
-        folder = lock_folder()
-        path = folder / file_name(name)
+        """Take one lock. Returns False if another gateway has it, True also if no lock can be made."""
+        folder = runtime_folder("lock")
         try:
-            folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+            path = make_runtime_folder("lock") / file_name(name)
             self._held[name] = path, lock_file(path)
         except Taken:
             return False

@@ -6,31 +6,93 @@ the newest document is made of goes from one to the other by a single assignment
 
 import contextlib
 import errno
+import logging
 import os
+import time
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.disk import reason_of, write_new
+from kontronik_can_gw.runtime.folders import STATUS_FILE, make_runtime_folder, status_name
 from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment, snapshot
 from kontronik_can_gw.runtime.worker import Report, Worker
+
+log = logging.getLogger("kontronik_can_gw")
 
 PERIOD_NS = SECOND
 _CLOSE_S = 0.2
 
 
-def default_file() -> Path | None:
-    """Where the statistics go if the configuration does not say: into what systemd gives the service, else nowhere."""
+def open_statistics(configured: Path | None, configuration: Path) -> "Statistics | None":
+    """Start to publish the status of the gateway with this configuration.
+
+    ``configured`` is the file of ``statistics.file``, or None. The status goes to that file, and can also be found
+    in the runtime folder, in which ``kontronik-can-gw status`` looks for gateways. Without ``statistics.file`` a
+    failure is logged and None is returned. RunError if another gateway writes the configured file.
+    """
+    published: Path | None = None
+    problem = ""
+    try:
+        published = _published_file(configuration)
+        if configured is None:
+            return Statistics(published)
+    except RunError as error:
+        problem = str(error)
+    except OSError as error:
+        problem = reason_of(error)
+    if problem:
+        log.warning("`kontronik-can-gw status` cannot show this gateway: %s", problem)
+    return None if configured is None else Statistics(configured, link=published)
+
+
+def _published_file(configuration: Path) -> Path:
+    """Return the file in the runtime folder for this gateway. OSError if there can be no such folder."""
     given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
-    return Path(given) / "status.json" if given else None
+    if given:  # by systemd, for the service alone
+        return Path(given) / STATUS_FILE
+    folder = make_runtime_folder("status")
+    _remove_left_over(folder)
+    return folder / status_name(configuration)
+
+
+def _remove_left_over(folder: Path) -> None:
+    """Remove the status files of gateways that were killed.
+
+    A running gateway holds a lock on its file. It also has just written the file, which counts if the gateway runs
+    in another network namespace, because locks hold only within one.
+    """
+    for path in folder.glob("*.json"):
+        locks = Locks(report=lambda _: None)
+        if not _is_recent(path) and not locks.hold([_lock_name(path)]):
+            with contextlib.suppress(OSError):
+                path.unlink()
+        locks.close()
+
+
+def _is_recent(path: Path) -> bool:
+    """Return True if the file, or the file that a link leads to, was written a moment ago."""
+    try:
+        return abs(time.time_ns() - path.stat().st_mtime_ns) <= STALE_NS
+    except OSError:
+        return False
+
+
+def _lock_name(file: Path) -> str:
+    return f"{os.path.realpath(file)}/statistics/0"
 
 
 class Statistics:
-    """The thread that writes the file. ``due``: when the next document is wanted. RunError where another gateway writes it."""
+    """The thread that writes the file.
 
-    def __init__(self, file: Path) -> None:
+    ``due`` is the time of the next document. ``link`` is a symbolic link to the file, made along with it. RunError if
+    another gateway writes the file.
+    """
+
+    def __init__(self, file: Path, link: Path | None = None) -> None:
         self.due = 0
+        self._link = link
         self._path, self._what = file, f"statistics file {file}"
         self._temporary = file.with_name(f".{file.name}.tmp")
         self._newest: Moment | None = None
@@ -39,7 +101,7 @@ class Statistics:
         self._is_ours = False
         """The file is what was written here."""
         self._locks = Locks()
-        if self._locks.hold([f"{os.path.realpath(file)}/statistics/0"]):
+        if self._locks.hold([_lock_name(file)]):
             raise RunError(
                 f"statistics.file {file}: another gateway writes it. Give this one its own."
             )
@@ -88,14 +150,29 @@ class Statistics:
             text = f"{self._what}: cannot be written: {reason_of(error)}. Trying again."
             self._faults.note(name, True, text)
         else:
+            if self._link is not None and not (self._is_ours and self._link.is_symlink()):
+                self._make_link(self._link)
             self._is_ours = True
             self._faults.note(name, False, f"{self._what}: is written again")
+
+    def _make_link(self, link: Path) -> None:
+        """Link to the file, in place of an earlier gateway's link. Only `status` uses it, so failure is no fault."""
+        if os.path.realpath(link) == os.path.realpath(self._path):
+            return  # also if statistics.file names the published file itself
+        temporary = link.with_name(f".{link.name}.{os.getpid()}")
+        with contextlib.suppress(OSError):
+            temporary.symlink_to(self._path.absolute())
+            temporary.replace(link)
 
     def _fail(self, error: Exception) -> None:
         """A mistake of ours in here must not go unsaid."""
         self._faults.note("statistics", True, f"the statistics fail: {error!r}. Trying again.")
 
     def _end(self) -> None:
-        if self._is_ours:
+        if not self._is_ours:
+            return
+        if self._link is not None and self._link.is_symlink():
             with contextlib.suppress(OSError):
-                self._path.unlink()
+                self._link.unlink()
+        with contextlib.suppress(OSError):
+            self._path.unlink()

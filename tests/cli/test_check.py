@@ -71,7 +71,7 @@ def test_commands_that_also_work_without_one_say_which_they_take(places: tuple[P
     with own.open("a") as file:
         file.write('[canopen]\nenabled = true\n[statistics]\nfile = "state.json"\n')
     assert "by gateway.toml" in run("eds").err
-    assert "state.json" in refused(3, "status")
+    assert "run -c gateway.toml" in refused(3, "status")
 
 
 def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another_layout(

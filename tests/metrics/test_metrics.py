@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from vcan_tools import GatewayProcess
 
 from kontronik_can_gw.desk import metrics as metrics_module
 from kontronik_can_gw.desk.libraries import EXTRAS, install_command
+from kontronik_can_gw.desk.monitor.status import look_at
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
@@ -176,7 +178,9 @@ def clock(document: dict[str, Any]) -> Clock:
 @pytest.fixture
 def port(file: Path, clock: Clock) -> Iterator[int]:
     """Of a server, chosen by the system."""
-    with metrics_module.server_of(file, "127.0.0.1", 0, lambda: clock.now) as made:
+    with metrics_module.server_of(
+        partial(look_at, file), "127.0.0.1", 0, lambda: clock.now
+    ) as made:
         thread = threading.Thread(target=made.serve_forever, args=(0.05,))
         thread.start()
         yield made.server_port

@@ -16,7 +16,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime import can_controller, can_link, locks
+from kontronik_can_gw.runtime import can_controller, can_link, folders
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
@@ -27,7 +27,7 @@ from kontronik_can_gw.transmit_queue import Sent
 @pytest.fixture(autouse=True)
 def locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Or a test of this file that runs at the same time in another process is another gateway with the same node."""
-    monkeypatch.setattr(locks, "lock_folder", lambda: tmp_path / "lock")
+    monkeypatch.setattr(folders, "RUN", tmp_path / "run")
 
 
 ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))

@@ -11,9 +11,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from vcan_tools import feeding
 
 from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.runtime.statistics import open_statistics
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 ENOUGH = 36_000
@@ -136,3 +138,80 @@ def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Pat
     fd, exit_code = (tmp_path / "x").read_text().split()
     assert int(fd) > 2
     assert exit_code == "0"
+
+
+ELSEWHERE = """
+from pathlib import Path
+from kontronik_can_gw.runtime import folders
+folders.RUN, folders.TEMPORARY = Path({folder!r}, "run"), Path({folder!r}, "tmp")
+"""
+BY_HAND = '[can]\ninterface = "virtual"\n{more}[[esc]]\nport = "{port}"\n'
+
+
+def test_gateways_run_by_hand_are_found_by_status_until_they_end(tmp_path: Path) -> None:
+    """With and without ``statistics.file``; one is killed, and its file goes when the next gateway starts."""
+    for name in ("run", "tmp"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "sitecustomize.py").write_text(ELSEWHERE.format(folder=str(tmp_path)))
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    environment.pop("XDG_RUNTIME_DIR", None)
+    running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(name: str, port: str, more: str = "") -> None:
+        (tmp_path / f"{name}.toml").write_text(BY_HAND.format(port=port, more=more))
+        command = [*PROGRAM, "run", "-c", str(tmp_path / f"{name}.toml")]
+        running[name] = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+
+    def status(*words: object) -> tuple[int, set[str]]:
+        """Exit code, and the configurations of the gateways that are shown."""
+        command = [*PROGRAM, "status", "--json", *map(str, words)]
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True)
+        found = json.loads(done.stdout)["gateways"]
+        return done.returncode, {
+            Path(each["document"]["configuration"]).stem for each in found if each["document"]
+        }
+
+    def until(expected: tuple[int, set[str]]) -> None:
+        end = time.monotonic() + LIMIT_S
+        while (found := status()) != expected:
+            assert time.monotonic() < end, (found, expected)
+
+    with feeding(tmp_path, 2) as escs:
+        for esc in escs:
+            esc.on = True
+        try:
+            start("plain", escs[0].path)
+            start("named", escs[1].path, '[statistics]\nfile = "own/state.json"\n')
+            (tmp_path / "own").mkdir()
+            until((0, {"plain", "named"}))
+            assert status("-c", tmp_path / "plain.toml") == (0, {"plain"})
+            assert status("-c", tmp_path / "named.toml") == (0, {"named"})
+            assert (tmp_path / "own" / "state.json").is_file()
+            running["plain"].terminate()
+            assert running["plain"].wait(LIMIT_S) == 0
+            assert status() == (0, {"named"})
+            running["named"].kill()
+            running["named"].wait()
+            until((3, {"named"}))
+            start("next", escs[0].path)
+            until((0, {"next"}))
+            running["next"].terminate()
+            assert running["next"].wait(LIMIT_S) == 0
+            assert status() == (3, set())
+        finally:
+            for process in running.values():
+                process.kill()
+                process.wait()
+    assert not list(tmp_path.glob("*/**/status/*"))
+
+
+def test_a_second_gateway_with_one_configuration_runs_without_a_status_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    first = open_statistics(None, tmp_path / "gateway.toml")
+    assert first is not None
+    assert open_statistics(None, tmp_path / "gateway.toml") is None
+    assert "`kontronik-can-gw status` cannot show this gateway: " in caplog.text
+    assert "another gateway writes it" in caplog.text
+    first.close()

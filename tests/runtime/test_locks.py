@@ -11,7 +11,7 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime import locks
+from kontronik_can_gw.runtime import folders
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.locks import Locks, Taken, file_name, lock_file
@@ -24,8 +24,11 @@ NODES = [f"{CHANNEL}: CANopen node {number}" for number in (5, 6, 7)]
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of this test alone."""
-    path = tmp_path / "run" / "lock"
-    monkeypatch.setattr(locks, "lock_folder", lambda: path)
+    path = tmp_path / "run" / "kontronik-can-gw" / "lock"
+    monkeypatch.setattr(folders, "RUN", tmp_path / "run")
+    monkeypatch.setattr(folders, "TEMPORARY", tmp_path / "tmp")
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    path.parent.parent.mkdir()
     return path
 
 
@@ -111,26 +114,6 @@ def test_what_cannot_be_locked_is_reported_once_and_done_without(
     mine.close()
     assert len(said) == 1 and "Nothing keeps a second gateway" in said[0]
     assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.parametrize(
-    ("uid", "writable", "expected"),
-    [
-        (0, "", "SYSTEM"),
-        (1000, "SYSTEM", "SYSTEM"),
-        (1000, "", "/run/user/1000/kontronik-can-gw/lock"),
-    ],
-)
-def test_the_folder_is_the_services_or_the_users_own(
-    uid: int, writable: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.undo()
-    monkeypatch.setattr(locks, "SYSTEM_FOLDER", tmp_path)
-    monkeypatch.setattr(os, "geteuid", lambda: uid)
-    allowed = writable.replace("SYSTEM", str(tmp_path))
-    monkeypatch.setattr(os, "access", lambda path, _mode: str(path) == allowed)
-    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
-    assert str(locks.lock_folder()) == expected.replace("SYSTEM", str(tmp_path))
 
 
 @pytest.mark.parametrize("name", [NODES[0], "/dev/serial/by-id/usb-A%2F_1@115200", "/ä" * 150])

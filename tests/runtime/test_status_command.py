@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from statistics_bench import Bench, with_nodes
 
-from kontronik_can_gw.cli import status
 from kontronik_can_gw.desk.monitor.status import (
     HEALTHY,
     NOT_RUNNING,
@@ -24,6 +23,7 @@ from kontronik_can_gw.desk.monitor.status import (
 )
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.runtime import folders
 from kontronik_can_gw.runtime.facts import (
     CanFacts,
     PortFacts,
@@ -85,8 +85,9 @@ def written(
 @pytest.fixture
 def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "run"
-    monkeypatch.setattr(status, "RUN_FOLDER", folder)
-    monkeypatch.setattr("kontronik_can_gw.desk.monitor.status.RUN_FOLDER", folder)
+    monkeypatch.setattr(folders, "RUN", folder)
+    monkeypatch.setattr(folders, "TEMPORARY", tmp_path / "tmp")
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     return folder
 
 
@@ -172,7 +173,8 @@ def test_a_configuration_names_its_file_or_the_service_of_its_name(
     for name, folder in (("gateway", ""), ("left", "-left")):
         toml = tmp_path / f"{name}.toml"
         toml.write_text(esc, encoding="utf-8")
-        assert shell("-c", toml)[0] == NOT_RUNNING
+        code, _, talk = shell("-c", toml)
+        assert (code, f"run -c {toml}" in talk) == (NOT_RUNNING, True)
         file = run_folder / f"kontronik-can-gw{folder}" / "status.json"
         written(file, heard(), program_facts(tmp_path / "other.toml"))
         code, _, talk = shell("-c", toml)
@@ -180,28 +182,56 @@ def test_a_configuration_names_its_file_or_the_service_of_its_name(
         written(file, heard(), program_facts(toml))
         code, out, _ = shell("-c", toml)
         assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
+        by_hand = folders.status_folders()[0] / folders.status_name(toml)
+        written(file, heard(), program_facts(tmp_path / "other.toml"))
+        written(by_hand, heard(), program_facts(toml))
+        assert shell("-c", toml)[0] == HEALTHY, "not the service of another configuration"
+        by_hand.unlink()
     elsewhere = tmp_path / "elsewhere.toml"
     elsewhere.write_text(f'[statistics]\nfile = "s/status.json"\n{esc}')
     written(tmp_path / "s" / "status.json", heard(), program_facts(elsewhere))
     assert shell("-c", elsewhere)[0] == HEALTHY
 
 
-def test_all_services_are_shown_and_the_worst_is_the_exit_code(
+def test_without_options_all_gateways_are_shown_and_3_means_that_none_runs(
     run_folder: Path,
 ) -> None:
     code, out, talk = shell()
     assert (code, out) == (NOT_RUNNING, "")
     assert "sudo systemctl start kontronik-can-gw" in talk and talk.count("\n") == 1
-    written(run_folder / "kontronik-can-gw" / "status.json", heard())
+    service = run_folder / "kontronik-can-gw" / "status.json"
+    written(service, heard(), monotonic_ns=1)
+    assert shell()[0] == NOT_RUNNING
+    written(service, heard())
     code, out, _ = shell()
     assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
     troubled = heard(change=lambda bench: bench.gateway.set_can_state(CanState.BUS_OFF, bench.now))
     written(run_folder / "kontronik-can-gw-a" / "status.json", troubled)
     assert shell()[0] == TROUBLE
-    written(run_folder / "kontronik-can-gw-b" / "status.json", heard(), monotonic_ns=1)
+    written(run_folder / "kontronik-can-gw-a" / "status.json", heard(), monotonic_ns=1)
     code, out, _ = shell()
-    assert code == NOT_RUNNING
-    assert out.count("kontronik-can-gw ") == 3
+    assert (code, out.count("kontronik-can-gw ")) == (TROUBLE, 2), "one runs, one has stopped"
+
+
+def test_without_options_gateways_of_this_user_are_found_in_every_runtime_folder(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "session"))
+    uid = os.geteuid()
+    places = [
+        run_folder / "kontronik-can-gw",
+        tmp_path / "session" / "kontronik-can-gw",
+        run_folder / "user" / str(uid) / "kontronik-can-gw",
+        tmp_path / "tmp" / f"kontronik-can-gw-{uid}",
+    ]
+    for number, place in enumerate(places):
+        written(place / "status" / f"{number}.json", heard(), program_facts(f"{number}.toml"))
+    code, out, _ = shell()
+    assert (code, [f"/{n}.toml" in out for n in range(4)]) == (HEALTHY, [True] * 4)
+    places[3].chmod(0o777)  # another user could have written the file
+    assert shell()[1].count("kontronik-can-gw ") == 3
+    (places[0] / "status" / "same.json").symlink_to(places[1] / "status" / "1.json")
+    assert shell()[1].count("kontronik-can-gw ") == 3, "a link is no second gateway"
 
 
 def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path: Path) -> None:

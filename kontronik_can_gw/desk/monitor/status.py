@@ -1,7 +1,9 @@
 """The state of a running gateway from its statistics file: an exit code, faults in words, lines of at most 80 columns."""
 
 import json
-from collections.abc import Iterator, Mapping
+import os
+import stat
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,11 +27,11 @@ from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.native.load import in_words
 from kontronik_can_gw.printable import printable
+from kontronik_can_gw.runtime import folders
 from kontronik_can_gw.runtime.fault_log import duration
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
-RUN_FOLDER = Path("/run")
 _LARGEST_FILE = 1 << 22
 FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
@@ -51,6 +53,8 @@ class Seen:
     troubles: tuple[str, ...] = ()
     age_s: float | None = None
     document: Document | None = None
+    is_missing: bool = False
+    """There is no such file."""
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -63,23 +67,60 @@ class Seen:
         }
 
 
-def status_file(config: Path | None) -> Path:
-    """The file of a configuration's gateway: its own, or the service's of the same name."""
-    own = None if config is None else load(config).statistics_path
-    folder = PROGRAM if config is None or config.stem == "gateway" else f"{PROGRAM}-{config.stem}"
-    return own or RUN_FOLDER / folder / "status.json"
+def published_files() -> list[Path]:
+    """Return the status files of all gateways of the system and of this user, services first."""
+    found = sorted(folders.RUN.glob(f"{PROGRAM}*/{folders.STATUS_FILE}"))
+    for folder in folders.status_folders():
+        found += sorted(folder.glob("*.json"))
+    return list({os.path.realpath(file): file for file in found}.values())
+
+
+def possible_files(config: Path | None) -> list[Path]:
+    """Return the files that may hold the status of a configuration's gateway: run by hand, or as a service.
+
+    Without a configuration this is the file of the plain service.
+    """
+    service = PROGRAM
+    if config is not None:
+        if (configured := load(config).statistics_path) is not None:
+            return [configured]
+        if config.stem != "gateway":
+            service = f"{PROGRAM}-{config.stem}"
+    files = [folders.RUN / service / folders.STATUS_FILE]
+    if config is not None:
+        files += [folder / folders.status_name(config) for folder in folders.status_folders()]
+    return files
+
+
+def look_at_first(files: Sequence[Path], now: int, config: Path | None = None) -> Seen:
+    """Return the result of the file that shows a running gateway, else of one that shows why there is none.
+
+    ``config`` is the configuration that the gateway must have.
+    """
+    seen = [look_at(file, now, config) for file in files]
+    return min(seen, key=lambda each: (each.document is None, each.code, each.is_missing))
 
 
 def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
-    """The result of a statistics file at ``now`` (monotonic). ``config``: of its gateway, where the file may be another one's."""
+    """Return the result of a status file at ``now`` (monotonic).
+
+    ``config`` is the configuration of the gateway that is meant; the file may be another gateway's.
+    """
     try:
-        if file.exists() and not file.is_file():  # reading a pipe would block
-            text = "is no plain file. Look at statistics.file."
-            return Seen(file, NOT_RUNNING, f"{file}: {text}")
-        with file.open("rb") as opened:
+        # a pipe would block, and may take the place of the file at any time
+        with open(file, "rb", opener=_open_without_waiting) as opened:
+            if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
+                text = "is no plain file. Look at statistics.file."
+                return Seen(file, NOT_RUNNING, f"{file}: {text}")
             document = json.loads(opened.read(_LARGEST_FILE))
     except FileNotFoundError:
-        text = "not running: there is no such file. Start the gateway whose statistics.file it is."
+        text = f"{file}: not running: there is no such file. Start the gateway whose statistics.file it is."
+        if config is not None:
+            start = f"Start it: kontronik-can-gw run -c {config}"
+            text = f"{config}: no gateway runs with this configuration. {start}"
+        return Seen(file, NOT_RUNNING, text, is_missing=True)
+    except IsADirectoryError:
+        text = "is no plain file. Look at statistics.file."
     except OSError as error:
         text = f"cannot be read: {error.strerror}. Try it with sudo."
     except (ValueError, RecursionError):
@@ -93,6 +134,10 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
             return seen
         text = f"is of the gateway with {printable(str(other))}, not of {config}."
     return Seen(file, NOT_RUNNING, f"{file}: {text}")
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def judge(file: Path, document: Any, now: int) -> Seen:

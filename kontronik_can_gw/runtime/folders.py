@@ -1,0 +1,79 @@
+"""Folders for files that matter only while a gateway runs: its locks, and the status that it publishes.
+
+The folder is the first that this user may use:
+
+1. ``/run/kontronik-can-gw``, shared with the service. Root and the service's user use it.
+2. ``kontronik-can-gw`` in ``$XDG_RUNTIME_DIR``, or in ``/run/user/UID`` of a login session.
+3. ``/tmp/kontronik-can-gw-UID``, if there is no session (cron, a container, ``su``). It must belong to this
+   user, because every user can create names in ``/tmp``.
+"""
+
+import contextlib
+import os
+import stat
+import zlib
+from pathlib import Path
+
+NAME = "kontronik-can-gw"
+RUN = Path("/run")
+TEMPORARY = Path("/tmp")  # noqa: S108  the folder in it is checked, see _is_own
+STATUS_FILE = "status.json"
+"""Name of a service's status file in its runtime folder."""
+
+
+def runtime_folder(purpose: str) -> Path:
+    """Return this user's folder for a purpose, ``lock`` or ``status``. It may not exist yet."""
+    system = RUN / NAME
+    shared = system / purpose if (system / purpose).exists() else system
+    if os.geteuid() == 0 or os.access(shared, os.W_OK):
+        return system / purpose
+    *sessions, last = _own_folders()
+    usable = (folder for folder in sessions if os.access(folder.parent, os.W_OK))
+    return next(usable, last) / purpose
+
+
+def make_runtime_folder(purpose: str) -> Path:
+    """Create the folder of ``runtime_folder`` if it is missing. OSError if it cannot be used."""
+    folder = runtime_folder(purpose)
+    if folder.parent.parent == TEMPORARY:
+        with contextlib.suppress(FileExistsError):
+            folder.parent.mkdir(mode=0o700)
+        if not _is_own(folder.parent):
+            raise OSError(0, f"{folder.parent} belongs to another user or is not a folder")
+    folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+    return folder
+
+
+def status_name(configuration: Path) -> str:
+    """Return the file name under which a gateway with this configuration publishes its status."""
+    return f"{zlib.crc32(os.fsencode(os.path.realpath(configuration))):08X}.json"
+
+
+def status_folders() -> list[Path]:
+    """Return the folders in which gateways of the system and of this user publish their status.
+
+    Root also gets the folders of the login sessions of all users.
+    """
+    folders = [RUN / NAME, *filter(_is_own, _own_folders())]
+    if os.geteuid() == 0:
+        folders += sorted((RUN / "user").glob(f"*/{NAME}"))
+    return [folder / "status" for folder in folders]
+
+
+def _own_folders() -> list[Path]:
+    """Return the candidates for this user's own folder, best first; they may not exist."""
+    uid = os.geteuid()
+    given = os.environ.get("XDG_RUNTIME_DIR")
+    sessions = [Path(given)] if given else []
+    sessions.append(RUN / "user" / str(uid))
+    return [*(folder / NAME for folder in sessions), TEMPORARY / f"{NAME}-{uid}"]
+
+
+def _is_own(folder: Path) -> bool:
+    """Return True for an existing folder of this user in which nobody else may write."""
+    try:
+        status = folder.lstat()
+    except OSError:
+        return False
+    is_closed = not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and is_closed
