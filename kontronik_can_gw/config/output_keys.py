@@ -103,6 +103,8 @@ class DronecanConfig:
         "esc.StatusExtended (throttle, duty, error bits) of each ESC in a second; 0: none, for it cannot say that a value is unknown")
     rpm: str = key(choice("motor", "output", "electrical"), "motor",
         "speed that is sent: of the 'motor' (ArduPilot, PX4), of the 'output' of the gear, 'electrical' (Betaflight)")
+    negative_rpm: bool = key(BOOLEAN, True,
+        "rpm is negative while the motor turns backward, as the DSDL requires; false: never negative")
     health: str = key(choice("gateway", "esc"), "gateway",
         "what the node's health says: with 'esc' errors of an ESC and lost telemetry too, and ArduPilot does not arm then")
     log_messages: bool = key(BOOLEAN, True,

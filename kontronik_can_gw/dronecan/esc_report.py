@@ -14,7 +14,7 @@ from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.wire import LOW, DataType, message_id
 from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, Severity
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
-from kontronik_can_gw.esc.values import Group, Value, steps_of, values_of
+from kontronik_can_gw.esc.values import Group, Value, steps_of, values_of, with_direction
 from kontronik_can_gw.frames import FIRST_PART, PARTS
 from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
@@ -72,11 +72,16 @@ _LAYOUTS: Mapping[DataType, tuple[int, tuple[int, int], Sequence[_Part]]] = {
 
 
 @cache
-def plans_of(protocol: EscProtocol, speed: str) -> Mapping[DataType, SlotPlan]:
-    """Of what an ESC of this protocol supplies; ``speed``: the value that is sent as rpm."""
+def plans_of(protocol: EscProtocol, speed: str, has_direction: bool) -> Mapping[DataType, SlotPlan]:
+    """The messages that an ESC of this protocol supplies.
+
+    ``speed`` is the value that is sent as rpm, negative while the motor turns backward if
+    ``has_direction``.
+    """
     values, found = values_of(protocol), {}
+    rpm = with_direction(protocol, values[speed]) if has_direction else values[speed]
     for kind, (length, _, parts) in _LAYOUTS.items():
-        signals = tuple(_signal(part, values[part.name or speed]) for part in parts)
+        signals = tuple(_signal(part, values[part.name] if part.name else rpm) for part in parts)
         if signals[0].source is None or not signals[0].source.supplied:
             continue
         plan = MessagePlan(
@@ -128,6 +133,7 @@ def _signal(part: _Part, value: Value) -> SignalPlan:
         intercept=intercept,
         source=value,
         esc=0,
+        saturates=signed,
         limits=(-_MAX_HALF, _MAX_HALF),
     )
 
@@ -144,7 +150,7 @@ class EscReport:
             wire.CIRCUIT_STATUS: 1,
             wire.TEMPERATURE: 1,
         }
-        self._plans = plans_of(esc.protocol, SPEEDS[table.rpm])
+        self._plans = plans_of(esc.protocol, SPEEDS[table.rpm], table.negative_rpm)
         self._slots: dict[wire.DataType, Slot] = {}
         self._node_id = self._page = 0
         values = values_of(esc.protocol)

@@ -198,6 +198,8 @@ class EscProtocol:
     errors: Mapping[str, Sequence[ErrorBit]] = field(default_factory=dict)
     """Name of an error word to its bits."""
     states: Mapping[int, State] = field(default_factory=dict)
+    backward_states: frozenset[int] = frozenset()
+    """Values of ``operating_state_raw`` in which the motor turns backward."""
     devices: Mapping[int, str] = field(default_factory=dict)
     peak_current_of: Mapping[int, str] = field(default_factory=dict)
     """Number of a device to whose peak current it reports: ``motor`` or ``battery``."""

@@ -92,6 +92,8 @@ class Value:
     """The last known info is taken, fresh or not."""
     pace: Group | None = None
     """What the value changes with, where that is not its group."""
+    negative_in: tuple[int, frozenset[int]] | None = None
+    """WIRE: a word of the live reading, and its values for which the steps are negative."""
     supplied: bool = True
     """False where the ESC's protocol does not have it: it is never available."""
 
@@ -122,6 +124,10 @@ def steps_of(value: Value, esc: EscTelemetry, reading: Sequence[int] | None) -> 
     if value.kind is _PRODUCT:
         return found * reading[value.words[1]]
     found = found >> value.shift & value.mask
+    if value.negative_in is not None:
+        word, negative = value.negative_in
+        if reading[word] in negative:
+            found = -found
     return found if not value.not_on or esc.supplies(value.not_on, found) else None
 
 
@@ -298,6 +304,15 @@ def values_of(protocol: EscProtocol) -> Mapping[str, Value]:
         if name in VALUES and value.unit != VALUES[name].unit:
             raise ValueError(f"ESC protocol {protocol.name}: {name} is in {VALUES[name].unit}")
     return {name: own.get(name) or _missing(value) for name, value in VALUES.items()} | own
+
+
+def with_direction(protocol: EscProtocol, speed: Value) -> Value:
+    """The speed with a negative sign while the motor turns backward, if the protocol has such states."""
+    state = protocol.by_name.get("operating_state_raw")
+    if state is None or not protocol.backward_states or speed.kind is not Kind.WIRE:
+        return speed
+    low = None if speed.high is None else -speed.high
+    return replace(speed, negative_in=(state.word, protocol.backward_states), low=low)
 
 
 def values_of_esc(settings: EscSettings) -> Mapping[str, Value]:

@@ -433,6 +433,13 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
             return 0;
         *x = field(s, e->live);
         break;
+    case KCG_OF_DIRECTED:
+        if (!e->has_live)
+            return 0;
+        *x = wire(e->live + s->place, s->wire);
+        if (e->live[s->shift] < 32 && s->mask >> e->live[s->shift] & 1)
+            *x = -*x;
+        break;
     case KCG_OF_INFO:
     case KCG_OF_LAST:
         if (!(s->kind == KCG_OF_LAST ? e->had_info : e->has_info))
@@ -579,6 +586,8 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
         v = floor_div(x * s->mul * over + s->add * by, s->div * by);
     if (s->flags & KCG_ROLLS)
         return (uint64_t)v % ((uint64_t)s->high + 1);
+    if (s->flags & KCG_SATURATES && v < s->low)
+        return (uint64_t)s->low; /* above `high` the code for Error is `high` */
     if (v > s->high || v < s->low || (s->flags & KCG_CODE_AMID && (uint64_t)v == s->not_available))
         return s->error;
     return (uint64_t)v;

@@ -64,7 +64,8 @@ enum {
     KCG_OF_GATEWAY, /* `place`: index into kcg.gateway */
     KCG_OF_UPTIME,  /* ms since gateway[KCG_STARTED_NS] */
     KCG_OF_ALIVE,   /* the message's alive counter, up to `div` */
-    KCG_OF_STATUS   /* link state, bit 6: the gateway's state is `place`, bit 7: info is fresh */
+    KCG_OF_STATUS,  /* link state, bit 6: the gateway's state is `place`, bit 7: info is fresh */
+    KCG_OF_DIRECTED /* a field as KCG_OF_LIVE, negative if the live byte at `shift` is the number of a bit that `mask` has */
 };
 enum { /* of kcg.gateway; KCG_ESCS_OK is the core's, KCG_STARTED_NS kcg_init's, the others are the owner's */
     KCG_ESCS_OK, KCG_GATEWAY_STATE, KCG_CAN_STATE, KCG_ESC_COUNT, KCG_SENT_FRAMES, KCG_REPLACED_FRAMES, KCG_SEND_FAILURES,
@@ -78,7 +79,7 @@ enum {
     KCG_N_DROPPED_NOISE, KCG_N_DROPPED_CRC, KCG_N_DROPPED_UNKNOWN_KIND, KCG_N_DROPPED_INCOMPLETE, KCG_N_LONG_RUN_BYTES, KCG_N_LOSSES, KCG_N_LATE_FRAMES, KCG_N_SUSPECT_FRAMES, KCG_COUNTS,
     KCG_N_LINK_STATE = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE_FRAMES, KCG_N_INFO_FRAMES, KCG_N_DROPPED_BYTES /* states, sums */
 };
-enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16, KCG_DIRECT = 32 }; /* of a signal; DIRECT: of live data, with no divisor, from every device */
+enum { KCG_ROLLS = 1, KCG_CODE_AMID = 2, KCG_PLAIN = 4, KCG_TABLE = 8, KCG_REAL = 16, KCG_DIRECT = 32, KCG_SATURATES = 64 }; /* of a signal; SATURATES: sent as its limit beyond that; DIRECT: of live data, with no divisor, from every device */
 enum { KCG_EVENT = 1, KCG_ON_CHANGE = 2, KCG_SILENT = 4, KCG_HAS_CRC = 8, KCG_OF_THE_GATEWAY = 16, KCG_FREE = 32, KCG_TRANSFER = 64, KCG_PACED = 128 }; /* of a message; the last two of a slot */
 enum { KCG_FIRST_PART = KCG_PAGES, KCG_PARTS = 3 }; /* pages of frames: each so many from the first one on are of one transfer */
 

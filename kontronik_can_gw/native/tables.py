@@ -57,6 +57,8 @@ _LARGEST_DIVISOR = {
     Divisor.CELLS: (255, 1),
 }
 _M64 = (1 << 64) - 1
+MASK_BITS = 32
+"""Of kcg_signal.mask."""
 END_OF_TIME = 1 << 61
 """ns: sums of times stay within int64."""
 _LIMIT = 1 << 63
@@ -217,6 +219,8 @@ class Tables:
             return
         if value.rolls:
             flags |= KCG.ROLLS
+        if signal.saturates:
+            flags |= KCG.SATURATES
         if (
             signal.low <= signal.not_available <= signal.high
             and signal.error != signal.not_available
@@ -258,7 +262,14 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         row.not_on = sum(1 << device for device in value.not_on)
         if value.mask != -1:
             row.shift, row.mask = value.shift, value.mask
-        if row.kind == KCG.OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
+        if value.negative_in is not None:
+            word, negative = value.negative_in
+            if is_info or max(negative) >= MASK_BITS or value.mask != -1:
+                raise NotInCore("a sign by a state of this number")
+            row.kind = KCG.OF_DIRECTED
+            row.shift = places[False][word][0]
+            row.mask = sum(1 << state for state in negative)
+        elif row.kind == KCG.OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
             row.flags = KCG.DIRECT
     elif value.kind is Kind.PRODUCT:
         row.kind = KCG.OF_POWER
@@ -309,6 +320,9 @@ def _range(row: Any, value: Value) -> tuple[int, int]:
     """Of the steps, before any divisor."""
     if row.kind in (KCG.OF_LIVE, KCG.OF_INFO, KCG.OF_LAST):
         return _TYPE_RANGES[row.wire]
+    if row.kind == KCG.OF_DIRECTED:
+        largest = max(map(abs, _TYPE_RANGES[row.wire]))
+        return -largest, largest
     low = 0 if value.low is None else value.low
     if value.high is not None:
         return low, value.high

@@ -122,6 +122,8 @@ def _raw(signal: SignalPlan) -> _Raw:
         )
         if source.rolls:
             return value % (high + 1)
+        if signal.saturates and value < low:
+            return low
         # a true value must not look like a code amid the values
         return value if low <= value <= high and value != not_available else error
 

@@ -76,6 +76,8 @@ class SignalPlan:
     numbers: Mapping[int, int] | None = None
     """Source number to raw value for an enumeration; what is missing is sent as Error."""
     constant: int = 0
+    saturates: bool = False
+    """A value below ``low`` is sent as ``low``; one above ``high`` as Error, which then is ``high``."""
     limits: tuple[float, float] = (-math.inf, math.inf)
     """Of a float, in raw values; its codes are bit patterns."""
     page: int | None = None

@@ -16,6 +16,7 @@ from kontronik_can_gw.dronecan.wire import Assembler, DataType, message_id, resp
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.kontronik.states import OperatingState
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
@@ -37,7 +38,13 @@ def shown(frames: list[CanFrame]) -> str:
 class Measuring:
     """A core with one ESC, which sends one message of it: in C where there is one, or in Python."""
 
-    def __init__(self, kind: DataType, is_pure: bool, speed: str = "electrical_speed") -> None:
+    def __init__(
+        self,
+        kind: DataType,
+        is_pure: bool,
+        speed: str = "electrical_speed",
+        has_direction: bool = True,
+    ) -> None:
         escs, layout = [EscSettings()], Layout("", "", ())
         self.core: Any = PythonCore(escs, layout, 0, False)
         if not is_pure:
@@ -45,7 +52,7 @@ class Measuring:
             if why:
                 pytest.skip(why)
         self.kind, self.now = kind, 0
-        self.plan = plans_of(PROTOCOLS[0], speed)[kind]
+        self.plan = plans_of(PROTOCOLS[0], speed, has_direction)[kind]
         self.slot = self.core.slot(0)
         self.slot.start(0)
 
@@ -96,6 +103,22 @@ def test_a_golden_answer() -> None:
     )
 
 
+BACKWARD = {OperatingState.Sync_Backward, OperatingState.Backward}
+
+
+@pure
+@pytest.mark.parametrize("has_direction", [True, False])
+@pytest.mark.parametrize("speed", [0, 1, 40_583, 131_071, 131_072, 131_073, 1_000_000, 0xFFFF_FFFF])
+def test_rpm_is_negative_in_the_backward_states_only(
+    is_pure: bool, has_direction: bool, speed: int
+) -> None:
+    measuring = Measuring(wire.STATUS, is_pure, has_direction=has_direction)
+    for state in (*range(32), 0x96, 0xFF):
+        got = measuring.read(LiveData(speed, operating_state=state), 0)
+        negative = has_direction and state in BACKWARD
+        assert got.rpm == (max(-speed, -131_072) if negative else min(speed, 131_071))
+
+
 def half(value: float) -> float:
     """The nearest number of a 16-bit float."""
     found: float = struct.unpack("<e", struct.pack("<e", value))[0]
@@ -115,7 +138,9 @@ def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
         kelvin = live.power_stage_temperature + 273.15
         found = (got.error_count, got.voltage, got.current, got.temperature, got.esc_index)
         assert found == (errors, half(volts), half(amperes), half(kelvin), index)
-        assert got.rpm == min(live.electrical_speed, 131_071)
+        is_backward = live.operating_state in BACKWARD
+        rpm = -live.electrical_speed if is_backward else live.electrical_speed
+        assert got.rpm == max(-131_072, min(rpm, 131_071))
         assert got.power_rating_pct == min(live.output_opening, 127)
         got, word = extended.read(live, index), live.operating_errors
         assert got.input_pct == abs(live.throttle)

@@ -7,7 +7,7 @@ from dronecan_bench import LIVE, START, Bench
 
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.esc.kontronik.fields import InfoData, device_and_variant
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, OperatingState
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway_status import CanState
 
@@ -34,6 +34,23 @@ def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh_and_no_longer(
     bench.live[0] = LIVE
     bench.clear()
     assert len(bench.run(1).of("Status")) == 100
+
+
+@pytest.mark.parametrize(
+    ("rpm", "speed"), [("motor", 6000), ("output", 600), ("electrical", 42_000)]
+)
+@pytest.mark.parametrize(("negative_rpm", "sign"), [(True, -1), (False, 1)])
+def test_rpm_of_a_motor_that_turns_backward_is_negative_unless_that_is_off(
+    rpm: str, speed: int, negative_rpm: bool, sign: int
+) -> None:
+    """The motor is started forward, reversed, and started forward again."""
+    bench = Bench(rpm=rpm, negative_rpm=negative_rpm)
+    seen = []
+    for state in (OperatingState.Forward, OperatingState.Backward, OperatingState.Forward):
+        bench.live[0] = LIVE._replace(operating_state=state)
+        bench.clear()
+        seen.append({each.payload.rpm for each in bench.run(0.5).of("Status")[1:]})
+    assert seen == [{speed}, {sign * speed}, {speed}]
 
 
 @pytest.mark.parametrize(("rate_hz", "live_ms"), [(50, 50), (50, 14), (100, 10), (30, 10), (7, 10)])

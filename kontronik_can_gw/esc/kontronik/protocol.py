@@ -51,6 +51,7 @@ KONTRONIK = EscProtocol(
     layouts=("V4", "legacy"),
     errors={"operating_errors": tuple(OperatingError), "selftest_errors": tuple(SelfTestError)},
     states=_STATES,
+    backward_states=frozenset({OperatingState.Sync_Backward, OperatingState.Backward}),
     devices=_DEVICES,
     wire=((body_format(LiveData), LiveData), (body_format(InfoData), InfoData)),
     peak_current_of={int(d): d.peak_current_of for d in Device if d.peak_current_of is not None},
