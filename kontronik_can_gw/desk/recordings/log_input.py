@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.can_logs import text
+from kontronik_can_gw.desk.recordings.can_logs import asc, text
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.log_clock import LogClock
@@ -30,7 +30,7 @@ _LOOK_FOR_CHANNELS = 10_000
 _BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
 _TEXTS: dict[str, tuple[Callable[[bytes], object], type[text.TextReader]]] = {
     "candump": (text.candump_line, text.CandumpReader),
-    "asc": (text.asc_line, text.AscReader),
+    "asc": (asc.asc_line, asc.AscReader),
     "trc": (text.trc_line, text.TrcReader),
 }
 """What matches a line of a format, and what reads it."""

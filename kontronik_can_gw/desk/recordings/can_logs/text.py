@@ -1,13 +1,12 @@
-"""Readers of candump logs, Vector ASC and PEAK TRC. A line that cannot be read is counted, the next one is read again.
+"""Readers of candump logs and PEAK TRC. A line that cannot be read is counted, the next one is read again.
 
-Times stay whole numbers of nanoseconds, of TRC of microseconds. ASC, which has no public specification, is read as python-can reads it;
-the lines of TRC by python-can itself. Events other than frames are left out.
+Times stay whole numbers of nanoseconds, in TRC of microseconds. python-can reads the lines of TRC. Events other than frames are
+left out. ASC: asc.py.
 """
 
 import io
 import re
 from collections.abc import Iterator, Sequence
-from datetime import datetime
 from typing import Any, BinaryIO
 
 from kontronik_can_gw.desk.recordings.recording import ERROR, LATEST_NS, LogFrame
@@ -128,7 +127,7 @@ class TextReader(LogReader):
         raise NotImplementedError
 
 
-def _nanoseconds(text: bytes) -> int:
+def nanoseconds(text: bytes) -> int:
     """Exact, of decimal seconds. ValueError."""
     seconds, _, fraction = text.partition(b".")
     if not (seconds.isdigit() and fraction.isdigit() and len(seconds) <= 12 and len(fraction) <= 9):
@@ -176,91 +175,7 @@ class CandumpReader(TextReader):
             frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, is_fd)
         received = (found["dir"] or b"")[:1] in (b"R", b"r")
         channel = found["channel"].decode("ascii")
-        return LogFrame(_nanoseconds(found["time"]), frame, received, channel)
-
-
-# --- Vector ASC
-
-_DIRECTIONS = (b"rx", b"tx", b"txrq")
-_HEADS = (b"date", b"base", b"begin", b"end", b"no", b"internal", b"previous")
-_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-_GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
-_ASC_HEAD = rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)"
-_ASC_FRAME = rb"\s*\d+\.\d+\s+(?:CANFD\s+\d+\s+(?:Rx|Tx)|\d+\s+\w+\s+(?:Rx|Tx))"
-_asc_frame = re.compile(_ASC_FRAME, re.IGNORECASE).match
-asc_line = re.compile(_ASC_HEAD + b"|" + _ASC_FRAME, re.IGNORECASE).match
-"""Matches what a line of the head begins with, or one of a frame."""
-
-
-class AscReader(TextReader):
-    """Vector ASC, base hex or dec, times absolute or relative, CAN and CAN FD."""
-
-    _base, _relative, _now = 16, False, 0
-
-    def _read_head(self, lines: list[bytes]) -> None:
-        for line in lines:
-            head = line.decode("utf-8", "replace").lower().split()
-            if head[:1] == ["base"]:
-                self._base = 10 if head[1:2] == ["dec"] else 16
-                self._relative = head[-1] == "relative"
-            elif head[:1] == ["date"] or head[:2] == ["begin", "triggerblock"]:
-                started = asc_time(head[2 if head[0] == "date" else 3 :])
-                if started is not None and started >= OLDEST_WALL_S * SECOND_NS:
-                    self.wall_start_ns = started
-            elif _asc_frame(line):
-                break
-
-    def _frame(self, line: bytes) -> LogFrame | None:
-        words = line.lower().split()
-        if words[0].startswith(b"//") or words[0] in _HEADS:
-            return None
-        time_ns = _nanoseconds(words[0])
-        if self._relative:
-            time_ns = self._now = self._now + time_ns
-        is_remote = False
-        if b"errorframe" in words[2:5]:
-            channel = words[2] if words[1] == b"canfd" else words[1]
-            return LogFrame(time_ns, error_frame(), b"tx" not in words[2:5], str(int(channel)))
-        if fd := words[1:2] == [b"canfd"]:
-            channel, direction, can_id, *rest = words[2:]
-            rest = rest if rest[0] in (b"0", b"1") else rest[1:]  # its symbolic name
-            dlc, size, data = int(rest[2], 16), int(rest[3]), rest[4:]
-            is_remote = bool(dlc and not size)
-        elif len(words) > 4 and words[3] in _DIRECTIONS:
-            channel, can_id, direction, kind, *data = words[1:]
-            is_remote = kind == b"r"
-            if not is_remote and kind != b"d":
-                raise ValueError
-            # older files have no length of a remote frame
-            has_dlc = not is_remote or (bool(data) and data[0].isalnum() and len(data[0]) <= 2)
-            dlc = int(data[0], self._base) if has_dlc else 0
-            size, data = 0 if is_remote else min(8, dlc), data[1:]
-        else:  # an event of another kind
-            return None
-        if len(data) < size or direction not in _DIRECTIONS:
-            raise ValueError
-        extended = can_id.endswith(b"x")
-        number = int(can_id.removesuffix(b"x"), self._base)
-        content = bytes(int(byte, self._base) for byte in data[:size])
-        frame = CanFrame(number, content, extended, fd)
-        if is_remote:
-            frame = remote_frame(number, dlc, extended)
-        return LogFrame(time_ns, frame, direction == b"rx", str(int(channel)))
-
-
-def asc_time(words: list[str]) -> int | None:
-    """Unix time in ns of ``Nov 14 10:13:20.123 pm 2023``, local time as ASC files have it; None where it is no date."""
-    try:
-        month, day, clock, *half, year = words
-        hour, minute, second = clock.split(":")
-        second, _, fraction = second.partition(".")
-        hours = int(hour) % 12 + 12 * (half == ["pm"]) if half else int(hour)
-        name = _GERMAN_MONTHS.get(month[:3], month[:3])
-        date = int(year), _MONTHS.index(name) + 1, int(day)
-        moment = datetime(*date, hours, int(minute), int(second))  # noqa: DTZ001  local
-        return int(moment.timestamp()) * SECOND_NS + int(fraction.ljust(9, "0")[:9])
-    except (ValueError, LookupError, OverflowError, OSError):
-        return None
+        return LogFrame(nanoseconds(found["time"]), frame, received, channel)
 
 
 # --- PEAK TRC

@@ -1,0 +1,155 @@
+"""Reader of Vector ASC, which has no public specification.
+
+It is read as python-can reads it, and as Vector's tools write it: symbolic names, requests to send,
+times since midnight.
+"""
+
+import re
+from datetime import datetime
+
+from kontronik_can_gw.desk.recordings.can_logs.text import (
+    OLDEST_WALL_S,
+    SECOND_NS,
+    TextReader,
+    error_frame,
+    nanoseconds,
+    remote_frame,
+)
+from kontronik_can_gw.desk.recordings.recording import LogFrame
+from kontronik_can_gw.frames import CanFrame
+
+_DIRECTIONS = (b"rx", b"tx", b"txrq")
+_REQUEST = b"txrq"
+"""A request to send. The frame itself follows as Tx when it has been sent."""
+_HEADS = (b"date", b"base", b"begin", b"end", b"no", b"internal", b"previous")
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
+_HEAD = rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)"
+_FRAME = rb"\s*(?P<time>\d+\.\d+)\s+(?:CANFD\s+\d+\s+(?:Rx|Tx)|\d+\s+\S+\s+(?:Rx|Tx))"
+_frame = re.compile(_FRAME, re.IGNORECASE).match
+asc_line = re.compile(_HEAD + b"|" + _FRAME, re.IGNORECASE).match
+"""Matches the beginning of a line of the head, or of a frame."""
+_decimal_id = re.compile(rb"\bid\s*=\s*(\d+)(x?)\b").search
+"""The id at the end of a line, decimal whatever the base is."""
+_SHORTEST_DAY_S, _EARLIEST_S, _LATEST_S = 600, -60, 600
+"""A first time that is at least 10 min, and this close to the start's time of day, counts from midnight."""
+
+
+class AscReader(TextReader):
+    """Vector ASC, base hex or dec, times absolute or relative, CAN and CAN FD."""
+
+    _base, _relative, _now = 16, False, 0
+
+    def _read_head(self, lines: list[bytes]) -> None:
+        started = None
+        for line in lines:
+            head = line.decode("utf-8", "replace").lower().split()
+            if head[:1] == ["base"]:
+                self._base = 10 if head[1:2] == ["dec"] else 16
+                self._relative = head[-1] == "relative"
+            elif head[:1] == ["date"] or head[:2] == ["begin", "triggerblock"]:
+                started = asc_time(head[2 if head[0] == "date" else 3 :]) or started
+            elif (found := _frame(line)) is not None:
+                if started is not None and not self._relative:
+                    started = _midnight_or_start(started, int(float(found["time"])))
+                break
+        if started is not None and _unix_ns(started) >= OLDEST_WALL_S * SECOND_NS:
+            self.wall_start_ns = _unix_ns(started)
+
+    def _frame(self, line: bytes) -> LogFrame | None:
+        line = line.lower()
+        words = line.split()
+        if words[0].startswith(b"//") or words[0] in _HEADS:
+            return None
+        time_ns = nanoseconds(words[0])
+        if self._relative:
+            time_ns = self._now = self._now + time_ns
+        is_fd = words[1:2] == [b"canfd"]
+        if b"errorframe" in words[2:5]:
+            channel = words[2] if is_fd else words[1]
+            return LogFrame(time_ns, error_frame(), b"tx" not in words[2:5], str(int(channel)))
+        if is_fd:
+            return self._fd_frame(time_ns, line, words[2:])
+        if len(words) > 4 and words[3] in _DIRECTIONS:
+            return self._classic_frame(time_ns, line, words[1:])
+        return None  # an event of another kind
+
+    def _classic_frame(self, time_ns: int, line: bytes, words: list[bytes]) -> LogFrame | None:
+        channel, id_word, direction, kind, *data = words
+        if direction == _REQUEST:
+            return None
+        number, extended = self._id(id_word, line)
+        if kind == b"r":  # older files do not have its length
+            has_length = bool(data) and data[0].isalnum() and len(data[0]) <= 2
+            length = int(data[0], self._base) if has_length else 0
+            frame = remote_frame(number, length, extended)
+        elif kind == b"d":
+            length = min(8, int(data[0], self._base))
+            frame = CanFrame(number, self._bytes(data[1:], length), extended)
+        else:
+            raise ValueError
+        return LogFrame(time_ns, frame, direction == b"rx", str(int(channel)))
+
+    def _fd_frame(self, time_ns: int, line: bytes, words: list[bytes]) -> LogFrame | None:
+        if not words[0].isdigit() or words[1] == _REQUEST:
+            return None  # "CANFD Start of measurement", or a request
+        channel, direction, id_word, *rest = words
+        if direction not in _DIRECTIONS:
+            raise ValueError
+        number, extended = self._id(id_word, line)
+        if rest[0] not in (b"0", b"1"):
+            del rest[0]  # the symbolic name
+        code, length, data = int(rest[2], 16), int(rest[3]), rest[4:]
+        if code and not length:
+            frame = remote_frame(number, code, extended)
+        else:
+            frame = CanFrame(number, self._bytes(data, length), extended, True)
+        return LogFrame(time_ns, frame, direction == b"rx", str(int(channel)))
+
+    def _bytes(self, words: list[bytes], length: int) -> bytes:
+        if len(words) < length:
+            raise ValueError
+        return bytes(int(byte, self._base) for byte in words[:length])
+
+    def _id(self, word: bytes, line: bytes) -> tuple[int, bool]:
+        """The id, and whether it has 29 bits. ``word`` may be a name; then the line ends with the id."""
+        extended = word.endswith(b"x")
+        stated = _decimal_id(line) if b"=" in line else None
+        if stated is None:
+            return int(word.removesuffix(b"x"), self._base), extended
+        number = int(stated[1])
+        with_base = "X" if self._base == 16 else "d"
+        if word.removesuffix(b"x").lstrip(b"0").upper() == format(number, with_base).encode():
+            return number, extended
+        return number, bool(stated[2]) or number > 0x7FF
+
+
+def asc_time(words: list[str]) -> tuple[datetime, int] | None:
+    """Local time and its nanoseconds of ``Nov 14 10:13:20.123 pm 2023``; None if it is not a date."""
+    try:
+        month, day, clock, *half, year = words
+        hour, minute, second = clock.split(":")
+        second, _, fraction = second.partition(".")
+        hours = int(hour) % 12 + 12 * (half == ["pm"]) if half else int(hour)
+        name = _GERMAN_MONTHS.get(month[:3], month[:3])
+        date = int(year), _MONTHS.index(name) + 1, int(day)
+        moment = datetime(*date, hours, int(minute), int(second))  # noqa: DTZ001  local
+        moment.timestamp()
+        return moment, int(fraction.ljust(9, "0")[:9])
+    except (ValueError, LookupError, OverflowError, OSError):
+        return None
+
+
+def _unix_ns(started: tuple[datetime, int]) -> int:
+    moment, fraction_ns = started
+    return int(moment.timestamp()) * SECOND_NS + fraction_ns
+
+
+def _midnight_or_start(started: tuple[datetime, int], first_s: int) -> tuple[datetime, int]:
+    """The moment from which times count, by the time of the first frame."""
+    moment = started[0]
+    midnight = moment.replace(hour=0, minute=0, second=0)
+    since_start_s = first_s - (moment - midnight).seconds
+    if first_s >= _SHORTEST_DAY_S and _EARLIEST_S <= since_start_s <= _LATEST_S:
+        return midnight, 0
+    return started

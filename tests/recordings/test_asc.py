@@ -1,0 +1,113 @@
+"""What Vector's tools write into ASC files is read as it is meant."""
+
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+from command_line import run
+from log_files import opened
+
+from kontronik_can_gw.frames import CanFrame
+
+MS = 1_000_000
+HEAD = "date Tue Mar 07 10:15:42.400 AM 2023\nbase {} timestamps absolute\ninternal events logged\n"
+FD_TAIL = "  0  0   200000 0 0 0 0 0"
+LIVE = bytes.fromhex("000000C409001400")
+
+
+def _read(path: Path, *lines: str, base: str = "hex") -> list[tuple[int, CanFrame, bool]]:
+    path.write_text(HEAD.format(base) + "".join(f"   {line}\n" for line in lines))
+    with opened(path) as log:
+        found = [(item.time_ns // MS, item.frame, item.received) for item in log.frames()]
+        assert log.damage == []
+    return found
+
+
+def test_the_start_of_a_can_fd_measurement_is_no_frame(tmp_path: Path) -> None:
+    path = tmp_path / "fd.asc"
+    found = _read(
+        path,
+        "0.000000 CANFD   Start of measurement",
+        "0.010000 CANFD   1 Rx        688                                   0 0 8 8 00 00 00 C4 09 00 14 00"
+        + FD_TAIL,
+        "0.020000 CANFD   1 Tx        12345x  EscLive                       1 0 9 12 00 01 02 03 04 05 06 07 08 09 0A 0B"
+        + FD_TAIL,
+    )
+    assert found == [
+        (10, CanFrame(0x688, LIVE, fd=True), True),
+        (20, CanFrame(0x12345, bytes(range(12)), True, True), False),
+    ]
+    done = run("convert", path, tmp_path / "out.csv")
+    assert (done.code, "damaged" in done.err) == (0, False), done.err
+
+
+@pytest.mark.parametrize("base", ["hex", "dec"])
+def test_the_id_of_a_symbolic_name_is_at_the_end_of_the_line(tmp_path: Path, base: str) -> None:
+    """The id at the end is decimal in both bases. A name may look like a number, or end with x."""
+    data = "00 00 00 C4 09 00 14 00" if base == "hex" else "0 0 0 196 9 0 20 0"
+    tail = "  Length = 230000 BitCount = 119 ID = "
+    names = [("EscLive", "1672"), ("Face", "1673"), ("Matrix", "1674"), ("Far.Away", "74565x")]
+    found = _read(
+        tmp_path / "names.asc",
+        *(
+            f"0.0{n}0000 1  {name}             Rx   d 8 {data}{tail}{number}"
+            for n, (name, number) in enumerate(names)
+        ),
+        base=base,
+    )
+    assert found == [
+        (0, CanFrame(1672, LIVE), True),
+        (10, CanFrame(1673, LIVE), True),
+        (20, CanFrame(1674, LIVE), True),
+        (30, CanFrame(74565, LIVE, True), True),
+    ]
+
+
+def test_an_id_stays_an_id_when_the_line_repeats_it(tmp_path: Path) -> None:
+    tail = "  Length = 230000 BitCount = 119 ID = "
+    found = _read(
+        tmp_path / "ids.asc",
+        f"0.000000 1  688             Rx   d 1 11{tail}1672",
+        f"0.001000 1  18EBFF00x       Rx   d 1 22{tail}418119424x",
+        f"0.002000 1  123x            Rx   d 1 33{tail}291",
+    )
+    assert [frame for _, frame, _ in found] == [
+        CanFrame(0x688, b"\x11"),
+        CanFrame(0x18EBFF00, b"\x22", True),
+        CanFrame(0x123, b"\x33", True),
+    ]
+
+
+def test_a_request_to_send_is_not_a_second_frame(tmp_path: Path) -> None:
+    found = _read(
+        tmp_path / "requests.asc",
+        "0.010000 1  688             TxRq d 8 00 00 00 C4 09 00 14 00",
+        "0.010250 1  688             Tx   d 8 00 00 00 C4 09 00 14 00",
+        "0.020000 CANFD   1 TxRq      688   0 0 8 8 00 00 00 C4 09 00 14 00" + FD_TAIL,
+        "0.021000 CANFD   1 Tx        688   0 0 8 8 00 00 00 C4 09 00 14 00" + FD_TAIL,
+    )
+    assert found == [
+        (10, CanFrame(0x688, LIVE), False),
+        (21, CanFrame(0x688, LIVE, fd=True), False),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("first", "expected"),
+    [
+        ("36942.900000", "10:15:42.900"),  # since midnight
+        ("36900.000000", "10:15:00.000"),  # since midnight, before the date of the head
+        ("0.500000", "10:15:42.900"),
+        ("1200.000000", "10:35:42.400"),
+    ],
+)
+def test_times_may_count_from_midnight(tmp_path: Path, first: str, expected: str) -> None:
+    path = tmp_path / "midnight.asc"
+    later = f"{float(first) + 0.01:.6f}"
+    found = _read(path, f"{first} 1  688   Rx   d 1 11", f"{later} 1  688   Rx   d 1 22")
+    assert found[1][0] - found[0][0] == 10
+    clock = datetime.strptime(f"2023-03-07 {expected}", "%Y-%m-%d %H:%M:%S.%f")  # noqa: DTZ007
+    with opened(path) as log:
+        wall_ns = log.wall_ns(next(log.frames()).time_ns)
+    assert wall_ns is not None
+    assert wall_ns // MS == round(clock.timestamp() * 1000)
