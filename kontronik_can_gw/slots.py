@@ -132,7 +132,7 @@ class PythonSlot:
 
     @property
     def is_pending(self) -> bool:
-        return self.number in self._owner.pending
+        return self.place in self._owner.pending
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
         before, self._settings = self._settings, settings

@@ -81,14 +81,14 @@ def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
       runs as root still uses /run/kontronik-can-gw.
     """
     from kontronik_can_gw.cli import arguments
-    from kontronik_can_gw.runtime import locks, machine
+    from kontronik_can_gw.runtime import folders, machine
 
     file = tmp_path_factory.mktemp("machine") / "machine-id"
     file.write_text("0123456789abcdef0123456789abcdef\n")
     runtime = tmp_path_factory.mktemp("runtime")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(runtime))
-        patch.setattr(locks, "SYSTEM_FOLDER", runtime / "kontronik-can-gw" / "lock")
+        patch.setattr(folders, "RUN", runtime)
         patch.setattr(machine, "_IDENTITIES", (str(file), "/etc/machine-id"))
         patch.setattr(arguments, "CONFIG_PLACES", arguments.CONFIG_PLACES[:1])
         yield

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.runtime import locks
+from kontronik_can_gw.runtime.folders import runtime_folder
 
 TESTS = Path(__file__).parent
 IGNORING = ["sh", "-c", 'trap "" HUP INT QUIT; exec "$@"', "sh", sys.executable, "-c"]
@@ -60,7 +60,7 @@ def test_make_test_goes_on_after_a_hangup_only_under_nohup(ignored: bool, code: 
 
 def test_locks_of_tests_are_in_a_folder_that_every_user_can_write() -> None:
     """Without a session a user has no /run/user/UID."""
-    folder = locks.lock_folder()
+    folder = runtime_folder("lock")
     assert not folder.is_relative_to("/run")
     folder.mkdir(parents=True, exist_ok=True)
     assert os.access(folder, os.W_OK)

@@ -21,7 +21,9 @@ fish:  kontronik-can-gw completion fish > ~/.config/fish/completions/kontronik-c
 
 exit codes: 0 done, 1 the installed shtab does not know this shell, 2 wrong usage
 """
-_KINDS = dict.fromkeys(("FILE", "PATH", "IN", "OUT"), shtab.FILE) | {"DIR": shtab.DIRECTORY}
+_KINDS = dict.fromkeys(("FILE", "SOURCE", "PATH", "IN", "OUT"), shtab.FILE) | {
+    "DIR": shtab.DIRECTORY
+}
 _ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "from": ("*.dbc", "*.DBC")}
 """File name endings for options, by their attribute name."""
 

@@ -1,17 +1,20 @@
 """``monitor``: a live screen of the ESCs, from the CAN bus by the DBC or from a recording. It never sends anything."""
 
 import argparse
+import contextlib
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.desk import bus_layout, given_layout
 from kontronik_can_gw.desk.monitor.model import Monitor
-from kontronik_can_gw.desk.monitor.watch import once, watch
+from kontronik_can_gw.desk.monitor.watch import once, stream, watch
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.desk.sources import Bus, Recording, Source, can_config
 from kontronik_can_gw.errors import UserError
@@ -20,48 +23,55 @@ from kontronik_can_gw.printable import printable_json
 _ONCE_S = 3.0
 # fmt: off
 OPTIONS = (
-    option("FILE", "a recording instead of the bus", type=Path, nargs="?"),
+    option("SOURCE", "a CAN interface, or a recording", nargs="?"),
     LAYOUT,
     option("--interface NAME", "python-can interface (default socketcan)"),
     option("--channel NAME", "channel of the interface (default can0); of a CAN log, as can0 or 1: the one to play"),
-    option("--speed FACTOR", "play FILE faster by this factor (0.01 to 1000, default 1)", type=number_from(0.01, 1000, "factor")),
-    option("--once", "one line of JSON with everything, then end"),
+    option("--speed FACTOR", "play a recording faster by this factor (0.01 to 1000, default 1)", type=number_from(0.01, 1000, "factor")),
+    (
+        option("--once", "one line of JSON with everything, then end"),
+        option("--stream", "one line of JSON each second, until the end"),
+    ),
     option("--timeout S", f"--once: maximum time to wait (default {_ONCE_S:g})", type=number_from(0.1, 3600)),
 )
 # fmt: on
 EPILOG = """\
-Without FILE it listens on the CAN bus, at any place: it only needs the DBC (-c,
---dbc) and never sends a frame. With -c the interface and the channel are those
-of the configuration unless they are given. FILE is a capture (.kcap), a file of
-UART bytes or a CAN log (candump .log, .asc, .blf, .trc, .mf4), played in real
-time.
+The monitor listens on a CAN interface, at any place on the bus. It only needs
+the DBC (-c, --dbc) and never sends a frame. SOURCE is the name of an interface,
+such as vcan0. Without it the configuration names the interface, or it is can0.
+
+SOURCE can also be a recording, which is played in real time: a capture (.kcap),
+a file of UART bytes, or a CAN log (candump .log, .asc, .blf, .trc, .mf4). A file
+that has the name of an interface is opened as ./NAME.
 
 keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it,
-      n and p next and previous, 0 all, space pause (FILE)
+      n and p next and previous, 0 all, space pause (recording)
 
 A value beyond a limit is marked with ! and !!: power stage and BEC from 80 and
 100 degC, a cell from 3.5 and 3.3 V down. The limits are the monitor's own.
 
-Where standard output is no terminal, or a dumb one, it writes the table every
-second. --once waits until each cyclic message of the DBC has come, or
-for --timeout, and prints one line of JSON; of a FILE the values at its end, in
-the units of "units", null where not available.
+If standard output is not a terminal, or a dumb one, the table is written every
+second. --once waits until each cyclic message of the DBC has come, or for
+--timeout, and prints one line of JSON; of a recording the values at its end.
+--stream prints such a line each second of the bus or the recording. It goes on
+while no frames come; "problem" is the reason, if it is known. Values are in the
+units of "units", and null if they are not available.
 
-exit codes: 0 ended by a key or signal, end of FILE, or --once with values; 1 no
-frame came (--once), or something cannot be opened; 2 wrong usage
+exit codes: 0 ended by a key or signal, end of a recording, or --once with
+values; 1 no frame came (--once), or something cannot be opened; 2 wrong usage
 """
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.file is None and args.speed is not None:
-        raise UserError("--speed: is for a FILE, not for the bus. Leave it out.")
-    if args.file is not None and args.interface is not None:
-        raise UserError(f"{args.file}: is played, so --interface means nothing. Leave it out.")
+    recording = _recording_of(args)
     if args.timeout is not None and not args.once:
         raise UserError("--timeout: is for --once. Leave it out.")
     stop = Event()
-    with _source_of(args) as source, stopping_on_signals(stop.set):
+    with _source_of(args, recording) as source, stopping_on_signals(stop.set):
         monitor = Monitor(source.bus)
+        if args.stream:
+            stream(source, monitor, _print_document, stop.is_set)
+            return 0
         if not args.once:
             watch(source, monitor, stop.is_set)
             count = monitor.view.frames
@@ -70,23 +80,61 @@ def main(args: argparse.Namespace) -> int:
         document = once(source, monitor, args.timeout or _ONCE_S, stop.is_set)
         if stop.is_set():
             return 130
-    is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
-    print(printable_json(document, ascii_only=not is_utf8))
+    _print_document(document)
     return 0
 
 
+def _print_document(document: dict[str, Any]) -> None:
+    is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
+    print(printable_json(document, ascii_only=not is_utf8), flush=True)
+
+
+def _recording_of(args: argparse.Namespace) -> Path | None:
+    """The recording that SOURCE names. Otherwise SOURCE is stored as the channel.
+
+    UserError for options that contradict SOURCE.
+    """
+    name = args.source
+    if name is None or _is_interface(name, args.interface):
+        if args.speed is not None:
+            raise UserError("--speed: is for a recording, not for the bus. Leave it out.")
+        if name is not None and args.channel is not None:
+            raise UserError(f"--channel {args.channel}: {name} names the interface. Leave one out.")
+        args.channel = name or args.channel
+        return None
+    if args.interface is not None:
+        raise UserError(f"{name}: is played, so --interface means nothing. Leave it out.")
+    return Path(name)
+
+
+def _is_interface(name: str, kind: str | None) -> bool:
+    """Whether a name is a CAN interface's, not a recording's. ``kind``: python-can's interface, if given.
+
+    A name that is neither is an interface unless it looks like a file's: the interface may be
+    missing, and the error says how to make it.
+    """
+    if kind not in (None, "socketcan"):
+        return not Path(name).is_file()
+    if "/" in name or name == "-":
+        return False
+    with contextlib.suppress(OSError):
+        socket.if_nametoindex(name)
+        return True
+    return "." not in name and not Path(name).exists()
+
+
 @contextmanager
-def _source_of(args: argparse.Namespace) -> Iterator[Source]:
-    if args.file is None:
+def _source_of(args: argparse.Namespace, recording: Path | None) -> Iterator[Source]:
+    if recording is None:
         bus = bus_layout(args)
         with Bus(bus, can_config(bus, args.interface, args.channel)) as live:
             yield live
         return
     given = given_layout(args)
-    with open_input(args.file, given) as opened:
+    with open_input(recording, given) as opened:
         if given is not None and isinstance(opened, CaptureInput):
             raise UserError(
-                f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out."
+                f"{recording}: is a capture, which holds its own DBC. Leave -c and --dbc out."
             )
         if args.channel is not None:
             opened.select_channel(args.channel)

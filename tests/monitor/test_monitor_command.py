@@ -3,22 +3,25 @@
 import ast
 import inspect
 import json
+import shutil
 import signal
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 from capture_bench import Bench, capture_file, made
-from command_line import Done, run, written
-from simulated_bus import Clock, flight, layout_of, write_log
+from command_line import Done, refused, run, written
+from simulated_bus import START_S, Clock, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import monitor
-from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.keys import CanConfig, shipped
 from kontronik_can_gw.desk import member, sources
 from kontronik_can_gw.desk.monitor import model, screen, watch
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.sources import Recording
+from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
 from kontronik_can_gw.runtime import bus_listener
 
@@ -125,3 +128,143 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
     assert len(late) == len(flight(ONE, 12))
     assert -1e-6 <= min(late) <= max(late) <= 0.11
     assert "END OF FILE" in recording.progress
+
+
+# --- one line of JSON each second
+
+
+def seconds_of(document: dict[str, Any]) -> float:
+    """Unix time of a line."""
+    return datetime.fromisoformat(document["time"]).timestamp()
+
+
+def documents(done: Done) -> list[dict[str, Any]]:
+    assert (done.code, "Traceback" in done.err) == (0, False), done.err
+    return [json.loads(line) for line in done.out.splitlines()]
+
+
+def test_stream_writes_a_line_each_second_of_a_recording(log: Path, clock: Clock) -> None:
+    frames = flight(ONE, 12)
+    found = documents(run("monitor", log, "--stream"))
+    begin = frames[0][0]
+    monitor = model.Monitor(ONE)
+    monitor.advance(begin)
+    waiting = list(frames)
+    for number, one in enumerate(found[:-1], 1):
+        due = begin + number * SECOND_NS
+        while waiting and waiting[0][0] < due:
+            now, frame = waiting.pop(0)
+            monitor.take(frame, now)
+        monitor.advance(due)
+        assert seconds_of(one) == START_S + number
+        assert (
+            one["escs"][0]["values"]
+            == json.loads(json.dumps(monitor.document()))["escs"][0]["values"]
+        )
+        assert one["frames"] == len(frames) - len(waiting)
+    assert len(found) == 12 and found[-1]["frames"] == len(frames)
+    assert {one["problem"] for one in found} == {None}
+
+
+def test_stream_has_no_old_values_in_a_gap_of_a_recording(tmp_path: Path, clock: Clock) -> None:
+    frames = flight(ONE, 4)
+    later = [(now + 60 * SECOND_NS, frame) for now, frame in frames]
+    file = write_log(tmp_path / "gap.log", frames + later)
+    found = documents(run("monitor", file, "--stream", "--speed", 30))
+    voltages = [one["escs"][0]["values"]["battery_voltage"] for one in found]
+    assert len(found) == 64
+    assert all(voltages[:3]) and set(voltages[5:59]) == {None} and all(voltages[60:])
+
+
+def test_stream_of_a_bus_leaves_out_the_seconds_that_it_missed() -> None:
+    class HeldUp(sources.Source):
+        clock = 0
+
+        def pump(self, take: sources.Take, until_s: float) -> None:
+            self.clock += SECOND_NS if self.clock < 2 * SECOND_NS else 3600 * SECOND_NS
+
+        def now(self) -> int:
+            return self.clock
+
+        def wall_ns(self) -> int:
+            return START_S * SECOND_NS + self.clock
+
+    found: list[dict[str, Any]] = []
+    watch.stream(HeldUp("can0", ONE), model.Monitor(ONE), found.append, lambda: len(found) >= 4)
+    assert [seconds_of(one) - START_S for one in found] == [1, 2, 3602, 7202]
+
+
+def test_stream_of_a_bus_goes_on_without_frames_and_gives_the_reason() -> None:
+    class Silent(sources.Source):
+        clock = 0
+
+        def pump(self, take: sources.Take, until_s: float) -> None:
+            self.clock += SECOND_NS // 2
+            self.problem = "" if self.clock <= SECOND_NS else "CAN interface can0: is down."
+
+        def now(self) -> int:
+            return self.clock
+
+        def wall_ns(self) -> int:
+            return START_S * SECOND_NS + self.clock
+
+    found: list[dict[str, Any]] = []
+    source = Silent("can0", ONE)
+    watch.stream(source, model.Monitor(ONE), found.append, lambda: len(found) == 3)
+    assert [one["problem"] for one in found] == [None, *["CAN interface can0: is down."] * 2]
+    assert [one["interface"] for one in found] == ["can0"] * 3
+    assert {value for one in found for value in one["escs"][0]["values"].values()} == {None}
+
+
+# --- a name is an interface's or a recording's
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "channel"),
+    [
+        ("vcan7", (), "vcan7"),  # no file, no interface: the error is about an interface
+        ("lo", (), "lo"),  # an interface, although there is such a file
+        ("bus", ("--interface", "virtual"), "bus"),
+        ("./lo", (), None),
+        ("flight", (), None),
+        ("missing.log", (), None),
+    ],
+)
+def test_a_name_is_an_interface_or_a_recording(
+    name: str, words: tuple[str, ...], channel: str | None, log: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    for file in ("lo", "flight"):
+        shutil.copy(log, tmp_path / file)
+    monkeypatch.chdir(tmp_path)
+    opened: list[str] = []
+
+    def open_bus(_bus: object, config: CanConfig) -> None:
+        opened.append(config.channel)
+        raise RunError("not opened")
+
+    monkeypatch.setattr(monitor, "Bus", open_bus)
+    done = run("monitor", name, "--once", *words)
+    if channel is None:
+        assert opened == []
+        assert done.code == (1 if name == "missing.log" else 0)
+    else:
+        assert (opened, done.code) == ([channel], 1)
+
+
+def test_an_interface_is_named_once() -> None:
+    said = refused(2, "monitor", "vcan7", "--channel", "vcan8")
+    assert said == "--channel vcan8: vcan7 names the interface. Leave one out."
+    assert "is for a recording" in refused(2, "monitor", "vcan7", "--speed", 2)
+
+
+def test_the_interface_of_the_command_line_comes_before_the_configurations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toml = written(tmp_path / "g.toml", '[can]\nchannel = "can3"\n[[esc]]\nport = "x"\n')
+    opened: list[str] = []
+    monkeypatch.setattr(monitor, "Bus", lambda _bus, config: opened.append(config.channel))
+    for words in (("vcan7",), ()):
+        with pytest.raises(TypeError, match="context manager"):
+            run("monitor", *words, "-c", toml)
+    assert opened == ["vcan7", "can3"]

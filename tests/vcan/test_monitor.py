@@ -15,7 +15,7 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
     gateway = start_gateway(configuration(vcan, escs))
     gateway.wait_for_line("esc1: /")
     escs[0].on = True
-    shown = GatewayProcess(None, "--channel", vcan, command="monitor")
+    shown = GatewayProcess(None, vcan, command="monitor")
     out = shown.out
     try:
 

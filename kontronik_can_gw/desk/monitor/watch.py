@@ -1,4 +1,4 @@
-"""Watching a source: a live screen with keys, lines without a terminal, or one document."""
+"""Watching a source: a live screen with keys, lines without a terminal, or documents."""
 
 import contextlib
 import os
@@ -20,6 +20,7 @@ from kontronik_can_gw.desk.monitor.screen import alarms, notices, screen, table_
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.frames import CanFrame
 
 REFRESH_S = 0.15
 _LINES_S = 1.0
@@ -120,16 +121,55 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
             break
         source.pump(monitor.take, now + REFRESH_S)
     monitor.advance(source.now())
-    file, name, wall = monitor.file, source.name, source.wall_ns()
     if not monitor.view.frames and not stopped():
+        file, name = monitor.file, source.name
         if source.is_file:
             raise RunError(f"{name}: holds no frame of {file}. Give its DBC (--dbc).")
         silence = f"no frame of {file} on {name} for {timeout:g} s."
         raise RunError(source.problem or " ".join([silence, *source.hints]))
-    moment = None if wall is None else datetime.fromtimestamp(wall / SECOND, UTC).astimezone()
+    return _document(source, monitor, source.now())
+
+
+def stream(
+    source: Source, monitor: Monitor, write: Callable[[dict[str, Any]], None], stopped: Stopped
+) -> None:
+    """Write a document for each second of the source's clock, and one at the end of a file.
+
+    Seconds of a bus that this process missed, for example while its reader was slow, are left out.
+    """
+    monitor.advance(source.now())
+    due = source.now() + SECOND
+
+    def write_until(now: int) -> None:
+        nonlocal due
+        if not source.is_file and now > due:
+            due += (now - due) // SECOND * SECOND
+        while due <= now:
+            monitor.advance(due)
+            write(_document(source, monitor, due) | {"problem": source.problem or None})
+            due += SECOND
+
+    def take(frame: CanFrame, now: int) -> None:
+        write_until(now)
+        monitor.take(frame, now)
+
+    while not stopped() and not source.ended:
+        source.pump(take, time.monotonic() + REFRESH_S)
+        write_until(source.now())
+    if source.ended:
+        write_until(source.now() + SECOND)
+
+
+def _document(source: Source, monitor: Monitor, now: int) -> dict[str, Any]:
+    """Everything that the monitor has seen up to ``now`` on the source's clock."""
+    wall = source.wall_ns()
+    moment = None
+    if wall is not None:
+        wall -= source.now() - now
+        moment = datetime.fromtimestamp(wall / SECOND, UTC).astimezone()
     return {
         "time": None if moment is None else moment.isoformat(timespec="milliseconds"),
-        "file" if source.is_file else "interface": name,
-        "dbc": file,
+        "file" if source.is_file else "interface": source.name,
+        "dbc": monitor.file,
         **monitor.document(),
     }
