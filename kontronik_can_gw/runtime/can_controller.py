@@ -15,6 +15,11 @@ ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
 ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
 RESTARTED_NS = SECOND
 """A driver may go on reporting bus-off for this long after a restart."""
+UNCONFIRMED_OFF_NS = SECOND
+"""A bus-off of an interface without a controller ends after this time at the latest.
+
+On a virtual bus any participant can send the error frame, and nothing restarts a controller there.
+"""
 
 
 class CanController:
@@ -33,6 +38,7 @@ class CanController:
         self._gateway = gateway
         self._conditions = conditions
         self._runs_since: int | None = None
+        self._off_since = 0
         self._restarted_ns = -RESTARTED_NS
         self._monitor: LinkMonitor | None = None
         if config.interface == "socketcan":
@@ -72,17 +78,17 @@ class CanController:
             self.note(reports[-1], now)
 
     def note_state(self, facts: LinkFacts, port: CanPort, now: int) -> None:
-        """Take over the kernel's state of the controller. A driver may learn of a restart later than its error frames say it."""
+        """Takes over the kernel's state of the controller.
+
+        A driver may learn of a restart later than its error frames report it.
+        """
+        if facts.state is None and self.is_off and now - self._off_since >= UNCONFIRMED_OFF_NS:
+            port.note_state(CanState.ERROR_ACTIVE)
         is_old = facts.state is CanState.BUS_OFF and (
             self.is_off or now - self._restarted_ns < RESTARTED_NS
         )
         if facts.state is not None and facts.state is not port.state and not is_old:
             port.note_state(facts.state)
-
-    @property
-    def loses_frames(self) -> bool:
-        """True in the bus-off of a real controller: what is sent now is lost. (On a vcan error frames are somebody's test.)"""
-        return self.is_off and self.facts is not None and self.facts.state is not None
 
     def follow(self, port: CanPort, now: int) -> None:
         """The port may have another state than the gateway knows: pass it on, log what it means."""
@@ -97,6 +103,7 @@ class CanController:
                 return
             self._restarted_ns, self._runs_since = now, None
         self.is_off = port.state is CanState.BUS_OFF
+        self._off_since = now
         self._gateway.set_can_state(port.state, now)
         name = f"CAN {self._config.channel}"
         if port.state is CanState.BUS_OFF:

@@ -232,11 +232,14 @@ class CanLink:
         return self._stuck.is_stuck(self.port)
 
     def transmit(self, now: int) -> None:
-        """Hand what is to be sent to the interface, as far as it takes it."""
+        """Hands over the frames that are due, as far as the interface takes them.
+
+        In bus-off nothing is handed over: it would be sent late, after the restart, or be lost.
+        """
         frames, port, transmitter = self._gateway.take_frames(now), self.port, self.transmitter
         if frames:
             transmitter.put(frames)
-        if port is None or (self.controller.is_off and self.controller.loses_frames):
+        if port is None or self.controller.is_off:
             if frames:
                 self._gateway.not_sent(now)
             transmitter.clear()

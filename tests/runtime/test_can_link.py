@@ -327,3 +327,64 @@ def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> 
     bench.turn(600)
     assert bench.port is not before and bench.port._ids == before._ids
     assert told(bench.take()) == ["boot-up"]
+
+
+def drone(kernel: Kernel, node_id: int = 42) -> Bench:
+    """A bench whose only output is DroneCAN."""
+    made = Bench.__new__(Bench)
+    table = {"enabled": True, "node_id": node_id}
+    tables = {"dbc": {"enabled": False}, "dronecan": table, "esc": [{"port": "p"}]}
+    loaded = assemble(parse(tables, "test"))
+    made.gateway = Gateway(
+        loaded.escs, loaded.layout, 0, further=[setup.make for setup in loaded.outputs]
+    )
+    made.kernel, made.now, made.clock = kernel, 0, 0
+    made.can = CanLink(
+        *(loaded.config.can, made.gateway, World().poller, FaultLog()), clock=lambda: made.clock
+    )
+    return made
+
+
+@pytest.mark.parametrize("is_drone", [False, True])
+@pytest.mark.parametrize(
+    "facts",
+    [
+        pytest.param(OFF._replace(running=False), id="controller"),
+        pytest.param(ACTIVE._replace(state=None), id="virtual interface"),
+        pytest.param(None, id="no rtnetlink"),
+    ],
+)
+def test_nothing_is_handed_to_the_kernel_in_bus_off(
+    kernel: Kernel, facts: LinkFacts | None, is_drone: bool
+) -> None:
+    made = drone(kernel) if is_drone else Bench(kernel)
+    kernel.facts = None if facts is None else facts._replace(state=facts.state and ACTIVE.state)
+    made.start()
+    made.turn(1500)
+    assert made.take() != []
+    kernel.facts = facts
+    made.error_frame(CanState.BUS_OFF)
+    made.turn(950)
+    made.gateway.receive_bytes(0, encode(LiveData(1, 2442), Layout.V4), made.now, made.now)
+    made.turn(10)
+    assert made.take() == []
+    kernel.facts = None if facts is None else ACTIVE._replace(state=facts.state and ACTIVE.state)
+    made.error_frame(CanState.ERROR_ACTIVE)
+    made.turn(1500)
+    assert made.take() != []
+    made.can.close()
+
+
+def test_a_bus_off_that_somebody_sent_on_a_virtual_bus_ends_after_a_second(kernel: Kernel) -> None:
+    made = Bench(kernel)
+    kernel.facts = ACTIVE._replace(state=None)
+    made.start()
+    made.turn(1500)
+    made.take()
+    made.error_frame(CanState.BUS_OFF)
+    made.turn(950)
+    assert made.take() == []
+    made.turn(300)
+    assert told(made.take())[0] == "boot-up"
+    assert made.gateway.status.can_state is CanState.ERROR_ACTIVE
+    made.can.close()
