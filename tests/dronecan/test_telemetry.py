@@ -10,6 +10,7 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, OperatingState
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.native import load
 
 HOT = OperatingError.POWER_STAGE_OVERTEMP_ERROR
 WARM = OperatingError.POWER_STAGE_OVERTEMP_WARNING
@@ -144,6 +145,25 @@ def test_a_node_says_each_second_that_it_is_there_and_how_the_gateway_is() -> No
     bench.gateway.stop(bench.now)
     bench.take()
     assert [(each.name, each.payload.mode) for each in bench.read] == [("NodeStatus", 7)]
+
+
+@pytest.mark.parametrize("is_pure", [True, False])
+def test_transfer_ids_count_from_0_to_31_for_each_message_of_a_node(
+    is_pure: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A receiver takes a transfer with the id of the one before for a repetition."""
+    monkeypatch.setenv(load.PURE, str(int(is_pure)))
+    load.library.cache_clear()
+    bench = Bench(2, extended_hz=5).run(70)
+    load.library.cache_clear()
+    bench.live[0] = HOT_NOW
+    bench.run(2)
+    for name in ("NodeStatus", "Status", "StatusExtended", "CircuitStatus", "Temperature"):
+        numbers = [each.number for each in bench.of(name)]
+        assert len(numbers) > 64
+        assert numbers == [n % 32 for n in range(len(numbers))], name
+    texts = [each.number for each in bench.of("LogMessage")]
+    assert texts == list(range(len(texts))) != []
 
 
 def test_what_waited_while_the_process_was_held_up_is_made_anew() -> None:

@@ -6,12 +6,14 @@ import os
 from pathlib import Path
 
 import pytest
+from wire_world import Bus, World
 
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime import folders
+from kontronik_can_gw.runtime import can_controller, can_link, folders
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.locks import Locks, Taken, file_name, lock_file
@@ -121,3 +123,54 @@ def test_a_file_name_stands_for_one_lock(name: str) -> None:
     assert "/" not in file_name(name)
     assert len(os.fsencode(file_name(name))) < 250
     assert file_name(name) != file_name(name + "0")
+
+
+def waiting_gateway(monkeypatch: pytest.MonkeyPatch) -> CanLink:
+    """A CANopen gateway whose node waits for LSS, on an interface that opens."""
+    tables = {
+        "can": {"channel": CHANNEL},
+        "dbc": {"enabled": False},
+        "canopen": {"enabled": True, "node_id": 255, "store": "/nowhere"},
+        "esc": [{"port": "p"}],
+    }
+    loaded = assemble(parse(tables, "test"))
+    gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
+    monkeypatch.setattr(can_link, "open_can", lambda _config: Bus(World()))
+    monkeypatch.setattr(can_controller, "link_monitor", lambda _name: None)
+    link = CanLink(loaded.config.can, gateway, World().poller, FaultLog())
+    link.open(0, wait=False)
+    gateway.start(0)
+    return link
+
+
+def assign_node_id(link: CanLink, node_id: int) -> None:
+    """LSS: switch to configuration, configure the node-ID, switch back: the node boots with it."""
+    for data in ("04 01", f"11 {node_id:02x}", "04 00"):
+        request = bytes.fromhex(data).ljust(8, b"\0")
+        link._gateway.receive_frame(CanFrame(0x7E5, request), 0, 0)
+    link._gateway.advance(0)
+    link.follow_ids()
+
+
+def test_a_node_id_that_lss_assigns_while_running_is_locked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    link, other = waiting_gateway(monkeypatch), Locks()
+    assert other.hold(NODES[:1]) == []
+    other.close()
+    assign_node_id(link, 5)
+    assert other.hold(NODES[:1]) == NODES[:1]
+    link.close()
+    assert other.hold(NODES[:1]) == []
+    other.close()
+
+
+def test_a_node_id_of_lss_that_another_gateway_has_is_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    link, other = waiting_gateway(monkeypatch), Locks()
+    assert other.hold(NODES[:1]) == []
+    assign_node_id(link, 5)
+    assert "can0: CANopen node 5: another gateway on this machine sends this." in caplog.text
+    link.close()
+    other.close()
