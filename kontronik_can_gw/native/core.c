@@ -580,7 +580,7 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
 #endif
     if (s->flags & KCG_PLAIN)
         v = x;
-    else if (x > s->most)
+    else if (x > s->most || x < -s->most)
         return s->error;
     else
         v = floor_div(x * s->mul * over + s->add * by, s->div * by);

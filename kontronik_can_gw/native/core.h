@@ -90,7 +90,7 @@ typedef struct {
     uint32_t mask, first_piece, first_pair, pairs;
     uint8_t divisor, length, reserved[6];
     uint64_t not_on;                                             /* set of devices that do not supply it */
-    int64_t mul, add, div, most;                                 /* floor((x * mul * over + add * by) / (div * by)); x above most: Error */
+    int64_t mul, add, div, most;                                 /* floor((x * mul * over + add * by) / (div * by)); |x| above most: Error */
     int64_t low, high;                                           /* of a float: double */
     uint64_t error, not_available;
 } kcg_signal;

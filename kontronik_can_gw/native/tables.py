@@ -6,8 +6,9 @@ runs on the Python core; settings beyond them that a master writes to 2100h leav
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from ctypes import c_uint16, c_uint64
+from dataclasses import replace
 from fractions import Fraction
 from itertools import accumulate
 from typing import Any
@@ -62,6 +63,8 @@ MASK_BITS = 32
 END_OF_TIME = 1 << 61
 """ns: sums of times stay within int64."""
 _LIMIT = 1 << 63
+_MAX_DIGITS = 15
+"""Digits that a factor of a DBC has at most."""
 
 
 class Tables:
@@ -214,27 +217,23 @@ class Tables:
                 self.pairs.append(Pair(int(number), raw & _M64))
             flags |= KCG.TABLE
         if signal.is_float:
-            row.flags = flags | KCG.REAL
-            _scale_float(row, signal, value)
-            return
-        if value.rolls:
-            flags |= KCG.ROLLS
-        if signal.saturates:
-            flags |= KCG.SATURATES
-        if (
-            signal.low <= signal.not_available <= signal.high
-            and signal.error != signal.not_available
-        ):
-            flags |= KCG.CODE_AMID
-        row.low, row.high = max(signal.low, -_LIMIT), min(signal.high, _LIMIT - 1)
-        if value.divisor is Divisor.ONE and signal.slope == 1 and signal.intercept == 0:
-            flags |= KCG.PLAIN
-        elif signal.numbers is None:
-            common = signal.slope.denominator * signal.intercept.denominator
-            mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
-            row.mul, row.add, row.div = _reduced(mul, add, 2 * common)
-            row.most = _most(row, signal, value)
+            flags |= KCG.REAL
+        else:
+            if value.rolls:
+                flags |= KCG.ROLLS
+            if signal.saturates:
+                flags |= KCG.SATURATES
+            has_own_code = signal.error != signal.not_available
+            if has_own_code and signal.low <= signal.not_available <= signal.high:
+                flags |= KCG.CODE_AMID
+            row.low, row.high = max(signal.low, -_LIMIT), min(signal.high, _LIMIT - 1)
         row.flags = flags
+        set_scale = _set_float_scale if signal.is_float else _set_scale
+        try:
+            set_scale(row, signal, value)
+        except NotInCore as error:
+            hint = _fitting_factor(row, signal, value, set_scale)
+            raise NotInCore(f"{error}.{hint}") from None
 
 
 Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
@@ -326,30 +325,79 @@ def _range(row: Any, value: Value) -> tuple[int, int]:
     low = 0 if value.low is None else value.low
     if value.high is not None:
         return low, value.high
-    return low, 1 << 62 if value.kind is Kind.RUN_TIME else MAX_COUNT  # ns; mW s, ms, frames
+    return low, END_OF_TIME if value.kind is Kind.RUN_TIME else MAX_COUNT  # ns; mW s, ms, frames
 
 
-def _most(row: Any, signal: SignalPlan, value: Value) -> int:
-    """The largest number of steps that the core has to multiply: above it the signal is Error. NotInCore if that leaves int64."""
-    low, high = _range(row, value)
+def _set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
+    """Factor and offset of an integer signal. NotInCore if a product leaves 64 bits."""
+    if value.divisor is Divisor.ONE and signal.slope == 1 and signal.intercept == 0:
+        row.flags |= KCG.PLAIN
+        return
+    if signal.numbers is not None:
+        return
+    common = signal.slope.denominator * signal.intercept.denominator
+    mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
+    mul, add, div = _reduced(mul, add, 2 * common)
+    most = _most(row, signal, value, (mul, add, div))
     by, over = _LARGEST_DIVISOR[value.divisor]
-    if high >= MAX_COUNT and not value.rolls:
-        end = signal.high + 1 if row.mul > 0 else signal.low - 1
-        high = min(high, max(0, -(-(end * row.div - row.add) // row.mul)) if row.mul else high)
-    greatest = max(abs(low), abs(high)) * abs(row.mul) * over + abs(row.add) * by
-    if greatest >= _LIMIT or row.div * by >= _LIMIT or row.div <= 0:
-        raise NotInCore("factor and offset leave 64 bits")
-    return high
+    greatest = most * abs(mul) * over + abs(add) * by
+    if greatest >= _LIMIT or div * by >= _LIMIT:
+        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 64 bits")
+    row.mul, row.add, row.div, row.most = mul, add, div, most
 
 
-def _scale_float(row: Any, signal: SignalPlan, value: Value) -> None:
+def _most(row: Any, signal: SignalPlan, value: Value, scale: tuple[int, int, int]) -> int:
+    """The largest absolute number of steps that the core has to multiply.
+
+    Beyond it, in either direction, the signal cannot hold the value whatever its divisor is, and is Error. A counter that rolls over
+    is never too large.
+    """
+    greatest = max(map(abs, _range(row, value)))
+    mul, add, div = scale
+    if value.rolls or not mul:
+        return greatest
+    by, _ = _LARGEST_DIVISOR[value.divisor]
+    above, below = (signal.high + 1) * div - add, add - signal.low * div
+    return min(greatest, by * max(0, above, below) // abs(mul) + 1)
+
+
+def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
+    """Factor, offset and limits of a float signal. NotInCore if a product leaves 63 bits."""
     row.low, row.high = (struct.unpack("<q", struct.pack("<d", end))[0] for end in signal.limits)
     by, over = _LARGEST_DIVISOR[value.divisor]
-    slope: Fraction = signal.slope
-    row.mul, row.div = slope.numerator, slope.denominator
+    mul, div = signal.slope.numerator, signal.slope.denominator
+    greatest = max(map(abs, _range(row, value))) * abs(mul) * over
+    if signal.numbers is None and max(greatest, div * by) >= _LIMIT // 2:
+        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 63 bits")
+    if signal.numbers is None:
+        row.mul, row.div = mul, div
     row.add = struct.unpack("<q", struct.pack("<d", float(signal.intercept)))[0]
     if signal.intercept == 0:
         row.flags |= KCG.PLAIN
-    greatest = max(map(abs, _range(row, value))) * abs(row.mul) * over
-    if signal.numbers is None and max(greatest, row.div * by) >= _LIMIT // 2:
-        raise NotInCore("factor leaves 63 bits")
+
+
+def _fitting_factor(
+    row: Any, signal: SignalPlan, value: Value, set_scale: Callable[..., None]
+) -> str:
+    """A hint that names a factor which the core can express: with fewer digits, or else a coarser one; "" if there is none."""
+    rounded = [f"{float(signal.factor):.{digits}g}" for digits in range(_MAX_DIGITS, 0, -1)]
+    coarser = [Fraction(rounded[-1]) * 10**power for power in range(1, _MAX_DIGITS)]
+    for factor in (*map(Fraction, rounded), *coarser):
+        ratio = signal.factor / factor
+        other = replace(
+            signal,
+            factor=factor,
+            slope=signal.slope * ratio,
+            intercept=signal.intercept * ratio,
+        )
+        try:
+            set_scale(type(row).from_buffer_copy(row), other, value)
+        except NotInCore:
+            continue
+        return f" Factor {_decimal(factor)} fits"
+    return ""
+
+
+def _decimal(number: Fraction) -> str:
+    """A factor as a DBC writes it."""
+    return f"{float(number):.{_MAX_DIGITS}g}"

@@ -1,6 +1,8 @@
 """The core in C gives what the core in Python gives; gcc and clang build it without a warning, for a small machine too."""
 
 import ctypes as c
+import random
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from built import STRICT, built, run_sanitized
 from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
+from kontronik_can_gw.core import PythonCore
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -18,6 +21,8 @@ from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.native.binding import WrongObject, load
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.objects import OPTIONS
+from kontronik_can_gw.native.rows import NotInCore
+from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.plan import Layout, SendType
 
 SEEDS = 16
@@ -38,6 +43,64 @@ def test_both_cores_are_equal_over_a_million_frames(native_library: Any, group: 
     seeds = range(10_000 + group, 10_100, 20)
     counts = [equality.run(native_library, seed, steps=2000, most=30) for seed in seeds]
     assert sum(counts) > 15_000
+
+
+def _scaled(chance: random.Random) -> str:
+    """A message whose signal has a factor that takes many digits and cannot hold all values of its source."""
+    length, is_signed = chance.randint(2, 24), chance.random() < 0.5
+    factor = f"{chance.choice((1, 1, 1, -1)) / chance.choice((3, 7, 255, 1023, 4095)):.8g}"
+    offset = chance.choice(("0", "0", "-40"))
+    sign = "-" if is_signed else "+"
+    signal = f'SG_ S : 0|{length}@1{sign} ({factor},{offset}) [0|0] "" X'
+    return f'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n {signal}\n'
+
+
+SOURCES = {
+    "electrical_speed": (0, 2**32 - 1),
+    "motor_speed": (0, 2**32 - 1),
+    "battery_current": (-(2**15), 2**15 - 1),
+}
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_factor_of_many_digits_is_in_c_and_gives_the_same_frames(
+    native_library: Any, seed: int
+) -> None:
+    """Around the largest value that the core multiplies, around the largest that the signal holds, and at the source's limits."""
+    chance = random.Random(seed)
+    name, (low, high) = chance.choice([*SOURCES.items()])
+    layout = compiled(_scaled(chance), bind={"S": name})
+    escs = [EscSettings("esc1", pole_pairs=chance.choice((1, 7, 255)))]
+    (row,) = Tables(layout, escs).signals
+    ends = [(end * row.div - row.add) // row.mul for end in (row.low, row.high + 1)]
+    steps = {low, high, 0, *(chance.randint(low, high) for _ in range(20))}
+    for middle in (row.most, -row.most, *ends, *(end * escs[0].pole_pairs for end in ends)):
+        steps |= {middle + n for n in range(-2, 3) if low <= middle + n <= high}
+    field = "battery_current" if name == "battery_current" else "electrical_speed"
+    cores = (PythonCore(escs, layout, 0, False), NativeCore(native_library, escs, layout, 0, False))
+    for number, step in enumerate(sorted(steps)):
+        now = number * 10 * MS + MS
+        data = encode(LiveData(**{field: step}), WireLayout.V4)
+        for core in cores:
+            core.receive(0, data, now, now)
+            core.advance(now)
+        python, native = (core.take(now) for core in cores)
+        assert python == native, step
+        assert len(python) == 1
+
+
+def test_a_factor_that_leaves_64_bits_is_named_with_one_that_fits() -> None:
+    """``output_speed`` is divided by pole pairs and gear, which may be large."""
+    text = 'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n SG_ S : 0|32@1+ ({},0) [0|0] "" X\n'
+    escs = [EscSettings("esc1")]
+    refused = compiled(text.format("0.0039215686"), bind={"S": "output_speed"})
+    with pytest.raises(NotInCore) as found:
+        Tables(refused, escs)
+    said = re.fullmatch(
+        r"M\.S: factor 0.0039215686 leaves 64 bits\. Factor (\S+) fits", str(found.value)
+    )
+    assert said is not None, str(found.value)
+    Tables(compiled(text.format(said[1]), bind={"S": "output_speed"}), escs)
 
 
 _COUNTED = """
