@@ -11,6 +11,9 @@ from kontronik_can_gw.capture.format import (
     COUNTERS,
     Entry,
     Kind,
+    check_counters,
+    check_state,
+    check_time,
     read_frame,
     read_json,
     read_numbers,
@@ -89,8 +92,10 @@ class Replay:
 
     def _play(self, entry: Entry) -> list[TimedFrame]:
         now, kind, esc, data, flags, came = entry
+        check_time(now)
         if came is None:
             came = now
+        check_time(came)
         gateway = self.gateway
         if not self._started and kind == Kind.ADVANCE:  # the beginning of the run is missing
             self._midway = True
@@ -111,8 +116,8 @@ class Replay:
             gateway.stop(now)
             self._take(now)
         elif kind == Kind.COUNTERS:
-            if len(counters := read_numbers(data)) != len(COUNTERS):
-                raise ValueError("has other counters")
+            counters = read_numbers(data)
+            check_counters(counters)
             for name, value in zip(COUNTERS, counters, strict=True):
                 setattr(gateway.status, name, value)
         elif kind == Kind.LINE_ERRORS:
@@ -122,7 +127,9 @@ class Replay:
         elif kind == Kind.STATE:
             if self._midway:
                 self._midway = False
-                self._take_up(read_json(data))
+                state = read_json(data)
+                check_state(state)
+                self._take_up(state)
         elif kind != Kind.CLOCK:
             _RARE[kind](gateway, entry)
         return []

@@ -19,7 +19,14 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
+from kontronik_can_gw.capture.format import (
+    END_OF_TIME,
+    FORMAT,
+    VERSION,
+    VERSIONS,
+    check_state,
+    whole_number,
+)
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.prepare import prepare
@@ -178,8 +185,8 @@ def _output(name: str, found: Mapping[str, Any], escs: Sequence[EscSettings]) ->
     if name not in OUTPUTS:
         raise ValueError(f"{str(name)[:40]!r} is no output that this version knows")
     table = getattr(parse({name: found["table"], "esc": [{"port": "-"}]}, "the capture"), name)
-    identity, seed = bytes.fromhex(found["identity"]), _number(found["seed"], 0, _SEEDS)
-    major, minor = (_number(each, 0, 255) for each in found["version"])
+    identity, seed = bytes.fromhex(found["identity"]), whole_number(found["seed"], 0, _SEEDS)
+    major, minor = (whole_number(each, 0, 255) for each in found["version"])
     return setup_of(name, Given(table, identity, (major, minor), seed), escs)
 
 
@@ -199,24 +206,16 @@ def _esc_json(esc: EscSettings) -> dict[str, Any]:
 def _esc(found: Mapping[str, Any]) -> EscSettings:
     """Settings of an ESC, within the ranges of the configuration or those that a master may write."""
     numerator, _, denominator = found["gear"].partition("/")
-    gear = Fraction(_number(numerator, 1, 10**12), _number(denominator or "1", 1, 10**12))
+    gear = Fraction(whole_number(numerator, 1, 10**12), whole_number(denominator or "1", 1, 10**12))
     return EscSettings(
         _text(found["name"], 12),
-        _number(found["pole_pairs"], 1, 0xFFFF),
+        whole_number(found["pole_pairs"], 1, 0xFFFF),
         gear,
-        _number(found["cell_count"], 0, 255),
-        _number(found["timeout_ns"], MS, 65_536 * MS),
-        _number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
+        whole_number(found["cell_count"], 0, 255),
+        whole_number(found["timeout_ns"], MS, 65_536 * MS),
+        whole_number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
         protocol_named(found.get("protocol")).name,  # not in captures of 0.5.0
     )
-
-
-def _number(value: Any, low: int, high: int) -> int:
-    if isinstance(value, str) and len(value) < 20 and value.isdecimal():
-        value = int(value)
-    if type(value) is not int or not low <= value <= high:
-        raise ValueError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
-    return value
 
 
 def _text(value: Any, longest: int) -> str:
@@ -227,12 +226,16 @@ def _text(value: Any, longest: int) -> str:
 
 def _check(header: Header) -> None:
     """Check the parts that readers use unchanged. ValueError for what a recorder never writes."""
-    for name in ("monotonic_ns", "wall_ns", "created_ns"):
+    for name, latest in (
+        ("monotonic_ns", END_OF_TIME - 1),
+        ("created_ns", END_OF_TIME - 1),
+        ("wall_ns", _LATEST),
+    ):
         if header.get(name) is not None:
-            _number(header[name], 0, _LATEST)
+            whole_number(header[name], 0, latest)
     for name in ("run", "file"):
         _text(header.get(name, ""), 4096)
-    _number(header.get("part", 0), 0, 1 << 32)
+    whole_number(header.get("part", 0), 0, 1 << 32)
     for name, kind in _KINDS.items():
         if not isinstance(header.get(name, kind()), kind):
             raise ValueError(f"{name} is not as a recorder writes it")
@@ -241,28 +244,18 @@ def _check(header: Header) -> None:
     check_state(header.get("state", {}))
 
 
-def check_state(state: Mapping[str, Any]) -> None:
-    """ValueError for an impossible state."""
-    for esc in state.get("escs", ()):
-        for name in ("energy", "run_time", "losses"):
-            _number(esc[name], 0, 1 << 100)
-    for name, high in (("started_ns", _LATEST), ("can_state", 5)):
-        if name in state:
-            _number(state[name], 0, high)
-
-
 def _node(found: Mapping[str, Any]) -> "NodeSettings":
     from kontronik_can_gw.canopen.node_settings import NodeSettings
 
     device, vendor = found["device"], found["vendor_id"]
     return NodeSettings(
-        _number(found["node_id"], 1, 255),
-        _number(found["serial"], 0, 0xFFFF_FFFF),
-        None if vendor is None else _number(vendor, 0, 0xFFFF_FFFF),
+        whole_number(found["node_id"], 1, 255),
+        whole_number(found["serial"], 0, 0xFFFF_FFFF),
+        None if vendor is None else whole_number(vendor, 0, 0xFFFF_FFFF),
         bool(found["self_start"]),
         bool(found["read_only"]),
-        _number(found["bitrate"], 1, 100_000_000),
-        _number(found["segment_ns"], 0, _LATEST),
+        whole_number(found["bitrate"], 1, 100_000_000),
+        whole_number(found["segment_ns"], 0, _LATEST),
         _text(found["version"], 100),
-        None if device is None else _number(device, 0, 0xFFFF),
+        None if device is None else whole_number(device, 0, 0xFFFF),
     )

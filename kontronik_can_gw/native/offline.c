@@ -5,6 +5,7 @@
 #define MS INT64_C(1000000)
 #define SECOND (1000 * MS)
 #define END_OF_TIME (INT64_C(1) << 61)
+#define MAX_COUNT (INT64_C(1) << 48)
 #define SAME_ROW (5 * MS)
 #define GATEWAY_EACH (100 * MS)
 enum { BYTES = 1, FRAME = 2, ADVANCE = 3, COUNTERS = 14, NOT_SENT = 18 }; /* capture/format.py, Kind */
@@ -154,6 +155,17 @@ int kcg_is_intact(const uint8_t *p, size_t size)
     return at == size;
 }
 
+/* Whether a COUNTERS entry holds what a gateway can have counted (twin: capture/format.py, check_counters). */
+static int are_counters(const uint8_t *data, uint32_t length)
+{
+    if (length != COUNTERS_COUNT * TIME || u64(data + (COUNTERS_COUNT - 1) * TIME) >= END_OF_TIME)
+        return 0;
+    for (int k = 0; k < COUNTERS_COUNT - 1; k++)
+        if (u64(data + k * TIME) >= MAX_COUNT)
+            return 0;
+    return 1;
+}
+
 int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
 {
     uint32_t count = u32(p);
@@ -176,7 +188,7 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
                 return KCG_IS_FULL;
             advance(o, now);
             o->core->gateway[SENT_FRAMES] += o->count - before;
-        } else if (kind == COUNTERS && length == COUNTERS_COUNT * TIME) {
+        } else if (kind == COUNTERS && are_counters(data, length)) {
             for (int k = 0; k < COUNTERS_COUNT; k++)
                 o->core->gateway[SENT_FRAMES + k] = (int64_t)u64(data + k * TIME);
         } else if (kind == NOT_SENT) {

@@ -1,0 +1,105 @@
+"""Numbers in a capture that no gateway has are rejected, the same with both cores, and none leaves 64 bits in the core in C."""
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+from capture_bench import START, Bench, capture, made
+
+from kontronik_can_gw.capture.format import (
+    COUNTERS,
+    END_OF_TIME,
+    MAX_COUNT,
+    Entry,
+    Kind,
+    check_state,
+    numbers_data,
+)
+from kontronik_can_gw.capture.replay import Replay
+from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.errors import UserError
+
+GOOD = {
+    "escs": [{"energy": 5, "run_time": 6, "losses": 7}],
+    "can_state": 1,
+    "started_ns": START,
+}
+
+
+def _with(name: str, number: int) -> dict[str, Any]:
+    if name in ("energy", "run_time", "losses"):
+        return GOOD | {"escs": [GOOD["escs"][0] | {name: number}]}  # type: ignore[index]
+    return GOOD | {name: number}
+
+
+LIMITS = {
+    "energy": MAX_COUNT * 10**9,
+    "run_time": END_OF_TIME - 1,
+    "losses": MAX_COUNT - 1,
+    "started_ns": END_OF_TIME - 1,
+    "can_state": 5,
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_state_that_no_gateway_has_is_refused_in_header_and_entry(
+    name: str, tmp_path: Path
+) -> None:
+    check_state(_with(name, LIMITS[name]))
+    for number in (LIMITS[name] + 1, 1 << 100, -1):
+        with pytest.raises(ValueError, match="is not a whole number"):
+            check_state(_with(name, number))
+    bench = Bench(*made(1)).live(1, 0.5)
+    bad = capture(tmp_path / "bad.kcap", bench.setup, bench.entries, state=_with(name, 1 << 100))
+    with pytest.raises(UserError), open_input(bad):
+        pass
+
+
+@pytest.mark.parametrize("started_ns", [END_OF_TIME, (1 << 63) - 1, 1 << 63, (1 << 64) - 1])
+def test_counters_that_no_gateway_has_are_rejected_and_change_nothing(started_ns: int) -> None:
+    bench = Bench(*made(1)).live(1, 0.5)
+    counters = [3] * (len(COUNTERS) - 1)
+    good = numbers_data(*counters, START - 77)
+    now = bench.entries[-1].time_ns
+    gateway = bench.setup.gateway(bench.layout, START)
+    replay = Replay(gateway)
+    for bad in (numbers_data(*counters, started_ns), numbers_data(*counters[1:], MAX_COUNT, START)):
+        [*replay.follow([Entry(now, Kind.COUNTERS, 0, good), Entry(now, Kind.COUNTERS, 0, bad)])]
+    assert replay.rejected == 2
+    assert gateway.status.started_ns == START - 77
+    assert gateway.status.sent_frames == 3
+
+
+@pytest.mark.parametrize("time_ns", [END_OF_TIME, (1 << 63) - 1])
+def test_a_time_that_no_gateway_has_is_rejected(time_ns: int) -> None:
+    bench = Bench(*made(1)).live(1, 0.5)
+    replay = Replay(bench.setup.gateway(bench.layout, START))
+    [*replay.follow(bench.entries)]
+    [
+        *replay.follow(
+            [Entry(time_ns, Kind.ADVANCE), Entry(START, Kind.BYTES, data=b"K", came_ns=time_ns)]
+        )
+    ]
+    assert replay.rejected == 2
+
+
+def test_rows_of_a_capture_with_such_counters_are_those_of_python(
+    native_library: Any, tmp_path: Path
+) -> None:
+    """The uptime in a table is computed from ``started_ns``."""
+    from offline_equality import core
+
+    bench = Bench(*made(1)).live(1, 1)
+    half = len(bench.entries) // 2
+    now = bench.entries[half].time_ns
+    data = struct.pack("<8Q", 9, 9, 9, 9, 9, 9, 9, (1 << 63) - 1)
+    entries = [*bench.entries[:half], Entry(now, Kind.COUNTERS, 0, data), *bench.entries[half:]]
+    path = capture(tmp_path / "far.kcap", bench.setup, entries)
+    found = []
+    for library in (native_library, None):
+        with core(library), open_input(path) as recording:
+            found.append([*recording.samples()])
+            assert any("make no sense" in text for text in recording.damage)
+    assert found[0] == found[1]
+    assert len(found[0]) > 20
