@@ -11,13 +11,11 @@ from kontronik_can_gw.capture.format import (
     COUNTERS,
     Entry,
     Kind,
-    check_counters,
-    check_state,
-    check_time,
     read_frame,
     read_json,
     read_numbers,
 )
+from kontronik_can_gw.capture.limits import check_counters, check_state, check_time
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState, GatewayState

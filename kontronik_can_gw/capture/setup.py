@@ -19,14 +19,8 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.capture.format import (
-    END_OF_TIME,
-    FORMAT,
-    VERSION,
-    VERSIONS,
-    check_state,
-    whole_number,
-)
+from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
+from kontronik_can_gw.capture.limits import END_OF_TIME, check_state, whole_number
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.prepare import prepare

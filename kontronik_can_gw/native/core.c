@@ -580,9 +580,10 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
 #endif
     if (s->flags & KCG_PLAIN)
         v = x;
-    else if (x > s->most || x < -s->most)
-        return s->error;
-    else
+    else if (x > s->most || x < -s->most) {
+        int is_below = (x < 0) == (s->mul > 0);
+        return s->flags & KCG_SATURATES && is_below ? (uint64_t)s->low : s->error;
+    } else
         v = floor_div(x * s->mul * over + s->add * by, s->div * by);
     if (s->flags & KCG_ROLLS)
         return (uint64_t)v % ((uint64_t)s->high + 1);

@@ -12,9 +12,10 @@ from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, held_settings
+from kontronik_can_gw.native.scale import END_OF_TIME
 from kontronik_can_gw.native.slots import NativeSlot, merge, reserve
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
-from kontronik_can_gw.native.tables import END_OF_TIME, Tables
+from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout

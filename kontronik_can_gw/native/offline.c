@@ -155,7 +155,7 @@ int kcg_is_intact(const uint8_t *p, size_t size)
     return at == size;
 }
 
-/* Whether a COUNTERS entry holds what a gateway can have counted (twin: capture/format.py, check_counters). */
+/* Whether a COUNTERS entry holds what a gateway can have counted (twin: capture/limits.py, check_counters). */
 static int are_counters(const uint8_t *data, uint32_t length)
 {
     if (length != COUNTERS_COUNT * TIME || u64(data + (COUNTERS_COUNT - 1) * TIME) >= END_OF_TIME)

@@ -1,15 +1,12 @@
 """Compiled messages -> the tables of the core in C (core.h, kcg_plan), in this machine's layout. NotInCore for what it cannot express.
 
-The proofs are here: no product leaves int64, whatever value comes and whatever settings within the limits below. What cannot be proven
+The proofs are in scale.py: no product leaves int64, whatever value comes and whatever settings within the limits. What cannot be proven
 runs on the Python core; settings beyond them that a master writes to 2100h leave the speeds that they divide not available.
 """
 
-import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from ctypes import c_uint16, c_uint64
-from dataclasses import replace
-from fractions import Fraction
 from itertools import accumulate
 from typing import Any
 
@@ -24,8 +21,6 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
     GATEWAY,
-    MAX_GEAR,
-    MAX_POLES,
     Message,
     NotInCore,
     Pair,
@@ -34,14 +29,12 @@ from kontronik_can_gw.native.rows import (
     Signal,
     settings_of,
 )
+from kontronik_can_gw.native.scale import END_OF_TIME, set_scale
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 WIRE = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32}
-_TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
 ALL_ESCS = 255
-MAX_COUNT = 1 << 48
-"""Of a counter or an integral: at 1 Mbit/s more than a human life."""
 MAX_ROWS = 0xFFFF
 """Of a table that is addressed by 16 bits."""
 MAX_ALIVE, MAX_BITS = 1 << 16, 64
@@ -51,20 +44,9 @@ _DIVISORS = {
     Divisor.OUTPUT: KCG.BY_OUTPUT,
     Divisor.CELLS: KCG.BY_CELLS,
 }
-_LARGEST_DIVISOR = {
-    Divisor.ONE: (1, 1),
-    Divisor.POLE_PAIRS: (MAX_POLES, 1),
-    Divisor.OUTPUT: (MAX_POLES * MAX_GEAR, MAX_GEAR),
-    Divisor.CELLS: (255, 1),
-}
 _M64 = (1 << 64) - 1
 MASK_BITS = 32
-"""Of kcg_signal.mask."""
-END_OF_TIME = 1 << 61
-"""ns: sums of times stay within int64."""
-_LIMIT = 1 << 63
-_MAX_DIGITS = 15
-"""Digits that a factor of a DBC has at most."""
+"""Bits of kcg_signal.mask."""
 
 
 class Tables:
@@ -216,24 +198,8 @@ class Tables:
             for number, raw in signal.numbers.items():
                 self.pairs.append(Pair(int(number), raw & _M64))
             flags |= KCG.TABLE
-        if signal.is_float:
-            flags |= KCG.REAL
-        else:
-            if value.rolls:
-                flags |= KCG.ROLLS
-            if signal.saturates:
-                flags |= KCG.SATURATES
-            has_own_code = signal.error != signal.not_available
-            if has_own_code and signal.low <= signal.not_available <= signal.high:
-                flags |= KCG.CODE_AMID
-            row.low, row.high = max(signal.low, -_LIMIT), min(signal.high, _LIMIT - 1)
         row.flags = flags
-        set_scale = _set_float_scale if signal.is_float else _set_scale
-        try:
-            set_scale(row, signal, value)
-        except NotInCore as error:
-            hint = _fitting_factor(row, signal, value, set_scale)
-            raise NotInCore(f"{error}.{hint}") from None
+        set_scale(row, signal, value)
 
 
 Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
@@ -307,97 +273,3 @@ def _constants(plan: MessagePlan, page: int | None, words: int) -> list[int]:
         elif signal.role is Role.MULTIPLEXER and page is not None:
             bits |= place(signal.pieces, page)
     return [bits >> 64 * word & _M64 for word in range(words)]
-
-
-def _reduced(mul: int, add: int, div: int) -> tuple[int, int, int]:
-    """The same quotient with smaller numbers: floor((x * mul + add) / div)."""
-    by = math.gcd(mul, add, div)
-    return mul // by, add // by, div // by
-
-
-def _range(row: Any, value: Value) -> tuple[int, int]:
-    """Of the steps, before any divisor."""
-    if row.kind in (KCG.OF_LIVE, KCG.OF_INFO, KCG.OF_LAST):
-        return _TYPE_RANGES[row.wire]
-    if row.kind == KCG.OF_DIRECTED:
-        largest = max(map(abs, _TYPE_RANGES[row.wire]))
-        return -largest, largest
-    low = 0 if value.low is None else value.low
-    if value.high is not None:
-        return low, value.high
-    return low, END_OF_TIME if value.kind is Kind.RUN_TIME else MAX_COUNT  # ns; mW s, ms, frames
-
-
-def _set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
-    """Factor and offset of an integer signal. NotInCore if a product leaves 64 bits."""
-    if value.divisor is Divisor.ONE and signal.slope == 1 and signal.intercept == 0:
-        row.flags |= KCG.PLAIN
-        return
-    if signal.numbers is not None:
-        return
-    common = signal.slope.denominator * signal.intercept.denominator
-    mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
-    mul, add, div = _reduced(mul, add, 2 * common)
-    most = _most(row, signal, value, (mul, add, div))
-    by, over = _LARGEST_DIVISOR[value.divisor]
-    greatest = most * abs(mul) * over + abs(add) * by
-    if greatest >= _LIMIT or div * by >= _LIMIT:
-        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 64 bits")
-    row.mul, row.add, row.div, row.most = mul, add, div, most
-
-
-def _most(row: Any, signal: SignalPlan, value: Value, scale: tuple[int, int, int]) -> int:
-    """The largest absolute number of steps that the core has to multiply.
-
-    Beyond it, in either direction, the signal cannot hold the value whatever its divisor is, and is Error. A counter that rolls over
-    is never too large.
-    """
-    greatest = max(map(abs, _range(row, value)))
-    mul, add, div = scale
-    if value.rolls or not mul:
-        return greatest
-    by, _ = _LARGEST_DIVISOR[value.divisor]
-    above, below = (signal.high + 1) * div - add, add - signal.low * div
-    return min(greatest, by * max(0, above, below) // abs(mul) + 1)
-
-
-def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
-    """Factor, offset and limits of a float signal. NotInCore if a product leaves 63 bits."""
-    row.low, row.high = (struct.unpack("<q", struct.pack("<d", end))[0] for end in signal.limits)
-    by, over = _LARGEST_DIVISOR[value.divisor]
-    mul, div = signal.slope.numerator, signal.slope.denominator
-    greatest = max(map(abs, _range(row, value))) * abs(mul) * over
-    if signal.numbers is None and max(greatest, div * by) >= _LIMIT // 2:
-        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 63 bits")
-    if signal.numbers is None:
-        row.mul, row.div = mul, div
-    row.add = struct.unpack("<q", struct.pack("<d", float(signal.intercept)))[0]
-    if signal.intercept == 0:
-        row.flags |= KCG.PLAIN
-
-
-def _fitting_factor(
-    row: Any, signal: SignalPlan, value: Value, set_scale: Callable[..., None]
-) -> str:
-    """A hint that names a factor which the core can express: with fewer digits, or else a coarser one; "" if there is none."""
-    rounded = [f"{float(signal.factor):.{digits}g}" for digits in range(_MAX_DIGITS, 0, -1)]
-    coarser = [Fraction(rounded[-1]) * 10**power for power in range(1, _MAX_DIGITS)]
-    for factor in (*map(Fraction, rounded), *coarser):
-        ratio = signal.factor / factor
-        other = replace(
-            signal,
-            factor=factor,
-            slope=signal.slope * ratio,
-            intercept=signal.intercept * ratio,
-        )
-        try:
-            set_scale(type(row).from_buffer_copy(row), other, value)
-        except NotInCore:
-            continue
-        return f" Factor {_decimal(factor)} fits"
-    return ""
-
-
-def _decimal(number: Fraction) -> str:
-    """A factor as a DBC writes it."""
-    return f"{float(number):.{_MAX_DIGITS}g}"

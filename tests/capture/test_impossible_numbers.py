@@ -7,15 +7,8 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, capture, made
 
-from kontronik_can_gw.capture.format import (
-    COUNTERS,
-    END_OF_TIME,
-    MAX_COUNT,
-    Entry,
-    Kind,
-    check_state,
-    numbers_data,
-)
+from kontronik_can_gw.capture.format import COUNTERS, Entry, Kind, numbers_data
+from kontronik_can_gw.capture.limits import END_OF_TIME, MAX_COUNT, check_state
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.errors import UserError

@@ -1,0 +1,50 @@
+"""Limits of the numbers in a capture: a damaged or hostile one can hold anything."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from kontronik_can_gw.capture.format import COUNTERS
+
+END_OF_TIME = 1 << 61
+"""ns. Later times are not from a gateway; sums of earlier ones stay within 64 bits."""
+MAX_COUNT = 1 << 48
+"""Of a counter, and of mW s: at 1 Mbit/s more than a human life."""
+_MAX_MW_NS = MAX_COUNT * 1_000_000_000
+
+
+def check_time(time_ns: int) -> None:
+    """ValueError for a time that no gateway has."""
+    if not 0 <= time_ns < END_OF_TIME:
+        raise ValueError(f"time {time_ns}")
+
+
+def check_counters(counters: Sequence[int]) -> None:
+    """ValueError for numbers that a COUNTERS entry of a gateway cannot hold."""
+    if len(counters) != len(COUNTERS):
+        raise ValueError("has other counters")
+    check_time(counters[-1])
+    if max(counters[:-1]) >= MAX_COUNT:
+        raise ValueError(f"counter {max(counters[:-1])}")
+
+
+def whole_number(value: Any, low: int, high: int) -> int:
+    """A number of a header. ValueError if it is none from ``low`` to ``high``."""
+    if isinstance(value, str) and len(value) < 20 and value.isdecimal():
+        value = int(value)
+    if type(value) is not int or not low <= value <= high:
+        raise ValueError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
+    return value
+
+
+_LIMITS_OF_ESC = {"energy": _MAX_MW_NS, "run_time": END_OF_TIME - 1, "losses": MAX_COUNT - 1}
+_LIMITS_OF_GATEWAY = {"started_ns": END_OF_TIME - 1, "can_state": 5}
+
+
+def check_state(state: Mapping[str, Any]) -> None:
+    """ValueError for a state (in a header, or a STATE entry) that no gateway has."""
+    for esc in state.get("escs", ()):
+        for name, high in _LIMITS_OF_ESC.items():
+            whole_number(esc[name], 0, high)
+    for name, high in _LIMITS_OF_GATEWAY.items():
+        if name in state:
+            whole_number(state[name], 0, high)

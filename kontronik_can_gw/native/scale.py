@@ -1,0 +1,144 @@
+"""Factor and offset of a signal as numbers of the core in C, with the proof that no product leaves 64 bits."""
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+from kontronik_can_gw.esc.values import Divisor, Kind, Value
+from kontronik_can_gw.native.header import KCG
+from kontronik_can_gw.native.rows import MAX_GEAR, MAX_POLES, NotInCore
+from kontronik_can_gw.signals.plan import SignalPlan
+
+_TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
+MAX_COUNT = 1 << 48
+"""Of a counter or an integral: at 1 Mbit/s more than a human life."""
+_LARGEST_DIVISOR = {
+    Divisor.ONE: (1, 1),
+    Divisor.POLE_PAIRS: (MAX_POLES, 1),
+    Divisor.OUTPUT: (MAX_POLES * MAX_GEAR, MAX_GEAR),
+    Divisor.CELLS: (255, 1),
+}
+END_OF_TIME = 1 << 61
+"""ns: sums of times stay within int64."""
+_LIMIT = 1 << 63
+_MAX_DIGITS = 15
+"""Digits that a factor of a DBC has at most."""
+
+
+def set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
+    """Fill in factor, offset and limits of a row. NotInCore, with a factor that fits, if a product can leave 64 bits."""
+    if signal.is_float:
+        set_one = _set_float_scale
+        row.flags |= KCG.REAL
+    else:
+        set_one = _set_integer_scale
+        if value.rolls:
+            row.flags |= KCG.ROLLS
+        if signal.saturates:
+            row.flags |= KCG.SATURATES
+        has_own_code = signal.error != signal.not_available
+        if has_own_code and signal.low <= signal.not_available <= signal.high:
+            row.flags |= KCG.CODE_AMID
+        row.low, row.high = max(signal.low, -_LIMIT), min(signal.high, _LIMIT - 1)
+    try:
+        set_one(row, signal, value)
+    except NotInCore as error:
+        hint = _fitting_factor(row, signal, value, set_one)
+        raise NotInCore(f"{error}.{hint}") from None
+
+
+def _reduced(mul: int, add: int, div: int) -> tuple[int, int, int]:
+    """The same quotient with smaller numbers: floor((x * mul + add) / div)."""
+    by = math.gcd(mul, add, div)
+    return mul // by, add // by, div // by
+
+
+def _range(row: Any, value: Value) -> tuple[int, int]:
+    """Of the steps, before any divisor."""
+    if row.kind in (KCG.OF_LIVE, KCG.OF_INFO, KCG.OF_LAST):
+        return _TYPE_RANGES[row.wire]
+    if row.kind == KCG.OF_DIRECTED:
+        largest = max(map(abs, _TYPE_RANGES[row.wire]))
+        return -largest, largest
+    low = 0 if value.low is None else value.low
+    if value.high is not None:
+        return low, value.high
+    return low, END_OF_TIME if value.kind is Kind.RUN_TIME else MAX_COUNT  # ns; mW s, ms, frames
+
+
+def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:
+    """Factor and offset of an integer signal. NotInCore if a product leaves 64 bits."""
+    if value.divisor is Divisor.ONE and signal.slope == 1 and signal.intercept == 0:
+        row.flags |= KCG.PLAIN
+        return
+    if signal.numbers is not None:
+        return
+    common = signal.slope.denominator * signal.intercept.denominator
+    mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
+    mul, add, div = _reduced(mul, add, 2 * common)
+    most = _most(row, signal, value, (mul, add, div))
+    by, over = _LARGEST_DIVISOR[value.divisor]
+    greatest = most * abs(mul) * over + abs(add) * by
+    if greatest >= _LIMIT or div * by >= _LIMIT:
+        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 64 bits")
+    row.mul, row.add, row.div, row.most = mul, add, div, most
+
+
+def _most(row: Any, signal: SignalPlan, value: Value, scale: tuple[int, int, int]) -> int:
+    """The largest absolute number of steps that the core has to multiply.
+
+    Beyond it, in either direction, the signal cannot hold the value whatever its divisor is, and is Error. A counter that rolls over
+    is never too large.
+    """
+    greatest = max(map(abs, _range(row, value)))
+    mul, add, div = scale
+    if value.rolls or not mul:
+        return greatest
+    by, _ = _LARGEST_DIVISOR[value.divisor]
+    above, below = (signal.high + 1) * div - add, add - signal.low * div
+    return min(greatest, by * max(0, above, below) // abs(mul) + 1)
+
+
+def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
+    """Factor, offset and limits of a float signal. NotInCore if a product leaves 63 bits."""
+    row.low, row.high = (struct.unpack("<q", struct.pack("<d", end))[0] for end in signal.limits)
+    by, over = _LARGEST_DIVISOR[value.divisor]
+    mul, div = signal.slope.numerator, signal.slope.denominator
+    greatest = max(map(abs, _range(row, value))) * abs(mul) * over
+    if signal.numbers is None and max(greatest, div * by) >= _LIMIT // 2:
+        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 63 bits")
+    if signal.numbers is None:
+        row.mul, row.div = mul, div
+    row.add = struct.unpack("<q", struct.pack("<d", float(signal.intercept)))[0]
+    if signal.intercept == 0:
+        row.flags |= KCG.PLAIN
+
+
+def _fitting_factor(
+    row: Any, signal: SignalPlan, value: Value, set_one: Callable[..., None]
+) -> str:
+    """A hint that names a factor which the core can express: with fewer digits, or else a coarser one; "" if there is none."""
+    rounded = [f"{float(signal.factor):.{digits}g}" for digits in range(_MAX_DIGITS, 0, -1)]
+    coarser = [Fraction(rounded[-1]) * 10**power for power in range(1, _MAX_DIGITS)]
+    for factor in (*map(Fraction, rounded), *coarser):
+        ratio = signal.factor / factor
+        other = replace(
+            signal,
+            factor=factor,
+            slope=signal.slope * ratio,
+            intercept=signal.intercept * ratio,
+        )
+        try:
+            set_one(type(row).from_buffer_copy(row), other, value)
+        except NotInCore:
+            continue
+        return f" Factor {_decimal(factor)} fits"
+    return ""
+
+
+def _decimal(number: Fraction) -> str:
+    """A factor as a DBC writes it."""
+    return f"{float(number):.{_MAX_DIGITS}g}"
