@@ -93,21 +93,28 @@ def test_a_request_to_send_is_not_a_second_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "expected"),
+    ("block", "first", "expected"),
     [
-        ("36942.900000", "10:15:42.900"),  # since midnight
-        ("36900.000000", "10:15:00.000"),  # since midnight, before the date of the head
-        ("0.500000", "10:15:42.900"),
-        ("1200.000000", "10:35:42.400"),
+        ("10:15:42.400 AM", "36942.900000", "10:15:42.900"),  # since midnight
+        ("10:15:42.400 AM", "36900.000000", "10:15:00.000"),  # before the beginning of the block
+        ("10:15:42.400 AM", "0.500000", "10:15:42.900"),
+        ("10:15:42.400 AM", "1200.000000", "10:35:42.400"),  # nothing came for 20 min
+        ("10:20:42.400 AM", "297.000000", "10:20:39.400"),  # since the date; a trigger came later
+        ("10:16:12.400 AM", "0.250000", "10:16:12.650"),  # since the beginning of the block
     ],
 )
-def test_times_may_count_from_midnight(tmp_path: Path, first: str, expected: str) -> None:
-    path = tmp_path / "midnight.asc"
+def test_times_count_from_the_moment_that_fits(
+    tmp_path: Path, block: str, first: str, expected: str
+) -> None:
+    path = tmp_path / "start.asc"
     later = f"{float(first) + 0.01:.6f}"
-    found = _read(path, f"{first} 1  688   Rx   d 1 11", f"{later} 1  688   Rx   d 1 22")
-    assert found[1][0] - found[0][0] == 10
+    begin = f"Begin Triggerblock Tue Mar 07 {block} 2023\n"
+    frames = [f"   {at} 1  688   Rx   d 1 11\n" for at in (first, later)]
+    path.write_text(HEAD.format("hex") + begin + "".join(frames))
     clock = datetime.strptime(f"2023-03-07 {expected}", "%Y-%m-%d %H:%M:%S.%f")  # noqa: DTZ007
     with opened(path) as log:
-        wall_ns = log.wall_ns(next(log.frames()).time_ns)
+        found = list(log.frames())
+        wall_ns = log.wall_ns(found[0].time_ns)
+    assert found[1].time_ns - found[0].time_ns == 10 * MS
     assert wall_ns is not None
     assert wall_ns // MS == round(clock.timestamp() * 1000)

@@ -7,6 +7,7 @@ from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
@@ -134,7 +135,8 @@ class Monitor:
         self.frame_rate: float | None = None
         """Frames of the layout in the last second; None during the first one."""
         self._start: int | None = None
-        self._now = 0
+        self._now = -LATEST_NS
+        """Times before the trigger of a log are negative."""
         self._second = (0, 0)
         """Begin of the present second, and the number of frames then."""
         parts = self.view.reader.parts

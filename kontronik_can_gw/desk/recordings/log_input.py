@@ -119,6 +119,8 @@ class CanLogInput(Input):
         before = None
         try:
             for item in clock.frames():
+                if before is None and item.time_ns >= text.OLDEST_WALL_S * text.SECOND_NS:
+                    self._reader.wall_start_ns = 0  # Unix times, whatever the head states
                 if item.channel != before:
                     before = item.channel
                     self._channels[before] = None

@@ -301,6 +301,8 @@ def part_of(
     if (first := next(filled, None)) is None:
         return None
     origin_ns = time_at(first, 0)
+    if isinstance(first, list):  # frames of a log, which may be out of order
+        origin_ns = min(item.time_ns for item in first)
     low = -LATEST_NS if start_ns is None else origin_ns + start_ns
     high = LATEST_NS if end_ns is None else origin_ns + end_ns
     wanted = takewhile(

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
-from kontronik_can_gw.desk.recordings.recording import Sample
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Sample
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.esc.values import Kind as How
@@ -147,7 +147,7 @@ def samples_of_frames(
 
     row_ns: int | None = None
     in_row: set[int] = set()
-    last = 0
+    last = -LATEST_NS
     for frame_ns, frame, _ in frames:
         last = time_ns = max(frame_ns, last)  # a log of several interfaces may not be in order
         key = frame.key

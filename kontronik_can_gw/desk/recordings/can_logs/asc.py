@@ -25,14 +25,16 @@ _HEADS = (b"date", b"base", b"begin", b"end", b"no", b"internal", b"previous")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 _HEAD = rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)"
-_FRAME = rb"\s*(?P<time>\d+\.\d+)\s+(?:CANFD\s+\d+\s+(?:Rx|Tx)|\d+\s+\S+\s+(?:Rx|Tx))"
+_FRAME = rb"\s*(?P<time>-?\d+\.\d+)\s+(?:CANFD\s+\d+\s+(?:Rx|Tx)|\d+\s+\S+\s+(?:Rx|Tx))"
 _frame = re.compile(_FRAME, re.IGNORECASE).match
 asc_line = re.compile(_HEAD + b"|" + _FRAME, re.IGNORECASE).match
 """Matches the beginning of a line of the head, or of a frame."""
 _decimal_id = re.compile(rb"\bid\s*=\s*(\d+)(x?)\b").search
 """The id at the end of a line, decimal whatever the base is."""
-_SHORTEST_DAY_S, _EARLIEST_S, _LATEST_S = 600, -60, 600
-"""A first time that is at least 10 min, and this close to the start's time of day, counts from midnight."""
+_Moment = tuple[datetime, int]
+"""Local time in whole seconds, and nanoseconds."""
+_CLOSE_S = 600
+"""The first frame is this close to the beginning of its block."""
 
 
 class AscReader(TextReader):
@@ -41,20 +43,27 @@ class AscReader(TextReader):
     _base, _relative, _now = 16, False, 0
 
     def _read_head(self, lines: list[bytes]) -> None:
-        started = None
+        written = began = None
         for line in lines:
             head = line.decode("utf-8", "replace").lower().split()
             if head[:1] == ["base"]:
                 self._base = 10 if head[1:2] == ["dec"] else 16
                 self._relative = head[-1] == "relative"
-            elif head[:1] == ["date"] or head[:2] == ["begin", "triggerblock"]:
-                started = asc_time(head[2 if head[0] == "date" else 3 :]) or started
+            elif head[:1] == ["date"]:
+                written = asc_time(head[2:])
+            elif head[:2] == ["begin", "triggerblock"]:
+                began = asc_time(head[3:])
             elif (found := _frame(line)) is not None:
-                if started is not None and not self._relative:
-                    started = _midnight_or_start(started, int(float(found["time"])))
                 break
-        if started is not None and _unix_ns(started) >= OLDEST_WALL_S * SECOND_NS:
-            self.wall_start_ns = _unix_ns(started)
+        else:
+            found = None
+        began = began or written
+        if began is None:
+            return
+        if found is not None and not self._relative:
+            began = _time_zero(began, written or began, float(found["time"]))
+        if (start_ns := _unix_ns(began)) >= OLDEST_WALL_S * SECOND_NS:
+            self.wall_start_ns = start_ns
 
     def _frame(self, line: bytes) -> LogFrame | None:
         line = line.lower()
@@ -124,7 +133,7 @@ class AscReader(TextReader):
         return number, bool(stated[2]) or number > 0x7FF
 
 
-def asc_time(words: list[str]) -> tuple[datetime, int] | None:
+def asc_time(words: list[str]) -> _Moment | None:
     """Local time and its nanoseconds of ``Nov 14 10:13:20.123 pm 2023``; None if it is not a date."""
     try:
         month, day, clock, *half, year = words
@@ -140,16 +149,21 @@ def asc_time(words: list[str]) -> tuple[datetime, int] | None:
         return None
 
 
-def _unix_ns(started: tuple[datetime, int]) -> int:
+def _unix_ns(started: _Moment) -> int:
     moment, fraction_ns = started
     return int(moment.timestamp()) * SECOND_NS + fraction_ns
 
 
-def _midnight_or_start(started: tuple[datetime, int], first_s: int) -> tuple[datetime, int]:
-    """The moment from which times count, by the time of the first frame."""
-    moment = started[0]
-    midnight = moment.replace(hour=0, minute=0, second=0)
-    since_start_s = first_s - (moment - midnight).seconds
-    if first_s >= _SHORTEST_DAY_S and _EARLIEST_S <= since_start_s <= _LATEST_S:
-        return midnight, 0
-    return started
+def _time_zero(began: _Moment, written: _Moment, first_s: float) -> _Moment:
+    """The moment from which the times count, which the file does not state.
+
+    It is the beginning of the block, the date of the file, or midnight: the one from which the first
+    frame is closest to the beginning of the block.
+    """
+    midnight = began[0].replace(hour=0, minute=0, second=0), 0
+
+    def distance_s(zero: _Moment) -> float:
+        return abs((began[0] - zero[0]).total_seconds() - first_s)
+
+    closest = min(began, written, midnight, key=distance_s)
+    return closest if distance_s(closest) <= _CLOSE_S else began

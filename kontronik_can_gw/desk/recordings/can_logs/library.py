@@ -38,6 +38,8 @@ _MIN_OBJECT, _MAX_OBJECT = 32, 1 << 20
 """Bytes of an object in a container of a BLF file: a larger one would gather all that follows it."""
 _ERROR_OBJECTS = tuple(number.to_bytes(4, "little") for number in (2, 104))
 """Types CAN_ERROR and CAN_FD_ERROR_64, which python-can does not read."""
+_STEP_FRAMES, _STEP_S = 10, 0.1
+"""As in log_clock.py."""
 _MS = 1_000_000
 
 
@@ -139,7 +141,7 @@ class Mf4Reader(LibraryReader):
     def __init__(self, file: BinaryIO) -> None:
         super().__init__(file)
         path = Path(file.name)
-        self._reader = reader = _opened(mf4_library().MF4Reader, path)
+        self._reader = reader = _opened(_reader_in_order(mf4_library()), path)
         start = reader._mdf.header.start_time.timestamp()
         groups = [group for group in reader._mdf.groups if group.channel_group.cycles_nr]
         names = {channel.name for group in groups for channel in group.channels}
@@ -170,6 +172,65 @@ def mf4_library() -> Any:
     library = importlib.import_module("can.io.mf4")
     # imported without it, for a quick start
     return importlib.reload(library) if library.asammdf is None else library
+
+
+def _reader_in_order(library: Any) -> Any:
+    """python-can's reader of MF4, with the records of each group in the order of their times."""
+
+    class InOrder:
+        """Part of an iterator over the records of a group."""
+
+        _mdf: Any
+        _group_index: int
+        _name: str
+        _chunk_size: int
+        _sorted: Any = None
+        _is_known = False
+
+        def _get_data(self, offset: int) -> Any:
+            if not self._is_known:
+                self._is_known = True
+                order = _order_of(self._mdf.get_master(self._group_index))
+                if order is not None:
+                    data = self._mdf.get(self._name, self._group_index, raw=False)
+                    samples, times = data.samples[order], data.timestamps[order]
+                    self._sorted = type(data)(samples, times, name=self._name)
+            if self._sorted is None:
+                return super()._get_data(offset)  # type: ignore[misc]
+            part = slice(offset, offset + self._chunk_size)
+            data = self._sorted
+            return type(data)(data.samples[part], data.timestamps[part], name=self._name)
+
+    class Reader(library.MF4Reader):  # type: ignore[misc]
+        """python-can makes its iterators by these names."""
+
+    for name in ("_CANDataFrameIterator", "_CANErrorFrameIterator", "_CANRemoteFrameIterator"):
+        made = getattr(library.MF4Reader, name)
+        setattr(Reader, name, type(name, (InOrder, made), {}))
+    return Reader
+
+
+def _order_of(times: Any) -> Any:
+    """Indices of times (s, numpy) in ascending order; None if they are.
+
+    If the clock was set back the times before the step stay in front of the others: ten of them, of
+    which one may be wrong, are more than 100 ms later than the ten after it.
+    """
+    import numpy as np
+
+    falls = np.flatnonzero(np.diff(times) < 0) + 1
+    if not len(falls):
+        return None
+    steps = [
+        at
+        for at in falls
+        if at >= _STEP_FRAMES
+        and len(times) - at >= _STEP_FRAMES
+        and np.sort(times[at - _STEP_FRAMES : at])[-2] - _STEP_S
+        > times[at : at + _STEP_FRAMES].max()
+    ]
+    parts = np.split(np.arange(len(times)), steps)
+    return np.concatenate([part[np.argsort(times[part], kind="stable")] for part in parts])
 
 
 def _opened(mf4_reader: Any, path: Path) -> Any:

@@ -18,6 +18,8 @@ OLDEST_WALL_S = 631_152_000
 """1990: what is earlier is no Unix time but seconds since a start."""
 MAX_S = 1 << 31
 """A time of a frame is shorter; python-can gives any number, infinite ones too."""
+_EXACT_S = 1 << 22
+"""From here on a float of seconds is no longer exact to the nanosecond."""
 LONGEST_LINE = 4096
 """Bytes; a line of any of these formats is far shorter."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -59,6 +61,8 @@ def frame_of(message: Any, first_channel: int = 0) -> LogFrame:
     else:
         frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
     time_ns = round(message.timestamp * SECOND_NS)
+    if abs(message.timestamp) >= _EXACT_S:
+        time_ns = round(time_ns, -3)
     channel = "1" if message.channel is None else str(message.channel + first_channel)
     return checked(LogFrame(time_ns, frame, message.is_rx, channel))
 
@@ -128,11 +132,13 @@ class TextReader(LogReader):
 
 
 def nanoseconds(text: bytes) -> int:
-    """Exact, of decimal seconds. ValueError."""
-    seconds, _, fraction = text.partition(b".")
+    """Exact nanoseconds of decimal seconds, which may be negative. ValueError."""
+    is_negative = text.startswith(b"-")
+    seconds, _, fraction = text[is_negative:].partition(b".")
     if not (seconds.isdigit() and fraction.isdigit() and len(seconds) <= 12 and len(fraction) <= 9):
         raise ValueError
-    return int(seconds + fraction.ljust(9, b"0"))
+    found = int(seconds + fraction.ljust(9, b"0"))
+    return -found if is_negative else found
 
 
 # --- candump
