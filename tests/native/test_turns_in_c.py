@@ -1,17 +1,22 @@
 """A loop that turns in C, with a kernel that is played: what it records, replayed by the core in Python, gives what it sent."""
 
+import ctypes as c
 import random
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import native_world
 import pytest
 import wire_world
 from built import run_sanitized
+from dbc_bench import compiled
 from dialogue import shipped_eds
 from equality import layout, settings, stream
+from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.canopen.cob_ids import EMERGENCY, HEARTBEAT
 from kontronik_can_gw.canopen.node_settings import NodeSettings
@@ -26,6 +31,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
 from kontronik_can_gw.output import Given, Output, setup_of
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
@@ -41,6 +47,7 @@ def _nodes(escs: Sequence[EscSettings]) -> CanopenSetup:
 
 
 ESCS = (EscSettings("esc1"),)
+EVENT = 'BA_DEF_DEF_ "GenMsgSendType" "Event";\n'
 pytestmark = pytest.mark.parametrize("core_language", ["C"], indirect=True)
 
 
@@ -263,6 +270,104 @@ def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_
     (at,) = [at for at in sent if at > 4 * SECOND]
     assert at < 5600 * MS
     it.loop.close()
+
+
+@pytest.mark.parametrize("answer", [Sent.DOWN, Sent.GONE])
+def test_an_interface_that_fails_is_noticed_with_the_next_frame(
+    answer: Sent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither is a full bus, for which turns in C would wait."""
+    it = InC(monkeypatch)
+    it.feed(LiveData(consumed_charge=n) for n in range(300))
+    it.run(1)
+    assert it.loop.can.is_proven
+    it.bus.answer = answer
+    it.run(1.02)
+    assert not it.loop.can.is_proven
+    assert it.loop.gateway.status.can_state is CanState.DOWN
+    it.bus.answer = Sent.OK
+    it.run(2)
+    assert it.loop.can.is_proven
+    it.loop.close()
+
+
+def test_a_driver_that_is_busy_is_tried_again_every_two_milliseconds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its socket stays writable: to wait until it is would use the whole processor."""
+    it = InC(monkeypatch)
+    it.feed(LiveData(consumed_charge=n) for n in range(300))
+    it.run(1)
+    it.bus.answer = Sent.BUSY
+    it.run(1.2)
+    assert 50 < len(it.bus.refused) <= 110
+    # the first attempt with a new frame, and those every 2 ms
+    assert it.loop.can.is_proven
+    it.bus.answer = Sent.OK
+    it.bus.sent.clear()
+    it.run(1.3)
+    assert len(it.bus.sent) > 5
+    it.loop.close()
+
+
+def test_a_slow_bus_has_the_newest_of_each_page_of_a_multiplexed_message(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A page that waits is replaced by the same page only."""
+    signals = [Sig("Page", 0, 8, mux="M")]
+    signals += [
+        Sig(f"Speed{n}", 8, 32, unit="1/min", mux=f"m{n}", source="electrical_speed")
+        for n in range(8)
+    ]
+    layout = compiled(
+        dbc_text([Msg("Pages", 0x100, 8, signals)], EVENT),
+        bind={f"Pages.{signal.name}": signal.source for signal in signals[1:]},
+    )
+    it = InC(monkeypatch, layout, (EscSettings("esc1", timeout_ns=SECOND),))
+    it.bus.frame_ns = 15 * MS
+    made: list[int] = []
+    for at in range(it.begun, it.begun + 4 * SECOND, 10 * MS):
+        # each makes one page, faster than the bus takes them for a while; then the bus catches up
+        if (at - it.begun) % SECOND < 400 * MS:
+            made.append(at)
+            wire = encode(LiveData(electrical_speed=len(made)), WireLayout.V4)
+            it.world.wires[0].put(wire, [at] * len(wire))
+    it.run(4)
+    status, transmitter = it.loop.gateway.status, it.loop.can.transmitter
+    it.loop.close()
+    pages: dict[int, list[int]] = {}
+    after: Counter[int] = Counter()
+    for at, frame in it.bus.sent:
+        if at > it.begun + SECOND:
+            speed = int.from_bytes(frame.data[1:5], "little")
+            pages.setdefault(frame.data[0], []).append(speed)
+            period, place = divmod(at - it.begun, SECOND)
+            if place < 400 * MS:
+                assert at - made[speed - 1] <= 90 * MS, "the eight pages come round in 80 ms"
+            else:
+                after[period] += 1
+    assert max(after.values()) <= 8, "one of each page was left"
+    assert sorted(pages) == list(range(8))
+    for speeds in pages.values():
+        assert speeds == sorted(set(speeds))
+    assert status.replaced_frames > 15
+    assert (transmitter.is_stalled, status.dropped_frames) == (False, 0)
+    assert it.loop._poller.count > 150, "most turns are in C"  # type: ignore[attr-defined]
+
+
+def test_each_change_of_the_ports_leaves_one_epoll_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or a port that comes and goes uses up the process's descriptors."""
+    opened = c.c_int.in_dll(native_world.library(), "fake_epolls")
+    before = opened.value
+    it = InC(monkeypatch)
+    it.feed(LiveData(consumed_charge=n) for n in range(900))
+    for second in range(1, 8):
+        it.run(second)
+        assert opened.value == before + 1
+        it.world.wires[0].fails_at = it.world.now
+    it.loop.close()
+    assert it.loop.escs[0].reopened >= 6
+    assert opened.value == before
 
 
 @pytest.mark.extended

@@ -318,6 +318,39 @@ def test_a_port_that_cannot_be_read_is_lost_in_that_turn_and_the_others_are_read
     assert shown_later
 
 
+def test_pauses_between_attempts_grow_until_a_port_has_given_bytes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A port that is lost again before a byte came is tried less and less often, up to a second."""
+    world = World()
+    (wire,) = world.wires
+    loop = loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    opened, open_port = list[int](), loop.escs[0].open
+
+    def note_and_open(*arguments: Any) -> None:
+        opened.append(world.now)
+        open_port(*arguments)
+
+    monkeypatch.setattr(loop.escs[0], "open", note_and_open)
+
+    def measure_pause_ms(has_bytes: bool) -> int:
+        if has_bytes:
+            wire.send(world.now)
+        run(loop, world, world.now + 50 * MS)
+        opened.clear()
+        wire.fails_at = lost = world.now
+        run(loop, world, world.now + 1200 * MS)
+        (at,) = opened
+        return round((at - lost) / MS, -1)
+
+    assert [measure_pause_ms(True) for _ in range(3)] == [100] * 3
+    assert [measure_pause_ms(False) for _ in range(5)] == [200, 400, 800, 1000, 1000]
+    assert [measure_pause_ms(True) for _ in range(2)] == [100] * 2
+    loop.close()
+
+
 def test_echo_is_off_before_anything_else_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
     """A terminal that was just made echoes; what comes before that is off goes back to the ESC."""
     real, echoes = serial_port._open, []
