@@ -5,6 +5,7 @@ On a vcan neither is wanted so early.
 
 import gc
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,11 @@ import pytest
 from child_signals import use_defaults_in_children
 
 use_defaults_in_children()
+
+# India's local time, without a data base of zones: on a machine whose local time is UTC no test
+# would notice that the two are exchanged.
+os.environ["TZ"] = "IST-5:30"
+time.tzset()
 
 if not os.environ.get("KCG_VCAN"):
     import can  # noqa: F401

@@ -6,6 +6,7 @@ import stat
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -82,6 +83,20 @@ def test_entries_are_in_the_file_in_order(tmp_path: Path) -> None:
     assert stat.S_IMODE(file.stat().st_mode) == 0o640
     assert stat.S_IMODE(folder.stat().st_mode) == 0o750
     assert bed.it.facts.bytes == file.stat().st_size
+
+
+def test_a_capture_is_named_by_the_utc_of_its_first_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recorder's clock shows 10 s at that moment, and the entry is nearly 10 s older."""
+    clocks = {name: getattr(time, name) for name in ("strftime", "gmtime", "localtime")}
+    at = SimpleNamespace(**clocks, time_ns=lambda: 1_700_000_010 * SECOND)
+    monkeypatch.setattr(recorder, "time", at)
+    bed = Bed(tmp_path)
+    bed.step(*entries(1))
+    bed.it.close()
+    [file] = tmp_path.iterdir()
+    assert file.name.startswith("20231114T221320Z-")
 
 
 def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:

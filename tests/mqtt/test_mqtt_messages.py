@@ -16,7 +16,7 @@ from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_error
 
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.dbc.writer import copies_text
-from kontronik_can_gw.desk.mqtt.messages import MIN_PAUSE_NS, Message, Publisher, Topics
+from kontronik_can_gw.desk.mqtt.messages import MIN_PAUSE_NS, Message, Publisher, Topics, iso
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
     ErrorWindow,
@@ -216,6 +216,10 @@ def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -
     assert (heard["errors"], heard["selftest"], heard["problem"]) == ([], [], False)
     silent = [found for now, found in states(published) if 7 * SECOND_NS < now < 9 * SECOND_NS][-1]
     assert {silent[key] for key in silent if key not in ("time", "available", "age")} == {None}
+
+
+def test_a_message_has_its_time_in_utc() -> None:
+    assert iso(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123Z"
 
 
 # --- Home Assistant

@@ -1,7 +1,10 @@
-"""Times in tables and logs where the machine's local time is not UTC."""
+"""Times in tables and logs on a machine whose local time is not UTC.
+
+All recordings start at 2023-11-14 22:13:20.250 UTC, which is 2023-11-15 03:43:20.250 there.
+"""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,21 +13,10 @@ from log_files import READERS, SUFFIX, at_wall, read_by_library, read_log, some_
 from recordings import WALL_NS, capture_bytes, convert
 from test_tables import Cells, read_csv, read_jsonl, read_parquet
 
-KOLKATA = "IST-5:30"
-"""Asia/Kolkata as POSIX writes it, which needs no data base of zones.
 
-The start of all recordings is 2023-11-14 22:13:20.250 UTC, 2023-11-15 03:43:20.250 in Kolkata.
-"""
-
-
-@pytest.fixture(autouse=True)
-def local_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with monkeypatch.context() as patch:
-        patch.setenv("TZ", KOLKATA)
-        time.tzset()
-        assert time.localtime(0)[3:5] == (5, 30)
-        yield
-    time.tzset()
+def test_local_time_is_not_utc() -> None:
+    """Otherwise this file proves nothing: see tests/conftest.py."""
+    assert time.localtime(0)[3:5] == (5, 30)
 
 
 @pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)

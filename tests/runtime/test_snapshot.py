@@ -16,7 +16,7 @@ from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.runtime.facts import program_facts
+from kontronik_can_gw.runtime.facts import program_facts, utc
 from kontronik_can_gw.runtime.process import process_facts, start_ticks
 from kontronik_can_gw.runtime.snapshot import snapshot
 
@@ -134,3 +134,7 @@ def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> Non
     assert start_ticks(child) == -1  # ended, and nobody has asked for its exit code
     os.waitpid(child, 0)
     assert start_ticks(child) == 0
+
+
+def test_the_times_of_a_status_are_utc() -> None:
+    assert utc(1_700_000_000.9) == "2023-11-14T22:13:20Z"
