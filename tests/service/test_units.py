@@ -12,6 +12,7 @@ import pytest
 
 import kontronik_can_gw
 from kontronik_can_gw.cli.service import planned
+from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 BESIDE = tuple(
@@ -80,21 +81,59 @@ def test_the_service_is_hardly_exposed(tmp_path: Path, beside: bool) -> None:
 # --- line by line
 
 
-def test_it_never_gives_up_and_is_watched() -> None:
+EVERY = [*NAMES, *BESIDE]
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_service_never_gives_up_and_has_no_rights_of_root(name: str) -> None:
     """What its cage forbids is tried under a real systemd: test_under_systemd.py."""
-    unit = settings(files()[NAMES[0]])
-    kept = {"Type": "notify", "Restart": "always", "StartLimitIntervalSec": "0"}
-    kept |= {"WatchdogSec": "10s", "IPAddressDeny": "any", "ProtectHome": "read-only"}
+    unit = settings(files()[name])
+    kept = {"Restart": "always", "StartLimitIntervalSec": "0", "TimeoutStopSec": "5s"}
+    kept |= {"User": "kontronik-can-gw", "Group": "kontronik-can-gw", "NoNewPrivileges": "yes"}
+    kept |= {"CapabilityBoundingSet": "", "AmbientCapabilities": ""}
+    if "mqtt" not in name:  # which has to reach a broker
+        kept["IPAddressDeny"] = "any"
+    kept |= {"ProtectHome": "read-only", "WantedBy": "multi-user.target"}
+    kept |= {"LimitCORE": "0"}  # a core dump would fill a memory card and delay the restart
     assert {name: unit[name] for name in kept} == {name: [text] for name, text in kept.items()}
+    assert unit["RestartSec"] == ["250ms" if name in NAMES else "5s"]
     never = ("ExecStartPre", "RestartPrevent", "ExecCondition", "Condition")
     assert not [name for name in unit if name.startswith(never)]
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if "metrics" not in name])
+def test_a_service_that_reports_to_systemd_is_watched(name: str) -> None:
+    """If it hangs, it is ended so that the log has the stack of each thread."""
+    unit = settings(files()[name])
+    kept = {"Type": "notify", "WatchdogSec": "10s", "TimeoutStartSec": "90s"}
+    kept |= {"Environment": "PYTHONFAULTHANDLER=1"}
+    assert {name: unit[name] for name in kept} == {name: [text] for name, text in kept.items()}
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if "metrics" not in name])
+def test_a_service_may_write_the_locks_that_all_gateways_share(name: str) -> None:
+    assert settings(files()[name])["ReadWritePaths"] == [f"-{SYSTEM_FOLDER}"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_gateway_shows_its_statistics_to_all_and_its_store_to_none(name: str) -> None:
+    """The folder of the plain service holds the locks of all, so that it stays when that one ends."""
+    unit = settings(files()[name])
+    kept = {"RuntimeDirectoryMode": "0755", "RuntimeDirectoryPreserve": "yes"}
+    kept |= {"StateDirectoryMode": "0700"}
+    assert {name: unit[name] for name in kept} == {name: [text] for name, text in kept.items()}
 
 
 def test_it_may_open_serial_ports_and_nothing_else() -> None:
     """What that is good for, and the folder of locks, is tried under a real systemd: test_under_systemd.py."""
     unit = settings(files()[NAMES[0]])
-    ports = {f"char-tty{kind} rw" for kind in ("USB", "ACM", "S", "AMA")}
-    assert ports <= set(unit["DeviceAllow"])
+    kinds = ("USB", "ACM", "S", "AMA", "SC", "mxc", "THS")
+    assert unit["DeviceAllow"] == [f"char-tty{kind} rw" for kind in kinds]
+    assert unit["DevicePolicy"] == ["closed"]
+    assert "PrivateDevices" not in unit, "it would hide ports that are plugged in later"
+    # who else has a port open, which may be a getty that sends to the ESC, is seen in /proc
+    assert unit["ProtectProc"] == ["default"]
+    assert "PrivateUsers" not in unit
     # an adapter may be plugged in when the service runs already: its driver has to be loaded before
     for name in ("Wants", "After"):
         assert {"modprobe@usbserial.service", "modprobe@cdc_acm.service"} <= set(
@@ -145,7 +184,7 @@ def allowed_families(unit: str) -> set[str]:
     return {word for line in settings(unit)["RestrictAddressFamilies"] for word in line.split()}
 
 
-@pytest.mark.parametrize("name", [*NAMES, *BESIDE])
+@pytest.mark.parametrize("name", EVERY)
 def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) -> None:
     unit = files()[name]
     command = settings(unit)["ExecStart"][0].split()[1]
