@@ -73,8 +73,8 @@ class Kernel:
 
 
 class Bench:
-    def __init__(self, kernel: Kernel, self_start: bool = True) -> None:
-        canopen = {"enabled": True, "self_start": self_start, "store": "/nowhere"}
+    def __init__(self, kernel: Kernel, self_start: bool = True, has_node: bool = True) -> None:
+        canopen = {"enabled": has_node, "self_start": self_start, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
@@ -214,9 +214,10 @@ def test_old_news_of_a_link_does_not_close_what_was_opened(bench: Bench, kernel:
     assert not bench.can.is_open
     bench.changes(ACTIVE)
     bench.now += SECOND
-    kernel.news = []
-    bench.can.reopen(bench.now)  # by its own pause, before the kernel's news of the making are read
+    kernel.news = [LinkFacts(exists=False)]
+    bench.can.reopen(bench.now)  # after its own pause, before it has read what the kernel reported
     port = bench.can.port
+    assert port is not None
     bench.turn(100)
     assert bench.can.port is port
 
@@ -388,3 +389,54 @@ def test_a_bus_off_that_somebody_sent_on_a_virtual_bus_ends_after_a_second(kerne
     assert told(made.take())[0] == "boot-up"
     assert made.gateway.status.can_state is CanState.ERROR_ACTIVE
     made.can.close()
+
+
+def test_a_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: Kernel) -> None:
+    """Others that send its messages are noticed then, too."""
+    bench = Bench(kernel, has_node=False)
+    bench.begin()
+    before = bench.port
+    assert before._ids
+    bench.changes(LinkFacts(exists=False), there=False)
+    bench.turn(100)
+    assert not bench.can.is_open
+    bench.changes(ACTIVE)
+    bench.turn(1000)
+    assert bench.port is not before
+    assert bench.port._ids == before._ids
+    bench.can.close()
+
+
+@pytest.mark.parametrize("wait", [False, True])
+def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
+    bench: Bench, wait: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not at the start, and not later when an adapter has come back under another name."""
+    opened: list[object] = []
+    monkeypatch.setattr(can_link, "open_can", opened.append)
+    bench.can._esc_at = lambda path: "left" if path == bench.can.config.channel else None
+    if wait:
+        bench.start()
+        bench.turn(3000)
+        assert not bench.can.is_open
+    else:
+        with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
+            bench.can.open(bench.now, wait=False)
+    assert opened == []
+
+
+def test_an_adapter_that_was_pulled_out_in_bus_off_boots_its_node_when_it_is_back(
+    bench: Bench,
+) -> None:
+    """What is sent then is not lost in a bus-off that has ended with the old adapter."""
+    bench.begin()
+    bench.goes_off()
+    bench.turn(100)
+    assert bench.can.controller.is_off
+    bench.changes(LinkFacts(exists=False), there=False)
+    bench.turn(100)
+    assert not bench.can.is_open
+    bench.changes(ACTIVE)
+    bench.turn(10)
+    assert bench.can.is_open
+    assert BOOT_UP in bench.take()

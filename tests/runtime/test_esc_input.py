@@ -24,7 +24,7 @@ from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime import serial_port, usb_adapters
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.serial_port import PortLost, is_mini_uart
+from kontronik_can_gw.runtime.serial_port import NoPort, PortLost, is_mini_uart
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
 
@@ -155,6 +155,22 @@ def test_an_esc_is_found_by_its_adapter(there: dict[str, Identity | None], bench
     assert not bench.escs[0].is_at("/dev/ttyUSB1")
 
 
+def test_a_port_is_lost_since_it_was_lost_however_often_it_is_tried(
+    there: dict[str, Identity | None], bench: Bench
+) -> None:
+    esc = bench.escs[0]
+    there.clear()
+    bench.lose(0, SECOND)
+    for now in (2 * SECOND, 4 * SECOND):
+        bench.reopen(now)
+        assert esc.facts().lost_since_ns == SECOND
+    there[USB0] = LEFT
+    bench.reopen(6 * SECOND)
+    assert esc.facts().lost_since_ns is None
+    bench.lose(0, 7 * SECOND)
+    assert esc.facts().lost_since_ns == 7 * SECOND
+
+
 def test_line_errors_are_counted_by_kind_over_every_plugging_in(
     bench: Bench,
 ) -> None:
@@ -200,6 +216,85 @@ def test_a_diagnosis_is_said_once_and_is_over_while_telemetry_comes(
         if now <= 22200 * MS:
             assert esc.facts().diagnosis is None, "frames come, or did so a moment ago"
     assert (esc.facts().diagnosis or "").startswith("no bytes")
+    for n in range(1, 400):
+        now = 24 * SECOND + n * 50 * MS
+        bench.port().reads = [bytes((0x55, 0x10 + n % 7)) * 20]
+        esc.serve(now)
+        bench.gateway.advance(now)
+        esc.report(now)
+    said = [message for message in caplog.messages if "never KOD" in message]
+    assert len(said) == 2, "it is said again for another loss"
+
+
+def test_a_port_that_is_unplugged_is_one_line_until_it_is_back(
+    there: dict[str, Identity | None],
+    bench: Bench,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And a change of its settings before is not reported afterwards."""
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    esc = bench.escs[0]
+
+    def is_unplugged(path: str, _protocol: object) -> Port:
+        raise NoPort(f"{path}: no such serial port.")
+
+    esc._noted.restored = True
+    bench.lose(0, SECOND)
+    with monkeypatch.context() as patch:
+        patch.setattr(esc_input, "SerialPort", is_unplugged)
+        for n in range(20):
+            bench.reopen((2 + n) * SECOND)
+    bench.reopen(30 * SECOND)
+    esc.report(30 * SECOND)
+    assert caplog.messages == [
+        "left: /dev/ttyUSB0: lost (hung up). Trying again.",
+        "left: /dev/ttyUSB0 is open, after 29.0 s",
+    ]
+
+
+def test_a_mini_uart_is_a_warning_when_it_is_opened(
+    there: dict[str, Identity | None],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """It opens, and loses frames: it has no parity."""
+    monkeypatch.setattr(esc_input, "is_mini_uart", lambda path: path == "/dev/ttyS0")
+    there |= {"/dev/ttyS0": None, USB0: LEFT}
+    Bench("/dev/ttyS0", USB0)
+    (warning,) = [each for each in caplog.messages if "mini-UART" in each]
+    assert warning.startswith("left: /dev/ttyS0 is a Raspberry Pi's mini-UART")
+    assert warning.endswith("Use ttyAMA0.")
+
+
+def test_a_loss_is_reported_with_the_errors_that_came_in_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    world = World()
+    (wire,) = world.wires
+    loop = loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    damaged = LIVE[:-1] + bytes((LIVE[-1] ^ 1,))
+
+    def put(data: bytes, at: int) -> None:
+        wire.put(data, [at] * len(data))
+
+    begin = world.now
+    for n in range(100):
+        put(LIVE, begin + n * 20 * MS)
+        if n % 25 == 0:
+            put(damaged, begin + n * 20 * MS + 10 * MS)
+    run(loop, world, begin + 3 * SECOND)
+    assert loop.gateway.escs[0].counters.crc_errors == 4
+    for n in range(3):
+        put(damaged, world.now + n * 20 * MS)
+    put(LIVE, world.now + SECOND)
+    run(loop, world, world.now + 1100 * MS)
+    loop.close()
+    (back,) = [each for each in caplog.messages if "dropped meanwhile" in each]
+    assert "; 3 CRC errors, " in back
 
 
 def test_a_usb_adapter_is_known_by_its_numbers_or_its_place(

@@ -22,6 +22,7 @@ from wire_world import (
     TIMES,
     World,
     layout_of,
+    live,
     loop_in,
     run,
     speed_and_age,
@@ -236,6 +237,57 @@ def shown_of_all(world: World) -> Iterator[tuple[int, int, int, int]]:
             yield frame.can_id, at, number, age
 
 
+def test_bytes_that_come_faster_than_the_wire_allows_are_not_of_the_future(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """More than two reads at once, as from a device that is no ESC; a frame is at the end."""
+    world = World()
+    (wire,) = world.wires
+    timeout = 100 * MS
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=timeout))
+    wire.stream(world.now, world.now + 400 * MS, 20 * MS)
+    run(loop, world, world.now + SECOND)
+    came, number = world.now + MS, len(wire.frames) + 1
+    flood = bytes(10_000) + live(number)
+    wire.put(flood, [came] * len(flood))
+    wire.frames.append(came)
+    run(loop, world, came + SECOND)
+    esc = loop.gateway.escs[0]
+    loop.close()
+    assert came - 40 * MS < esc.live_bound_ns <= came
+    sent = [at for at, shown_number, _ in values(world) if shown_number == number]
+    assert came <= sent[0] < sent[-1] <= came + timeout
+
+
+def test_bytes_left_in_a_lost_port_do_not_age_the_first_ones_of_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World()
+    (wire,) = world.wires
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=60 * SECOND))
+    wire.send(world.now)
+    run(loop, world, world.now + 100 * MS)
+    wire.put(bytes(5000), [world.now] * 5000)
+    lost, read = world.now, wire.read
+
+    def read_once(most: int = 4096) -> bytes:
+        data = read(most)
+        assert wire.waits_to_be_read
+        wire.fails_at = world.now
+        monkeypatch.setattr(wire, "read", read)
+        return data
+
+    monkeypatch.setattr(wire, "read", read_once)
+    run(loop, world, lost + SECOND)
+    assert loop.escs[0].reopened == 1
+    at = world.now
+    wire.send(at)
+    run(loop, world, at + 100 * MS)
+    esc = loop.gateway.escs[0]
+    loop.close()
+    assert esc.live_bound_ns > at - 300 * MS
+
+
 @pytest.mark.parametrize("frames_before", [0, 64])
 def test_frames_that_become_old_while_they_are_handed_over_are_made_anew(
     monkeypatch: pytest.MonkeyPatch, frames_before: int
@@ -388,14 +440,15 @@ def test_a_bus_that_is_slower_than_what_comes_has_the_newest_values_in_order(
     loop.close()
 
 
+@pytest.mark.parametrize("clock_error_s", [-3600, 3600])
 def test_a_frame_that_came_in_a_hold_up_is_as_old_as_it_is(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, clock_error_s: int
 ) -> None:
     """However the wall clock was set meanwhile: it came between the two looks at the bus."""
     world, shown_at = World(), list[int]()
     loop = begin(monkeypatch, world, EscSettings("esc1"))
     monkeypatch.setattr(loop.gateway, "receive_frame", lambda _frame, _now, at: shown_at.append(at))
-    world.bus.clock_error = -3600 * SECOND
+    world.bus.clock_error = clock_error_s * SECOND
     world.wires[0].stream(world.now, world.now + 2 * SECOND, 10 * MS)
     for _ in range(5):
         run(loop, world, world.now + 100 * MS)
@@ -403,7 +456,10 @@ def test_a_frame_that_came_in_a_hold_up_is_as_old_as_it_is(
         world.bus.came(0x80, b"", came)
         world.now += 200 * MS
         run(loop, world, world.now + 20 * MS)
-        assert came - 50 * MS < shown_at.pop() <= came
+        if clock_error_s < 0:
+            assert came - 50 * MS < shown_at.pop() <= came
+        else:
+            assert came <= shown_at.pop() <= came + 220 * MS
     loop.close()
 
 
