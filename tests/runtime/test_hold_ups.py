@@ -288,6 +288,28 @@ def test_bytes_left_in_a_lost_port_do_not_age_the_first_ones_of_the_next(
     assert esc.live_bound_ns > at - 300 * MS
 
 
+def test_a_hold_up_is_one_line_in_the_log(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Delays that are shorter than the shortest time-out are none."""
+    world = World()
+    start = world.now
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=100 * MS))
+    world.wires[0].stream(start, start + 3 * SECOND, 10 * MS)
+    left = {1100 * MS: 90 * MS, 2100 * MS: 400 * MS}
+
+    def hold_up() -> int:
+        due = [since for since in left if world.now >= start + since]
+        return left.pop(due[0]) if due else 0
+
+    world.hold_up = hold_up
+    run(loop, world, start + 3 * SECOND)
+    loop.close()
+    assert not left
+    (line,) = [each for each in caplog.messages if "suspended" in each]
+    assert line.startswith("the process was suspended for 0.4 s")
+
+
 @pytest.mark.parametrize("frames_before", [0, 64])
 def test_frames_that_become_old_while_they_are_handed_over_are_made_anew(
     monkeypatch: pytest.MonkeyPatch, frames_before: int
