@@ -16,6 +16,8 @@ from kontronik_can_gw.output import Given
 from kontronik_can_gw.signals.plan import classic_bits
 
 _USUAL_BITRATE = 1_000_000
+_LOWEST_RATE_HZ = 10
+"""ArduPilot takes a motor for stopped if it hears nothing of it for 210 ms."""
 _STATUS, _BEC = (8, 8, 3), (8, 6)
 """Data bytes of the frames of esc.Status, of CircuitStatus and Temperature."""
 _RESOLUTION = (
@@ -87,13 +89,24 @@ class DronecanSetup:
             found.append(
                 f"dronecan: can.bitrate is {bitrate // 1000} kbit/s; autopilots run DroneCAN at 1000 kbit/s"
             )
+        table = self.given.table
+        if table.rate_hz < _LOWEST_RATE_HZ:
+            found.append(
+                f"dronecan.rate_hz is {table.rate_hz}: below {_LOWEST_RATE_HZ} ArduPilot may take a running motor for "
+                f"stopped. Set it to {_LOWEST_RATE_HZ} or more"
+            )
+        if table.extended_hz:
+            found.append(
+                "dronecan.extended_hz: the motor temperature in esc.StatusExtended is not known and sent as -256 degC, which PX4 "
+                "takes for the temperature. Set extended_hz = 0 for PX4"
+            )
         if not self.given.identity:
             found.append(
                 "dronecan: this machine has no id, so unique ids come from the names alone: "
                 "give each gateway on a bus its own dronecan.name"
             )
         plain = [esc.name for esc in self.escs if esc.pole_pairs == 1]
-        if plain and self.given.table.rpm != "electrical":
+        if plain and table.rpm != "electrical":
             found.append(
                 f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: set pole_pairs in [[esc]], "
                 'or dronecan.rpm = "electrical" if it is one'
@@ -122,7 +135,12 @@ class DronecanSetup:
         return [
             *found,
             f"{sent}; NodeStatus, CircuitStatus and Temperature of the BEC each second",
-            f"rpm is {SPEEDS[table.rpm]}, at most {MAX_RPM}: what is more is sent as that",
+            f"rpm is {SPEEDS[table.rpm]}, at most {MAX_RPM}: what is more is sent as that; "
+            + (
+                "negative while the motor turns backward"
+                if table.negative_rpm
+                else "never negative"
+            ),
             _RESOLUTION,
         ]
 

@@ -78,6 +78,14 @@ def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
         ("rate_hz = 200", {"kbit": 125}, 2, "the DroneCAN nodes need"),
         ("", {"poles": 1}, 0, "rpm of right is sent as with one pole pair: set pole_pairs in"),
         ("rpm = 'electrical'", {"poles": 1}, 0, ""),
+        (
+            "rate_hz = 9",
+            {},
+            0,
+            "dronecan.rate_hz is 9: below 10 ArduPilot may take a running motor",
+        ),
+        ("extended_hz = 1", {}, 0, "sent as -256 degC, which PX4 takes for the temperature"),
+        ("rate_hz = 10", {"poles": 7}, 0, ""),
         ("", {}, 0, "give each gateway on a bus its own dronecan.name"),
     ],
 )
