@@ -438,7 +438,7 @@ def test_pauses_between_attempts_grow_until_a_port_has_given_bytes(
         wire.fails_at = lost = world.now
         run(loop, world, world.now + 1200 * MS)
         (at,) = opened
-        return round((at - lost) / MS, -1)
+        return 10 * round((at - lost) / (10 * MS))
 
     assert [measure_pause_ms(True) for _ in range(3)] == [100] * 3
     assert [measure_pause_ms(False) for _ in range(5)] == [200, 400, 800, 1000, 1000]

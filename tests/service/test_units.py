@@ -12,7 +12,7 @@ import pytest
 
 import kontronik_can_gw
 from kontronik_can_gw.cli.service import planned
-from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
+from kontronik_can_gw.runtime.folders import NAME, RUN
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 BESIDE = tuple(
@@ -112,7 +112,7 @@ def test_a_service_that_reports_to_systemd_is_watched(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in EVERY if "metrics" not in name])
 def test_a_service_may_write_the_locks_that_all_gateways_share(name: str) -> None:
-    assert settings(files()[name])["ReadWritePaths"] == [f"-{SYSTEM_FOLDER}"]
+    assert settings(files()[name])["ReadWritePaths"] == [f"-{RUN / NAME / 'lock'}"]
 
 
 @pytest.mark.parametrize("name", NAMES)
