@@ -44,3 +44,28 @@ def test_a_table_in_mf4_is_told_from_a_log(tmp_path: Path) -> None:
         mdf.save(table)
     said = refused(2, "convert", table, tmp_path / "o.csv")
     assert "table.mf4: is a table of values (an MF4 measurement), no log of a CAN bus." in said
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "(1700000000.123456)  vcan0  688   [8]  00 00 00 C4 09 00 14 00",
+        " (000.000000)  vcan0  00012345   [2]  11 22",
+        " (2023-11-14 22:13:20.123456)  vcan0  688  [12]  00 01 02 03 04 05 06 07 08 09 0A 0B",
+        "  vcan0  RX - -  688   [8]  00 00 00 C4 09 00 14 00",
+        "  vcan0  688   [8]  remote request",
+        "  vcan0  688   [0] ",
+    ],
+)
+def test_the_screen_output_of_candump_gets_the_right_command(tmp_path: Path, line: str) -> None:
+    log = tmp_path / "screen.txt"
+    log.write_text(f"{line}\n" * 3)
+    for words in (
+        ("convert", log, tmp_path / "o.csv"),
+        ("report", log, "-o", tmp_path / "o.html"),
+        ("monitor", "--once", log),
+        ("replay", log, "--on", "pty"),
+    ):
+        said = refused(2, *words)
+        assert said.startswith(f"{log}: is the output of candump for the screen.")
+        assert said.endswith("candump -L vcan0 > FILE (or candump -l vcan0).")

@@ -11,7 +11,7 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.bytes_input import UART_MAGIC, BytesInput
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.recordings.log_input import CanLogInput, log_format
+from kontronik_can_gw.desk.recordings.log_input import CanLogInput, candump_advice, log_format
 from kontronik_can_gw.desk.recordings.recording import Input
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -44,6 +44,8 @@ def open_input(path: Path, layout: BusLayout | None = None) -> Input:
         return CanLogInput(path, layout, found)
     if UART_MAGIC in head:
         return BytesInput(path, layout)
+    if (advice := candump_advice(head)) is not None:
+        raise UserError(f"{path}: {advice}")
     raise UserError(
         f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_HEAD // 1024} kB"
     )

@@ -89,24 +89,29 @@ class LogClock:
         return self._ahead.popleft() if self._ahead else next(self._source, None)
 
     def _look_ahead(self, count: int) -> Sequence[LogFrame]:
-        """The next frames, which stay to be read; fewer at the end of the log."""
+        """The next frames, which stay to be read; fewer at the end of the log.
+
+        A pipe may not have them yet, so a frame in its order must not need them.
+        """
         self._ahead.extend(islice(self._source, max(0, count - len(self._ahead))))
         return list(islice(self._ahead, count))
 
     def _is_alone(self, first: LogFrame) -> bool:
         """True if the log begins with a frame that is far later than the two after it, which agree."""
-        following = self._look_ahead(2)
-        if len(following) < 2 or first.time_ns - following[0].time_ns <= _FAR_NS:
+        following = self._look_ahead(1)
+        if not following or first.time_ns - following[0].time_ns <= _FAR_NS:
             return False
-        return _follows(following[1], following[0])
+        following = self._look_ahead(2)
+        return len(following) == 2 and _follows(following[1], following[0])
 
     def _leads_back(self, item: LogFrame) -> bool:
         """True if the times after this one go back again."""
-        for after in self._look_ahead(2):
-            if after.time_ns < item.time_ns - _FAR_NS:
-                return True
-            if _follows(after, item):
+        for count in (1, 2):
+            following = self._look_ahead(count)
+            if len(following) < count or _follows(following[-1], item):
                 return False
+            if following[-1].time_ns < item.time_ns - _FAR_NS:
+                return True
         return False
 
     def _is_followed(self, item: LogFrame) -> bool:

@@ -48,6 +48,18 @@ def log_format(head: bytes) -> str | None:
     return None
 
 
+def candump_advice(head: bytes) -> str | None:
+    """What is wrong with the output of candump for the screen, and the remedy; None for other files."""
+    for line in head.split(b"\n", _HEAD_LINES)[:_HEAD_LINES]:
+        if (found := text.candump_screen_line(line)) is not None:
+            interface = found["interface"].decode("ascii", "replace")
+            return (
+                "is the output of candump for the screen. Record the log format: "
+                f"candump -L {interface} > FILE (or candump -l {interface})."
+            )
+    return None
+
+
 def _reader_of(format_: str) -> type[text.LogReader]:
     if format_ in _TEXTS:
         return _TEXTS[format_][1]

@@ -157,6 +157,14 @@ candump_line = _LINE.fullmatch
 """Matches a line of ``candump -L``: ``(1700000000.123456) can0 681#0011223344556677 R``."""
 
 
+candump_screen_line = re.compile(
+    rb"[ \t]*(?:\([^()\n]{1,40}\)[ \t]+)?(?P<interface>[\w.-]{1,15})[ \t]+"
+    rb"(?:[RT]X[ \t]+\S[ \t]+\S[ \t]+)?(?:[0-9A-F]{3}|[0-9A-F]{8})[ \t]+\[\d{1,2}\](?:[ \t]|\r?$)",
+    re.MULTILINE,
+).match
+"""Matches a line of candump without ``-L``: ``(000.000000)  can0  681   [8]  00 11 22 33``."""
+
+
 class CandumpReader(TextReader):
     """``candump -L`` and ``-l``."""
 
