@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import LAYOUT, LOG_CHANNEL, REMOVED_OPTIONS, option
-from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.cli.desk import given_layout, watched
+from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.desk import OpenInput, given_layout, reading, was_ended, watched
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
     FORMATS,
@@ -24,7 +24,11 @@ from kontronik_can_gw.desk.recordings.convert import (
 )
 from kontronik_can_gw.desk.recordings.fields import Choice
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
+from kontronik_can_gw.desk.recordings.stream import is_standard_input, name_of
 from kontronik_can_gw.errors import RunError, UserError
+
+_STOPPED = 130
+"""Exit code after a signal."""
 
 
 def _seconds_ns(text: str) -> int:
@@ -48,7 +52,7 @@ def _names(text: str) -> list[str]:
 
 # fmt: off
 OPTIONS = (
-    option("IN", "capture, CAN log or UART bytes", dest="input"),
+    option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
     option("OUT", "file to write, or - for standard output", dest="output"),
     option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS),
     option("--force", "write over OUT if it is there"),
@@ -66,7 +70,8 @@ OPTIONS = (
 # fmt: on
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
-BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
+BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. Its format is found from its content.
+It may be a pipe. UART bytes and candump text are then converted as they arrive; Ctrl-C ends the input and keeps the rows so far.
 
 OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
 bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .log .candump .asc .blf .trc .bin; --to where it
@@ -79,39 +84,40 @@ can0 is 1 in formats that have numbers.
 Of a damaged recording everything that is intact is converted, and a summary says what is not.
 OUT takes its name only when it is whole; until then it is called OUT.part.
 
-exit codes: 0 converted, also where a part of IN is damaged; 1 there is nothing to convert, something cannot be read or written, or a
-library is missing; 2 wrong usage, or IN is no recording
+examples:
+  kontronik-can-gw convert flight.kcap flight.csv
+  candump -L vcan0 | kontronik-can-gw convert - flight.csv
+
+exit codes: 0 converted, even if a part of IN is damaged; 1 there is nothing to convert, something cannot be read or written, or a
+library is missing; 2 wrong usage, or IN is not a recording; 130 stopped by a signal
 """
 
 
-def main(args: argparse.Namespace, opened_by: Callable[..., Input] = open_input) -> int:
-    """Convert args.input, which ``opened_by`` opens. UserError for wrong usage, RunError where something cannot be read or written."""
+def main(args: argparse.Namespace, opened_by: OpenInput = open_input) -> int:
+    """Convert args.input, which ``opened_by`` opens. UserError for wrong usage, RunError if something cannot be read or written."""
     if args.output != "-" and Path(args.output).is_dir():
         raise UserError(f"{args.output}: is a directory. Give a file.")
     form = _format(args)
     _check(args, form)
     try:
-        with stopping_on_signals(_interrupt):
-            _convert(args, form, opened_by)
+        return _convert(args, form, opened_by)
     except KeyboardInterrupt:
         say("stopped: nothing is written" if args.output != "-" else "stopped", args.command)
-        return 130
-    return 0
+        return _STOPPED
 
 
-def _interrupt() -> None:
-    raise KeyboardInterrupt
-
-
-def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input]) -> None:
+def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
     target = None if args.output == "-" else Path(args.output)
     begun = time.monotonic()
-    with opened_by(Path(args.input), given_layout(args)) as recording:
+    with reading(Path(args.input), given_layout(args), opened_by) as recording:
         if args.channel is not None:
             recording.select_channel(args.channel)
         conversion = _conversion(args, form, recording)
+        out = Output(target)
+        # the rows of a pipe cannot be read again, but only text can be used without its end
+        out.keeps_part = recording.stream is not None and form in ON_SCREEN
         try:
-            with Output(target) as out:
+            with out:
                 name = f"{Path(args.input).name or recording.name} to {form}:"
                 out.watch = partial(watched, name=name, data_on_screen=target is None)
                 summary = conversion(recording, out)
@@ -119,19 +125,24 @@ def _convert(args: argparse.Namespace, form: str, opened_by: Callable[..., Input
             raise
         except OSError as error:
             where = target or "standard output"
-            raise RunError(f"{where}: cannot be written: {error.strerror}.") from None
+            kept = f" The data so far are in {out.kept_part}." if out.kept_part else ""
+            raise RunError(f"{where}: cannot be written: {error.strerror}.{kept}") from None
+        if summary is None and was_ended(recording):
+            raise KeyboardInterrupt
         _report(args, form, recording, summary, time.monotonic() - begun)
+        return _STOPPED if was_ended(recording) else 0
 
 
 def _report(
     args: argparse.Namespace, form: str, recording: Input, summary: str | None, seconds: float
 ) -> None:
     """Say what was written, and what of the recording was not intact. RunError where there was nothing."""
-    damage = [f"{args.input}: damaged: {line}" for line in recording.damage]
+    source = name_of(Path(args.input))
+    damage = [f"{source}: damaged: {line}" for line in recording.damage]
     if summary is None:
-        raise RunError(*damage, f"{args.input}: {_nothing(args, form, recording)}")
+        raise RunError(*damage, f"{source}: {_nothing(args, form, recording)}")
     if form in TABLES and recording.left_out:
-        damage.append(f"{args.input}: {recording.left_out}")
+        damage.append(f"{source}: {recording.left_out}")
     if not args.quiet:
         where = "standard output" if args.output == "-" else args.output
         say(f"{where}: {summary}, in {seconds:.1f} s", args.command)
@@ -194,6 +205,8 @@ def _check(args: argparse.Namespace, form: str) -> None:
         if is_wrong:
             raise UserError(problem)
     source, target = Path(args.input), Path(args.output)
+    if is_standard_input(source):
+        source = Path("/dev/stdin")
     if to_screen or not target.exists():
         return
     if source.exists() and source.samefile(target):

@@ -7,14 +7,20 @@ from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.desk.recordings.inputs import open_bytes
 
 OPTIONS = (
-    option("FILE", "file of UART bytes"),
+    option("FILE", "file or pipe of UART bytes, or - for standard input"),
     option("--csv", "CSV with a header instead of JSON lines"),
 )
 EPILOG = """\
-The same as kontronik-can-gw convert FILE - --to jsonl (or csv), and FILE is taken for the bytes of one ESC, whatever is in it: a row
-for each live frame, with all values. Where no frame is found a line says what the bytes look like.
+Short for kontronik-can-gw convert FILE - --to jsonl (or csv), except that FILE is read as the bytes of one ESC, whatever its
+content is: a row for each live frame, with all values. If it has no frame, a line describes the bytes. The bytes of a pipe are
+decoded as they arrive.
 
-exit codes: 0 decoded, also where a part of FILE is damaged; 1 no frame is found, or something cannot be read or written; 2 wrong usage
+examples:
+  kontronik-can-gw decode esc.bin --csv
+  cat esc.bin | kontronik-can-gw decode -
+
+exit codes: 0 decoded, even if a part of FILE is damaged; 1 no frame is found, or something cannot be read or written; 2 wrong usage;
+130 stopped by a signal
 """
 
 

@@ -1,17 +1,19 @@
-"""Shared by commands of the desk: the layout that ``-c`` or ``--dbc`` names, ``-o``, progress, pseudo terminals."""
+"""Shared by commands of the desk: recordings, the layout that ``-c`` or ``--dbc`` names, ``-o``, progress, pseudo terminals."""
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from kontronik_can_gw.cli.common import announced_config, load_all, say
+from kontronik_can_gw.cli.common import announced_config, load_all, say, stopping_on_signals
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.convert import Output
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.desk.recordings.stream import Stream
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 
@@ -38,6 +40,35 @@ def bus_layout(args: argparse.Namespace) -> BusLayout:
             f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. Give --dbc instead."
         )
     return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
+
+
+OpenInput = Callable[[Path, BusLayout | None], Input]
+
+
+@contextmanager
+def reading(
+    path: Path, layout: BusLayout | None, opened_by: OpenInput = open_input
+) -> Iterator[Input]:
+    """An open recording.
+
+    SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, unless the recording is a stream: they end it, so that its data so far can be
+    used. ``was_ended`` is true afterwards.
+    """
+    stream: Stream | None = None
+
+    def stop() -> None:
+        if stream is None:
+            raise KeyboardInterrupt
+        stream.end()
+
+    with stopping_on_signals(stop), opened_by(path, layout) as recording:
+        stream = recording.stream
+        yield recording
+
+
+def was_ended(recording: Input) -> bool:
+    """True if a signal ended the stream that is this recording."""
+    return recording.stream is not None and recording.stream.is_ended
 
 
 def write_output(where: str, text: str, encoding: str = "utf-8") -> None:

@@ -5,7 +5,7 @@ import contextlib
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -23,7 +23,7 @@ from kontronik_can_gw.printable import printable_json
 _ONCE_S = 3.0
 # fmt: off
 OPTIONS = (
-    option("SOURCE", "a CAN interface, or a recording", nargs="?"),
+    option("SOURCE", "a CAN interface, a recording, or - for standard input", nargs="?"),
     LAYOUT,
     option("--interface NAME", "python-can interface (default socketcan)"),
     option("--channel NAME", "channel of the interface (default can0); of a CAN log, as can0 or 1: the one to play"),
@@ -42,7 +42,8 @@ such as vcan0. Without it the configuration names the interface, or it is can0.
 
 SOURCE can also be a recording, which is played in real time: a capture (.kcap),
 a file of UART bytes, or a CAN log (candump .log, .asc, .blf, .trc, .mf4). A file
-that has the name of an interface is opened as ./NAME.
+that has the name of an interface is opened as ./NAME. A recording may be a pipe:
+ssh BOARD candump -L can0 | kontronik-can-gw monitor -
 
 keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it,
       n and p next and previous, 0 all, space pause (recording)
@@ -138,7 +139,8 @@ def _source_of(args: argparse.Namespace, recording: Path | None) -> Iterator[Sou
             )
         if args.channel is not None:
             opened.select_channel(args.channel)
-        yield Recording(opened, args.speed or 1.0, at_once=args.once)
+        with closing(Recording(opened, args.speed or 1.0, at_once=args.once)) as played:
+            yield played
         for line in dict.fromkeys(
             filter(None, [*opened.damage, *opened.clock_notes, opened.left_out])
         ):

@@ -9,10 +9,11 @@ from threading import Event
 from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.cli.desk import given_layout, terminals
+from kontronik_can_gw.cli.desk import given_layout, reading, terminals
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.played import PlayedInput
+from kontronik_can_gw.desk.recordings.stream import name_of
 from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import SECOND
@@ -34,7 +35,7 @@ def _speed(text: str) -> float | None:
 
 # fmt: off
 OPTIONS = (
-    option("FILE", "the recording", type=Path),
+    option("FILE", "the recording, or - for standard input", type=Path),
     option("--on", "what to play it on", choices=("can", "pty"), required=True),
     LAYOUT,
     option("--speed FACTOR", "times real time, 0.01 to 1000, or max: as fast as possible (default 1)", type=_speed, default=1.0),
@@ -96,13 +97,23 @@ def main(args: argparse.Namespace) -> int:
         if place != args.on and given:
             raise UserError(f"--{given[0]} is for --on {place}")
     pace = Pace(args.speed)
-    with (
-        open_input(args.file, given_layout(args)) as recording,
-        stopping_on_signals(pace.stopped.set),
-    ):
+    with reading(args.file, given_layout(args)) as recording:
+        _play(args, recording, pace)
+    return 0
+
+
+def _play(args: argparse.Namespace, recording: Input, pace: Pace) -> None:
+    """Play all of it, or until a signal. UserError for a log of CAN frames."""
+
+    def stop() -> None:
+        pace.stopped.set()
+        if recording.stream is not None:
+            recording.stream.end()
+
+    with stopping_on_signals(stop):
         if not isinstance(recording, PlayedInput):
             raise UserError(
-                f"{args.file}: is a log of CAN frames, which has no bytes of ESCs. Type canplayer -I FILE (of can-utils) to send "
+                f"{name_of(args.file)}: is a log of CAN frames, which has no bytes of ESCs. Type canplayer -I FILE (of can-utils) to send "
                 "a candump log; kontronik-can-gw convert makes one of other logs."
             )
         play = {"can": _on_can, "pty": _on_pty}[args.on]
@@ -112,7 +123,6 @@ def main(args: argparse.Namespace) -> int:
         say(f"{text}{', stopped' if pace.stopped.is_set() else ''}")
         for line in recording.damage:
             say(f"warning: {line}")
-    return 0
 
 
 def _on_can(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str:

@@ -1,11 +1,14 @@
 """Where the frames of monitor and MQTT come from: the CAN bus, to which nothing is sent, a recording in real time, or a simulation."""
 
+import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from typing import Self
 
+from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.assemble import assemble, check_devices
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.config.parse import parse
@@ -110,8 +113,47 @@ class Bus(Source):
         self._listener.close()
 
 
+class _FramesAhead:
+    """Frames of a stream, read by a thread so that nobody has to wait for the next one."""
+
+    def __init__(self, frames: Iterator[TimedFrame]) -> None:
+        self._frames = frames
+        self._read: queue.Queue[TimedFrame | None] = queue.Queue(1000)
+        self._problem: Exception | None = None
+        self.have_ended = False
+        Thread(target=self._read_all, daemon=True).start()
+
+    def take(self) -> TimedFrame | None:
+        """The next frame; None if it has not arrived yet, or after the last one. Raises the reader's exception at its place."""
+        try:
+            found = self._read.get_nowait()
+        except queue.Empty:
+            return None
+        if found is None:
+            self.have_ended = True
+            if self._problem is not None:
+                raise self._problem
+        return found
+
+    def close(self) -> None:
+        """Wait for the thread; the stream must have been ended."""
+        while not self.have_ended:
+            self.have_ended = self._read.get() is None
+
+    def _read_all(self) -> None:
+        try:
+            for frame in self._frames:
+                self._read.put(frame)
+        except Exception as error:  # raised again by the thread that takes the frames
+            self._problem = error
+        self._read.put(None)
+
+
 class Recording(Source):
-    """Frames from a file, played in real time times ``speed``; ``at_once``: as fast as it can be read."""
+    """Frames from a recording, played in real time times ``speed``; ``at_once``: as fast as it can be read.
+
+    A stream is played as its frames arrive, and waits for nothing. While none arrive its clock goes on, so that values expire.
+    """
 
     is_file = True
 
@@ -119,11 +161,31 @@ class Recording(Source):
         super().__init__(Path(opened.name).name, opened.bus)
         self._input, self._speed, self._at_once = opened, speed, at_once
         self._frames = opened.frames()
-        self._next = next(self._frames, None)
-        self._clock = self._first_ns = 0 if self._next is None else self._next.time_ns
-        opened.begin_ns = self._first_ns
+        self._ahead = None if opened.stream is None else _FramesAhead(self._frames)
+        self._next: TimedFrame | None = None
+        self._has_begun = False
+        self._clock = self._first_ns = 0
         self._last_pump = time.monotonic()
-        self.ended = self._next is None
+        self._advance()
+
+    def _advance(self) -> None:
+        """Fetch the next frame, if there is one yet."""
+        if self._ahead is None:
+            self._next = next(self._frames, None)
+            self.ended = self._next is None
+        else:
+            self._next = self._ahead.take()
+            self.ended = self._ahead.have_ended
+        if not self._has_begun and self._next is not None:
+            self._has_begun = True
+            self._clock = self._first_ns = self._next.time_ns
+            self._input.begin_ns = self._first_ns
+
+    def close(self) -> None:
+        """End a stream and the thread that reads it."""
+        if self._ahead is not None and self._input.stream is not None:
+            self._input.stream.end()
+            self._ahead.close()
 
     def pump(self, take: Take, until_s: float) -> None:
         begin = time.monotonic()
@@ -131,20 +193,22 @@ class Recording(Source):
         passed, self._last_pump = min(begin - self._last_pump, _MAX_LAG_S), begin
         pause = _LONGEST_SLEEP_S
         if not self.paused and not self.ended:
-            clock = self._clock + round(passed * self._speed * SECOND)
+            if self._next is None:
+                self._advance()
+            clock = self._clock + round(passed * self._speed * SECOND) * self._has_begun
             while self._next is not None and (self._at_once or self._next.time_ns <= clock):
-                self._clock = self._next.time_ns
+                self._clock = max(self._clock, self._next.time_ns)
                 take(self._next.frame, self._clock)
-                self._next = next(self._frames, None)
+                self._advance()
                 if time.monotonic() >= until_s:
                     break
             else:
-                if self._next is not None:  # at the end the clock stays
+                if not self.ended and not self._at_once:  # at the end the clock stays
                     self._clock = clock
+                if self._next is not None:
                     pause = min(pause, (self._next.time_ns - clock) / SECOND / self._speed)
-            self.ended = self._next is None
         pause = min(pause, until_s - time.monotonic())
-        if pause > 0 and not self._at_once:
+        if pause > 0 and (not self._at_once or self._next is None):
             time.sleep(pause)
 
     def now(self) -> int:

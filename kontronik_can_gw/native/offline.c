@@ -259,7 +259,7 @@ static void find(kcg_offline *o, const uint8_t *data, size_t size)
     }
 }
 
-/* Where the next header begins, or else what is undecided at the end of a read. */
+/* Where the next header begins. Without one, the end of the bytes, less a header that is not complete. */
 static size_t piece_end(const uint8_t *b, size_t from, size_t size, int ended)
 {
     for (size_t at = from + 1; at + MAGIC <= size; at++) {
@@ -270,7 +270,11 @@ static size_t piece_end(const uint8_t *b, size_t from, size_t size, int ended)
         if (p[1] == 'O' && p[2] == 'D')
             return at;
     }
-    return ended ? size : size > from + MAGIC - 1 ? size - (MAGIC - 1) : from;
+    if (ended)
+        return size;
+    if (size >= from + 2 && b[size - 2] == 'K' && b[size - 1] == 'O')
+        return size - 2;
+    return size > from && b[size - 1] == 'K' ? size - 1 : size;
 }
 
 int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)

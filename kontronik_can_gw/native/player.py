@@ -173,11 +173,15 @@ class Player(Output):
         """True where rows must be taken before more is played."""
         return bool(self._state.rows + KCG.MAX_ROWS > self._state.room)
 
+    def rows_so_far(self) -> Rows:
+        """The rows that are complete. Later ones are appended to them, until ``take_rows``."""
+        self._rows.count = self._state.rows
+        return self._rows
+
     def take_rows(self, final: bool = False) -> Rows:
         """The rows that are complete; ``final``: also the one that is open."""
         if final:
             self._library.kcg_close_row(c.byref(self._state))
-        found = self._rows
-        found.count = self._state.rows
+        found = self.rows_so_far()
         self._new_rows()
         return found

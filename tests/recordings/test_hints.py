@@ -1,23 +1,11 @@
 """What is no recording, and what is said where a log is of more ESCs than its DBC."""
 
-import os
 from pathlib import Path
 
 import asammdf
 import numpy as np
-import pytest
 from command_line import refused, run
 from simulated_bus import flight, layout_of, write_log
-
-
-@pytest.mark.parametrize("command", ["convert", "decode"])
-def test_a_pipe_or_a_device_is_refused_and_not_opened(tmp_path: Path, command: str) -> None:
-    """To open a fifo would wait for its other end."""
-    os.mkfifo(fifo := tmp_path / "fifo")
-    for path in ("-", fifo, "/dev/zero"):
-        words = [command, path, *([tmp_path / "o.csv"] if command == "convert" else [])]
-        assert refused(2, *words).startswith(f"{path}: is no file.")
-    assert [*tmp_path.iterdir()] == [fifo]
 
 
 def test_frames_that_the_dbc_does_not_have_are_counted_and_the_remedy_is_said(

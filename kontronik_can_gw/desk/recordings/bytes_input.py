@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from io import BufferedReader
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -14,6 +15,7 @@ from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core import PythonCore
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.played import PlayedInput
+from kontronik_can_gw.desk.recordings.stream import Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -29,15 +31,16 @@ if TYPE_CHECKING:
 CHUNK = 1 << 16
 PERIOD_NS = 10 * MS
 UART_MAGIC = b"KOD"
-"""What a telemetry frame begins with."""
-_UNDECIDED = len(UART_MAGIC) - 1
-"""Bytes at the end of a read that may begin a header."""
+"""The first bytes of every telemetry frame."""
+_BEGINS_OF_HEADER = (b"KO", b"K")
 
 
 class BytesInput(PlayedInput):
     """The bytes of one ESC, without times."""
 
-    def __init__(self, path: Path, layout: BusLayout | None = None) -> None:
+    def __init__(
+        self, path: Path, layout: BusLayout | None = None, stream: Stream | None = None
+    ) -> None:
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         if len(layout.escs) != 1:
             raise UserError(
@@ -48,6 +51,7 @@ class BytesInput(PlayedInput):
         escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
         setup = CaptureSetup(escs, (str(path),), None, DbcConfig(), False, None)
         super().__init__(str(path), layout, setup)
+        self.stream = stream
         self.provenance["times"] = "assumed: 100 live frames a second"
         if layout.config is None:
             self.provenance["motor"] = (
@@ -55,23 +59,37 @@ class BytesInput(PlayedInput):
             )
 
     def entries(self) -> Iterator[Entry]:
-        """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period after it."""
-        now = 0
-        with self._path.open("rb") as file:
-            for now, reading in self._found(PROTOCOLS[0].make()):
-                end = reading.offset + reading.form.length
-                while data := file.read(min(CHUNK, end - file.tell())):
-                    yield Entry(now, Kind.BYTES, data=data)
-            while data := file.read(CHUNK):
-                yield Entry(now, Kind.BYTES, data=data)
+        """The bytes up to each frame's end, at the frame's time."""
+        now = given = 0
+        held = bytearray()
+
+        def hold(pieces: Iterator[bytes]) -> Iterator[bytes]:
+            for data in pieces:
+                held.extend(data)
+                yield data
+
+        for now, reading in self._found(PROTOCOLS[0].make(), hold(self.esc_bytes(0))):
+            size = reading.offset + reading.form.length - given
+            yield Entry(now, Kind.BYTES, data=bytes(held[:size]))
+            del held[:size]
+            given += size
+        if held:
+            yield Entry(now, Kind.BYTES, data=bytes(held))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:  # noqa: ARG002  there is one
         try:
-            with self._path.open("rb") as file:
-                while data := file.read(CHUNK):
+            with self._open() as file:
+                while data := file.read1(CHUNK):
                     yield data
         except OSError as error:
             raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
+
+    def _open(self) -> BufferedReader:
+        return self._path.open("rb") if self.stream is None else StreamReader(self.stream)
+
+    def close(self) -> None:
+        if self.stream is not None:
+            self.stream.close()
 
     def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
         return None
@@ -113,10 +131,15 @@ class BytesInput(PlayedInput):
             yield player.take_frames()
         self._describe_damage(player.counters)
 
-    def _found(self, decoder: Any) -> Iterator[tuple[int, Reading]]:
-        """Each frame at its time. The decoder is given the bytes up to the next header with it: its counters are of that time."""
+    def _found(
+        self, decoder: Any, read: Iterator[bytes] | None = None
+    ) -> Iterator[tuple[int, Reading]]:
+        """Each frame at its time: a live frame each period, an info frame half a period after it.
+
+        The decoder is given the bytes up to the next header with it: its counters are of that time.
+        """
         now = lives = 0
-        for piece in chain(self._pieces(), (b"",)):
+        for piece in chain(_pieces(read or self.esc_bytes(0)), (b"",)):
             for frame in decoder.feed(piece) if piece else decoder.flush():
                 if not frame.form.is_info:
                     now = lives * PERIOD_NS
@@ -126,18 +149,6 @@ class BytesInput(PlayedInput):
                 yield now, frame
         self._describe_damage(decoder.counters)
 
-    def _pieces(self) -> Iterator[bytes]:
-        """The bytes of the file, each header at the beginning of a piece."""
-        rest = b""
-        for data in self.esc_bytes(0):
-            first, *others = (rest + data).split(UART_MAGIC)
-            pieces = [first, *(UART_MAGIC + other for other in others)]
-            rest = pieces[-1][-_UNDECIDED:]
-            pieces[-1] = pieces[-1][:-_UNDECIDED]
-            yield from filter(None, pieces)
-        if rest:
-            yield rest
-
     def _describe_damage(self, counters: Counters) -> None:
         self.damage = []
         if counters.dropped_bytes:
@@ -146,3 +157,16 @@ class BytesInput(PlayedInput):
             )
         if not counters.live:
             self.damage.append(counters.diagnosis() or "no live frame")
+
+
+def _pieces(read: Iterator[bytes]) -> Iterator[bytes]:
+    """The bytes of a file, cut in front of each header. Only a header that is not complete is held back."""
+    rest = b""
+    for data in read:
+        first, *others = (rest + data).split(UART_MAGIC)
+        pieces = [first, *(UART_MAGIC + other for other in others)]
+        last = pieces.pop()
+        rest = next((begin for begin in _BEGINS_OF_HEADER if last.endswith(begin)), b"")
+        yield from filter(None, (*pieces, last[: len(last) - len(rest)]))
+    if rest:
+        yield rest

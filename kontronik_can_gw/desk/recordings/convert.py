@@ -38,23 +38,32 @@ ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 
 
 class Output:
-    """Where the data goes: a file that takes its name when all is well and ``is_whole`` was set, or standard output (``target`` None).
+    """The destination of converted data: a file, or standard output if ``target`` is None.
 
-    Until then it is written beside, as ``NAME.part``. What is no plain file (a pipe, /dev/stdout) is written to as it stands. ``what``: how
-    a person gives it.
+    A file is written as ``NAME.part`` beside its destination and takes its name at the end, if ``is_whole`` was set. Pipes and devices such
+    as /dev/stdout are written to directly. ``what``: how a user names the destination.
     """
+
+    keeps_part = False
+    """True: if writing fails, ``NAME.part`` stays with the data so far, because its input cannot be read again."""
 
     def __init__(self, target: Path | None, what: str = "file") -> None:
         self.is_whole = False
         self.watch: Callable[[Iterable[Any]], Iterable[Any]] = iter
-        """What is converted passes through this, block by block."""
+        """All converted data pass through this, block by block."""
         self._target, self._what = target, what
         self._file: IO[bytes] | None = None
         self._part: Path | None = None
-        """What may have been made."""
+        """The file that may have been created."""
+
+    @property
+    def kept_part(self) -> Path | None:
+        """After a failure: the file with the data so far, if it was kept."""
+        is_there = self.keeps_part and self._part is not None and self._part.exists()
+        return self._part if is_there else None
 
     def open(self) -> IO[bytes]:
-        """What to write to. RunError where it cannot be opened."""
+        """The file to write to. RunError if it cannot be opened."""
         target = self._target
         if target is None:
             return sys.stdout.buffer
@@ -77,17 +86,21 @@ class Output:
 
     def __exit__(self, kind: object, *_: object) -> None:
         is_kept = kind is None and self.is_whole
+        has_failed = kind is not None
         if kind is None and self._target is None:
             sys.stdout.flush()
         try:
             if self._file is not None:
-                # what is buffered of a file that is not kept may find no room
+                # buffered data of a file that is not kept may find no room
                 with suppress(*([] if is_kept else [OSError])):
                     self._close(self._file, is_kept)
             if is_kept and self._part is not None and self._target is not None:
                 self._part.replace(os.path.realpath(self._target))
+        except BaseException:
+            has_failed = True
+            raise
         finally:
-            if self._part is not None:
+            if self._part is not None and not (has_failed and self.keeps_part):
                 self._part.unlink(missing_ok=True)
 
     def _close(self, file: IO[bytes], is_kept: bool) -> None:
@@ -112,7 +125,9 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     fields = [recording.fields[index] for index in choice.columns]
     has_utc = recording.wall_ns(origin_ns) is not None
     table = Table(fields, has_utc, origin_ns, recording.provenance)
-    count, last_ns = _write_all(_table_writer(out.open(), form, table), blocks, out)
+    file = out.open()
+    _flush_before_waits(recording, file)
+    count, last_ns = _write_all(_table_writer(file, form, table), blocks, out)
     lasted = last_ns - origin_ns
     return f"{counted(count, 'row')} of {counted(len(fields), 'value')}, up to {lasted / 1e9:.3f} s"
 
@@ -144,7 +159,9 @@ def to_log(
     recording.begin_ns = origin_ns
     wall_ns = recording.wall_ns(origin_ns)
     known = wall_ns, origin_ns, recording.channel, recording.provenance
-    writer = CanLogWriter(out.open(), form, *known)
+    file = out.open()
+    _flush_before_waits(recording, file)
+    writer = CanLogWriter(file, form, *known)
     count, last_ns = _write_all(writer, batches, out)
     lasted = last_ns - origin_ns
     frames_written = counted(count - sum(writer.left_out.values()), "CAN frame")
@@ -154,6 +171,12 @@ def to_log(
     if writer.channels.changes:
         summary += f"; channels: {writer.channels.changes}"
     return summary
+
+
+def _flush_before_waits(recording: "Input", file: IO[bytes]) -> None:
+    """Write buffered data whenever the recording is a pipe that has no more data at the moment."""
+    if recording.stream is not None:
+        recording.stream.before_wait = file.flush
 
 
 def _write_all(writer: Any, items: Iterator[Any], out: Output) -> tuple[int, int]:
@@ -176,7 +199,9 @@ def _write_all(writer: Any, items: Iterator[Any], out: Output) -> tuple[int, int
 
 def to_bytes(recording: "Input", out: Output, esc: int) -> str | None:
     """To the plain bytes of one ESC."""
-    file, count = out.open(), 0
+    file = out.open()
+    _flush_before_waits(recording, file)
+    count = 0
     for data in out.watch(recording.esc_bytes(esc)):
         file.write(data)
         count += len(data)

@@ -1,9 +1,15 @@
-"""Recordings of every kind as one thing: CAN frames in order of time, and rows of values.
+"""Opens recordings of every kind: captures, logs of CAN frames, and plain UART bytes of one ESC.
 
-A capture (.kcap) goes through the gateway's core with the recorded clock. Plain UART bytes have no time: their live frames are taken to
-come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what a file is by its content.
+A capture (.kcap) is played through the gateway's core with the recorded clock. Plain UART bytes have no times: their live frames are
+assumed to arrive at a fixed rate. ``open_input`` finds the format from the content.
+
+A pipe is read as its data arrive if it carries UART bytes or candump text. Other formats are copied to a temporary file first.
 """
 
+import io
+import shutil
+import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
@@ -11,58 +17,131 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.bytes_input import UART_MAGIC, BytesInput
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.recordings.log_input import CanLogInput, candump_advice, log_format
+from kontronik_can_gw.desk.recordings.log_input import (
+    STREAMED,
+    CanLogInput,
+    candump_advice,
+    log_format,
+)
 from kontronik_can_gw.desk.recordings.recording import Input
+from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, open_stream
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.protocols import PROTOCOLS
 
 __all__ = ["BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
 
-_HEAD = 1 << 16
+_CAPTURE, _BYTES = "capture", "bytes"
+"""Formats beside those of ``log_format``."""
 
 
 def open_input(path: Path, layout: BusLayout | None = None) -> Input:
-    """Open a recording. UserError for other files, RunError for what cannot be read.
+    """Open a recording. UserError if it is not a recording, RunError if it cannot be read.
 
-    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run. ``layout``: of CAN
-    logs and plain bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
+    ``path``: a file, a named pipe, or ``-`` for standard input. A folder of captures, or the common prefix of their names, stands for
+    all parts of one run. ``layout``: of the frames in a CAN log and of those made from plain bytes, by default the shipped DBC of one
+    ESC. For a capture it replaces the recorded one.
     """
-    _check_kind(path)
+    if (stream := open_stream(path)) is not None:
+        return _open_stream(stream, layout)
     parts = _parts(path)
     if parts is not None:
         return CaptureInput(parts, layout)
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
-    if not head.strip():
-        raise UserError(f"{path}: is empty")
-    if MAGIC in head or path.suffix == SUFFIX:
-        return CaptureInput([path], layout)
-    if (found := log_format(head)) is not None:
-        layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-        return CanLogInput(path, layout, found)
-    if UART_MAGIC in head:
-        return BytesInput(path, layout)
-    if (advice := candump_advice(head)) is not None:
-        raise UserError(f"{path}: {advice}")
-    raise UserError(
-        f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_HEAD // 1024} kB"
-    )
+    return _open_file(path, layout)
 
 
 def open_bytes(path: Path, layout: BusLayout | None) -> Input:
-    """Open the bytes of one ESC, whatever is in them."""
-    _check_kind(path)
-    return BytesInput(path, layout)
+    """Open a file or a pipe as the bytes of one ESC, whatever its content is."""
+    return BytesInput(path, layout, open_stream(path))
 
 
-def _check_kind(path: Path) -> None:
-    """UserError for a pipe or a device. None is opened: it might be the port of an ESC."""
-    if str(path) == "-" or (path.exists() and not path.is_file() and not path.is_dir()):
-        raise UserError(
-            f"{path}: is no file. What comes through a pipe is written into one first: COMMAND > FILE"
-        )
+def _open_file(path: Path, layout: BusLayout | None) -> Input:
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
+    found = _format_of(head, str(path), is_capture=path.suffix == SUFFIX)
+    if found == _CAPTURE:
+        return CaptureInput([path], layout)
+    if found == _BYTES:
+        return BytesInput(path, layout)
+    return CanLogInput(path, layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc")), found)
+
+
+def _format_of(head: bytes, name: str, *, is_capture: bool = False) -> str:
+    """The format of a recording by its head. UserError if it is none."""
+    if not head.strip():
+        raise UserError(f"{name}: is empty")
+    if is_capture or MAGIC in head:
+        return _CAPTURE
+    if (found := log_format(head)) is not None:
+        return found
+    if UART_MAGIC in head:
+        return _BYTES
+    if (advice := candump_advice(head)) is not None:
+        raise UserError(f"{name}: {advice}")
+    raise UserError(
+        f"{name}: is neither a capture nor a CAN log (candump, ASC, BLF, TRC, MF4), and has no ESC telemetry in its first {HEAD // 1024} kB"
+    )
+
+
+# --- pipes
+
+
+def _open_stream(stream: Stream, layout: BusLayout | None) -> Input:
+    with ExitStack() as on_error:
+        on_error.callback(stream.close)
+        found = _format_of_stream(stream)
+        if found == _BYTES:
+            opened: Input = BytesInput(Path(stream.name), layout, stream)
+        elif found in STREAMED:
+            layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+            opened = CanLogInput(Path(stream.name), layout, found, stream)
+        else:
+            return _open_spooled(stream, layout)
+        on_error.pop_all()
+    return opened
+
+
+def _format_of_stream(stream: Stream) -> str:
+    """Wait until the format is certain. A whole line of a log, or one intact frame of an ESC, is enough."""
+    decoder = PROTOCOLS[0].make()
+    done = 0
+    while len(stream.head) < HEAD and stream.look():
+        head = stream.head
+        if head.startswith(MAGIC):
+            return _CAPTURE
+        if (found := log_format(head[: head.rfind(b"\n") + 1] or head[:8])) is not None:
+            return found
+        if decoder.feed(head[done:]):
+            return _BYTES
+        done = len(head)
+    return _format_of(stream.head, stream.name)
+
+
+def _open_spooled(stream: Stream, layout: BusLayout | None) -> Input:
+    """Copy a stream to a temporary file without a name, and open that."""
+    file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  open as long as the recording
+    with ExitStack() as on_error:
+        on_error.enter_context(file)
+        try:
+            shutil.copyfileobj(io.BufferedReader(stream, HEAD), file, HEAD)
+        except OSError as error:
+            raise RunError(
+                f"{tempfile.gettempdir()}: {stream.name} cannot be stored there: {error.strerror}. Set TMPDIR to a folder with more room."
+            ) from None
+        path = Path(f"/proc/self/fd/{file.fileno()}")
+        try:
+            opened = _open_file(path, layout)
+        except UserError as error:
+            problems = [problem.replace(str(path), stream.name) for problem in error.problems]
+            raise type(error)(*problems) from None
+        opened.name = stream.name
+        opened.resources.enter_context(on_error.pop_all())
+    return opened
+
+
+# --- captures of several parts
 
 
 def _parts(path: Path) -> list[Path] | None:

@@ -9,6 +9,8 @@ every format:
 3. A time that jumps ahead by more than 10 s is kept and reported: a pause looks the same as a clock
    that was set ahead.
 4. A single time that leads far away and back is damaged, and its frame is left out.
+
+Rules 1, 3 and 4 need the frames that follow. A frame at a usual time is returned at once.
 """
 
 from bisect import bisect_right
@@ -33,14 +35,18 @@ _REMEMBERED = 256
 
 
 class LogClock:
-    """Gives the frames of a log continuous times, and remembers where the clock was set."""
+    """Gives the frames of a log continuous times, and remembers where the clock was set.
 
-    def __init__(self, source: Iterable[LogFrame]) -> None:
+    ``is_live``: the next frame may not have arrived yet, so the first one is trusted.
+    """
+
+    def __init__(self, source: Iterable[LogFrame], *, is_live: bool = False) -> None:
         self.steps: list[ClockStep] = []
         """Complete when all frames have been read."""
         self.impossible = 0
         """Frames that were left out because their time is damaged."""
         self._source = iter(source)
+        self._is_live = is_live
         self._ahead: deque[LogFrame] = deque()
         self._recent: deque[LogFrame] = deque(maxlen=_REMEMBERED)
         self._shift_ns = 0

@@ -20,10 +20,13 @@ from kontronik_can_gw.desk.recordings.recording import (
     Sample,
 )
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
+from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError
 
 _BATCH = 256
 """Frames."""
+STREAMED = ("candump",)
+"""Formats that are read from a pipe as their data arrive."""
 _HEAD_LINES = 2000
 _LOOK_FOR_CHANNELS = 10_000
 """Frames in which further channels are looked for, once there are too many."""
@@ -71,9 +74,13 @@ def _reader_of(format_: str) -> type[text.LogReader]:
 class CanLogInput(Input):
     """A log of CAN frames. UserError for a table in MF4, RunError where it cannot be read."""
 
-    def __init__(self, path: Path, layout: BusLayout, format_: str) -> None:
+    def __init__(
+        self, path: Path, layout: BusLayout, format_: str, stream: Stream | None = None
+    ) -> None:
         super().__init__(str(path), layout)
         self._path, self._format = path, format_
+        self.stream = stream
+        self._is_unread = True
         self._selected: str | None = None
         self._channels: dict[str, None] = {}
         """Channels of the frames that have been read."""
@@ -84,18 +91,29 @@ class CanLogInput(Input):
 
     def _open(self) -> None:
         try:
-            self._file = self._path.open("rb")
+            self._file = (
+                self._path.open("rb", buffering=HEAD)
+                if self.stream is None
+                else StreamReader(self.stream)
+            )
         except OSError as error:
             raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
         self._reader = _reader_of(self._format)(self._file)
-        self._clock = LogClock(self._reader)
+        self._clock = LogClock(self._reader, is_live=self.stream is not None)
+
+    def _rewind(self) -> None:
+        """Go to the beginning."""
+        if not self._is_unread:
+            self.close()
+            self._open()
+        self._is_unread = False
 
     def select_channel(self, name: str) -> None:
         self._selected = name
 
     def batches(self) -> Iterator[list[LogFrame]]:
         frames = self._logged()
-        while some := list(islice(frames, _BATCH)):
+        while some := list(islice(frames, _BATCH if self.stream is None else 1)):
             yield some
 
     def frames(self) -> Iterator[TimedFrame]:
@@ -122,8 +140,7 @@ class CanLogInput(Input):
 
     def _logged(self) -> Iterator[LogFrame]:
         """All frames, or those of the selected channel. UserError if the log does not have it."""
-        self.close()
-        self._open()
+        self._rewind()
         clock, selected = self._clock, self._selected
         self._channels = {}
         self._chosen = selected

@@ -80,18 +80,24 @@ class PlayedInput(Input):
         return super().blocks(chosen) if found is None else self._played(*found)
 
     def _played(self, gateway: Gateway, player: "Player") -> Iterator[Block]:
+        done = 0
         for _ in self._play(gateway, player):
             if player.is_full:
-                yield from self._timed(player.take_rows())
-        yield from self._timed(player.take_rows(final=True))
+                yield from self._timed(player.take_rows(), done)
+                done = 0
+            elif self.stream is not None:
+                rows = player.rows_so_far()
+                yield from self._timed(rows, done)
+                done = rows.count
+        yield from self._timed(player.take_rows(final=True), done)
 
-    def _timed(self, rows: "Rows") -> Iterator[Block]:
-        """Blocks of rows in which the wall clock goes on as it began."""
-        times = rows.times
-        cuts = {bisect_left(times, since) for since, _ in self._offsets}
-        for begin, end in pairwise(sorted({0, rows.count, *cuts})):
-            wall_ns = self.wall_ns(times[begin])
-            yield PlayedBlock(rows, begin, end, None if wall_ns is None else wall_ns - times[begin])
+    def _timed(self, rows: "Rows", begin: int) -> Iterator[Block]:
+        """The rows from ``begin`` on, in blocks during which the wall clock was not set."""
+        times, count = rows.times, rows.count
+        cuts = {max(begin, bisect_left(times, since)) for since, _ in self._offsets}
+        for first, end in pairwise(sorted({begin, count, *cuts})):
+            wall_ns = self.wall_ns(times[first])
+            yield PlayedBlock(rows, first, end, None if wall_ns is None else wall_ns - times[first])
 
     def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
         """Without messages; nodes are there, because they may change pole pairs and gear."""

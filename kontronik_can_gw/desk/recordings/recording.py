@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from itertools import chain, groupby, islice, takewhile
 from operator import itemgetter
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.fields import Field, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.stream import Stream
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
@@ -124,10 +126,13 @@ class PlayedBlock(Block):
 
 
 class Input(ABC):
-    """A recording. Each of ``frames``, ``blocks``, ``esc_bytes`` reads it from its beginning.
+    """A recording. Each of ``frames``, ``blocks``, ``esc_bytes`` reads it from its beginning, a stream only once.
 
-    ``damage`` (what was not intact) has a line each and is complete when it was read to the end.
+    ``damage`` has a line for each part that is not intact. It is complete after the recording was read to its end.
     """
+
+    stream: Stream | None = None
+    """The pipe from which it is read as data arrive: blocks and batches are then returned as soon as they are complete."""
 
     def __init__(self, name: str, bus: BusLayout) -> None:
         self.name = name
@@ -139,6 +144,8 @@ class Input(ABC):
         """CAN frames that the layout does not have; complete when it was read to the end."""
         self.begin_ns = 0
         """Time 0 of the output, from which ``clock_notes`` count. Set by the conversion."""
+        self.resources = ExitStack()
+        """Closed with the recording."""
 
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
@@ -201,7 +208,7 @@ class Input(ABC):
         """Rows of the values of ``chosen`` fields, in that order; None: of all."""
         samples = self.samples_in_python(range(len(self.fields)) if chosen is None else chosen)
         found = ((self._wall_of(row), *row) for row in samples)
-        while some := list(islice(found, ROWS)):
+        while some := list(islice(found, ROWS if self.stream is None else 1)):
             for wall_ns, rows in groupby(some, itemgetter(0)):
                 _, times, values = zip(*rows, strict=True)
                 yield Block(times, [*zip(*values, strict=True)], wall_ns)
@@ -230,7 +237,8 @@ class Input(ABC):
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        with self.resources:
+            self.close()
 
     def _wall_of(self, row: Sample) -> int | None:
         wall_ns = self.wall_ns(row.time_ns)

@@ -7,6 +7,7 @@ left out. ASC: asc.py.
 import io
 import re
 from collections.abc import Iterator, Sequence
+from io import BufferedReader
 from typing import Any, BinaryIO
 
 from kontronik_can_gw.desk.recordings.recording import ERROR, LATEST_NS, LogFrame
@@ -97,12 +98,11 @@ class LogReader:
 
 
 class TextReader(LogReader):
-    """Reads a log line by line."""
+    """Reads a log line by line. ``file``: buffered, at its beginning; its first buffer holds the log's head."""
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: BufferedReader) -> None:
         super().__init__(file)
-        self._read_head([file.readline(LONGEST_LINE) for _ in range(_HEAD_LINES)])
-        file.seek(0)
+        self._read_head(io.BytesIO(file.peek()).readlines()[:_HEAD_LINES])
 
     def __iter__(self) -> Iterator[LogFrame]:
         number, last, count = 1, 0, 0
