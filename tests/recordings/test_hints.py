@@ -4,6 +4,7 @@ from pathlib import Path
 
 import asammdf
 import numpy as np
+import pytest
 from command_line import refused, run
 from simulated_bus import flight, layout_of, write_log
 
