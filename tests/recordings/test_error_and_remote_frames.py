@@ -1,5 +1,6 @@
 """Error frames and remote frames of a log are copied if the format has them, and counted if not."""
 
+import struct
 from pathlib import Path
 
 import can
@@ -151,7 +152,14 @@ def test_error_objects_of_blf_that_python_can_skips_are_read(tmp_path: Path, kin
             writer.on_message_received(
                 can.Message(now, 0x688, False, data=DATA.data, channel=1, is_rx=True)
             )
-            writer._add_object(kind, data, now + 0.001)
+            if kind == 2:
+                writer._add_object(kind, data, now + 0.001)
+            else:  # a header of version 2, which is longer
+                head = struct.pack("<4sHHLL", b"LOBJ", 40, 2, 40 + len(data), kind)
+                times = struct.pack("<LBxHQ8x", 2, 0, 0, (number * 10 + 1) * MS)
+                writer._buffer.append(head + times + data + bytes(len(data) % 4))
+                writer._buffer_size += len(writer._buffer[-1])
+                writer._flush()
     found = _logged(path)
     assert [(item.kind, item.channel) for item in found] == [
         ("CAN frame", "2"),

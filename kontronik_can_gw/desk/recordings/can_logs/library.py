@@ -86,12 +86,13 @@ class _SoundObjects(BLFReader):
 
 
 def _error_message(data: bytes) -> "Message":
-    """The error frame of an object that python-can does not read. The channel is its first byte."""
+    """The error frame of an object that python-can does not read. The channel follows its header."""
     from can import Message
 
+    (header_size,) = struct.unpack_from("<H", data, 4)
     flags, time = struct.unpack_from("<L4xQ", data, 16)
     unit = 1e-5 if flags == 1 else 1e-9
-    return Message(time * unit, is_error_frame=True, channel=data[32] - 1)
+    return Message(time * unit, is_error_frame=True, channel=data[header_size] - 1)
 
 
 class BlfReader(LibraryReader):
