@@ -8,7 +8,13 @@ from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import Device
-from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import (
+    INFO_TIMEOUT_NS,
+    MS,
+    SECOND,
+    EscSettings,
+    LinkState,
+)
 from kontronik_can_gw.gateway import Gateway
 
 EVENT = 'BA_ "GenMsgSendType" BO_ 256 1;\n'
@@ -99,6 +105,22 @@ def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_seco
     for n in range(500):  # for 5 s; each tenth frame is damaged
         sent += bench.read(good if n % 10 else good[:20] + b"\x55" + good[21:])
     assert 3 * per_second <= int.from_bytes(sent[-1][:4], "little") <= 5 * per_second
+
+
+@pytest.mark.parametrize(("more", "link"), [(0, LinkState.OK), (1, LinkState.DEGRADED)])
+def test_a_link_is_degraded_above_a_tenth_of_dropped_bytes(more: int, link: LinkState) -> None:
+    """In a second 18 frames and two frames' length of noise come, and one byte more."""
+    bench = Bench(SPEED)
+    frame = wire(electrical_speed=1)
+    bench.read(frame)  # from this one on the bytes are counted
+    noise = bytes(2 * len(frame) + more)
+    assert (len(noise) * 10 > 18 * len(frame) + len(noise)) == bool(more)
+    for n in range(18):
+        bench.wait(55 * MS - PERIOD)
+        bench.read(noise + frame if n == 0 else frame)
+    assert bench.gateway.escs[0].link is LinkState.OK
+    bench.wait(20 * MS)  # the second is over
+    assert bench.gateway.escs[0].link is link
 
 
 def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:

@@ -306,6 +306,12 @@ def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
     bench.turn(200)
     assert bench.gateway.status.bus_off_count == 2
     assert told(bench.take()) == ["8110", "0000"]
+    bench.turn(1000)  # it is reported once a second at most
+    bench.port.overruns = 1
+    for _ in range(3000):  # frames are received all the time
+        bench.can.serve(bench.now)
+        bench.turn()
+    assert told(bench.take()) == ["8110", "0000"]
 
 
 def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) -> None:
@@ -440,3 +446,22 @@ def test_an_adapter_that_was_pulled_out_in_bus_off_boots_its_node_when_it_is_bac
     bench.turn(10)
     assert bench.can.is_open
     assert BOOT_UP in bench.take()
+
+
+def test_frames_that_are_thrown_away_in_an_outage_are_told_to_who_records(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A replay would show them otherwise."""
+    bench.begin()
+    told_at: list[int] = []
+    monkeypatch.setattr(bench.gateway, "not_sent", told_at.append)
+    bench.turn(100)
+    assert told_at == []
+    bench.changes(LinkFacts(exists=False), there=False)
+    bench.turn(1000)
+    assert len(told_at) > 10
+    bench.changes(ACTIVE)
+    bench.turn(100)
+    told_at.clear()
+    bench.turn(100)
+    assert told_at == []
