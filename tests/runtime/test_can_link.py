@@ -78,8 +78,13 @@ class Bench:
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
+        self.world = World()
         self.can = CanLink(
-            *(loaded.config.can, self.gateway, World().poller, FaultLog()), clock=lambda: self.clock
+            loaded.config.can,
+            self.gateway,
+            self.world.poller,
+            FaultLog(),
+            clock=lambda: self.clock,
         )
 
     @property
@@ -465,3 +470,29 @@ def test_frames_that_are_thrown_away_in_an_outage_are_told_to_who_records(
     told_at.clear()
     bench.turn(100)
     assert told_at == []
+
+
+def test_an_adapter_that_fails_now_and_then_is_opened_after_the_shortest_pause(
+    bench: Bench,
+) -> None:
+    """Nothing reports that it is there again: pauses grow only while no frame can be sent."""
+    bench.start()
+    for _ in range(5):
+        bench.turn(500)
+        failed = bench.port
+        failed.gone = True
+        bench.can.serve(bench.now)
+        assert not bench.can.is_open
+        assert CAN_FD not in bench.world.handlers
+        bench.turn(110)
+        assert bench.port is not failed
+
+
+def test_frames_that_are_received_are_counted(bench: Bench) -> None:
+    bench.start()
+    bench.turn(10)
+    before = bench.gateway.status.received_frames
+    bench.port.came(0x601, bytes(8), at=0)
+    bench.port.came(0x601, bytes(8), at=0)
+    bench.can.serve(bench.now)
+    assert bench.gateway.status.received_frames == before + 2

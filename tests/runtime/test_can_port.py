@@ -119,6 +119,17 @@ def filters_of(fake: FakeSocket) -> list[tuple[int, int]]:
     return list(struct.iter_unpack("=II", packed))
 
 
+def test_a_new_socket_receives_no_data_frame_and_none_of_its_own(
+    port: CanPort, fake: FakeSocket
+) -> None:
+    """Its own frames would look as if another device sent with its ids."""
+    assert fake.options[socket.CAN_RAW_FILTER] == b""
+    assert fake.options[socket.CAN_RAW_RECV_OWN_MSGS] == 0
+    assert fake.options[socket.SO_RCVBUF] == 1 << 20, (
+        "frames wait there while the process is held up"
+    )
+
+
 @settings(max_examples=80)
 @given(st.sets(st.integers(0, 0x7FF)), st.sets(st.integers(0, 0x1FFFFFFF), max_size=600))
 @example(set(range(0x800)), set())
