@@ -2,9 +2,9 @@
 
     python tests/mutants/put_in_faults.py [WORDS...]
 
-WORDS select the faults whose description contains one of them. A fault can be in a Python file, in a C
-source or in a systemd unit of kontronik_can_gw. Exits with 0 if the tests detected every fault, else
-with 1 and one line for each fault that they missed or that no longer fits the code.
+WORDS select the faults whose description contains one of them. A fault can be in a Python file, in
+a C source or in a systemd unit of kontronik_can_gw. Exits with 0 if the tests detected every fault,
+else with 1 and one line for each fault that they missed or that no longer fits the code.
 """
 
 import argparse
@@ -23,7 +23,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("faults.toml")
 LIMIT_S = 1800
 FAILED = 1
-"""The exit code of pytest if a test failed. Any other code, such as a failed collection, proves nothing."""
+"""The exit code of pytest if a test failed. Any other code proves nothing."""
 SUFFIXES = (".py", ".c", ".h", ".service")
 """The kinds of files that can have a fault."""
 IN_C = (".c", ".h")
@@ -37,7 +37,7 @@ class Fault:
     seen_by: tuple[str, ...]
 
     def put_in(self, project: Path = PROJECT) -> tuple[Path, str]:
-        """Return the file and its text with the fault. ValueError if the fault does not fit the code."""
+        """Return the file and its text with the fault. ValueError if it does not fit the code."""
         # with any white space
         pattern = re.compile(r"\s+".join(map(re.escape, self.search.split())))
         folder = project / "kontronik_can_gw"

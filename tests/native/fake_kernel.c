@@ -16,7 +16,8 @@ typedef struct {
     void (*wait)(int64_t until, int for_room); /* until something has come; then the process may stand still */
     int (*look)(int is_all);              /* errno of a poll, of all descriptors or of some */
     int (*ready)(int fd);                 /* for what */
-    int (*size)(int fd, int most);        /* how many bytes a read gives: `data` then has them; -errno, -1: the port has hung up */
+    /* How many bytes a read puts into `data`; below 0: -errno; -1: the port has hung up. */
+    int (*size)(int fd, int most);
     int (*send)(const uint8_t *frame, int size); /* errno, or 0 if the bus takes the frame */
     void (*settings)(int fd, uint8_t *at, int is_set); /* of a port: they are set, or asked for */
 } kernel;

@@ -36,7 +36,7 @@ LIMITS: dict[str, dict[str, float]] = {
         "tokens a code line": 10.3,
         "conditional expressions": 16.2,
         "tuple assignments": 13.2,
-        "starred literals": 6,
+        "starred literals": 5,
     },
     "docs": {
         "all patterns": 13.5,

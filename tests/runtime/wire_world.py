@@ -256,7 +256,7 @@ class World:
         self.hold_up: Callable[[], int] = lambda: 0
         """How long the process stands still behind a wait, before it looks at the clock, in ns."""
         self.poll_fault: Callable[[bool], int] = lambda _is_all: 0
-        """The errno with which a poll in C fails; 0: it does not. True: it asks for all descriptors."""
+        """The errno with which a poll in C fails, or 0. True: it asks for all descriptors."""
         self.until = 1 << 62
         """Turns in C end by then."""
         self.opening_ns = 0

@@ -117,7 +117,7 @@ def test_a_service_may_write_the_locks_that_all_gateways_share(name: str) -> Non
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_gateway_shows_its_statistics_to_all_and_its_store_to_none(name: str) -> None:
-    """The folder of the plain service holds the locks of all, so that it stays when that one ends."""
+    """The plain service's folder stays when it ends, because it holds the locks of all."""
     unit = settings(files()[name])
     kept = {"RuntimeDirectoryMode": "0755", "RuntimeDirectoryPreserve": "yes"}
     kept |= {"StateDirectoryMode": "0700"}
@@ -148,7 +148,7 @@ IN_LIBRARIES: dict[str, set[str]] = {
     "mqtt": {"AF_INET", "AF_INET6", "AF_NETLINK"},
     "metrics": set(),
 }
-"""The address families that a command needs besides the ones its own code names."""
+"""The address families that libraries need, by command."""
 
 
 def reachable(command: str) -> set[Path]:
@@ -189,9 +189,8 @@ def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) ->
     unit = files()[name]
     command = settings(unit)["ExecStart"][0].split()[1]
     modules = reachable(command)
-    if (
-        command == "metrics"
-    ):  # it listens and reads one file; what it shares with others opens nothing
+    if command == "metrics":
+        # The modules that it shares with other commands open no socket there.
         modules = {PACKAGE / "desk" / "metrics.py"}
     assert allowed_families(unit) == named_families(modules) | IN_LIBRARIES[command]
 
