@@ -122,3 +122,18 @@ def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:
     assert f"{wide} CAN FD frames left out, which trc does not know" in said
     found = [item[1:] for item in read_log(tmp_path / "fd.trc")[0]]
     assert found == [item[1:] for item in some if not item[1].fd]
+
+
+def test_a_part_has_frames_that_a_log_of_two_interfaces_holds_late(tmp_path: Path) -> None:
+    """Those of the second interface stand up to a second behind their time."""
+    lines = []
+    for ms in range(0, 6000, 5):
+        lines.append(f"({1_700_000_000 + ms / 1000:.6f}) can0 100#{ms:04X}")
+        if ms >= 800:
+            lines.append(f"({1_700_000_000 + (ms - 800) / 1000:.6f}) can1 101#{ms - 800:04X}")
+    source, part = tmp_path / "two.log", tmp_path / "part.log"
+    source.write_text("\n".join(lines) + "\n")
+    run("convert", source, part, "--from", "1", "--until", "3")
+    found = [(frame.can_id, int.from_bytes(frame.data)) for _, frame, _ in read_log(part)[0]]
+    for can_id in (0x100, 0x101):
+        assert [ms for number, ms in found if number == can_id] == list(range(1000, 3001, 5))

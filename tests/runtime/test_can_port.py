@@ -11,8 +11,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 
 import can
 import pytest
@@ -20,6 +21,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState
@@ -55,7 +57,8 @@ class FakeSocket:
         self.options: dict[int, bytes | int] = {}
         self.ancillary: list[tuple[int, int, bytes]] = []
         self.drops = 0
-        self.fault = 0
+        self.fault = self.bind_fault = 0
+        self.is_closed = False
         self.refusals: list[int] = []
         """Errors of the next sends."""
 
@@ -73,7 +76,18 @@ class FakeSocket:
     def fileno(self) -> int:
         return 99
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        self.is_closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def bind(self, _address: tuple[str]) -> None:
+        if self.bind_fault:
+            raise OSError(self.bind_fault, os.strerror(self.bind_fault))
 
     def send(self, data: bytes) -> None:
         if self.refusals:
@@ -285,6 +299,65 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
     fake.inbox, fake.ancillary = [packet(1)], ancillary
     assert fake.options[64] == 1, "the kernel is asked for them"
     assert port.receive() == [(CanFrame(1, b""), came)]
+
+
+def test_frames_that_the_controller_or_the_kernel_lost_are_noted_once(
+    port: CanPort, fake: FakeSocket
+) -> None:
+    port.set_receive_ids({1})
+    fake.inbox = [packet(ERROR | 0x04, b"\0\x01")]
+    port.receive()
+    assert port.overruns == 1
+    fake.drops = 5
+    for expected in (2, 2):  # more than one call takes: only then the kernel may have lost some
+        fake.inbox = [packet(1)] * (RECEIVE_LIMIT + 1)
+        port.receive()
+        assert port.overruns == expected
+
+
+@pytest.fixture
+def opened(fake: FakeSocket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSocket:
+    """The socket that ``open_socketcan`` gets. In tmp_path is /sys/class/net."""
+    monkeypatch.setattr(socketcan_port.socket, "socket", lambda *_: fake)
+    monkeypatch.setattr(socketcan_port, "Path", lambda _, *parts: tmp_path.joinpath(*parts))
+    (tmp_path / "lo").mkdir()
+    (tmp_path / "can0").mkdir()
+    (tmp_path / "can0" / "flags").write_text("0x1\n")
+    (tmp_path / "can0" / "mtu").write_text("16\n")
+    return fake
+
+
+def test_an_interface_is_opened_with_error_frames_and_can_fd_if_asked(
+    opened: FakeSocket, tmp_path: Path
+) -> None:
+    socketcan_port.open_socketcan(CanConfig()).close()
+    assert opened.options[socketcan_port._CAN_RAW_ERR_FILTER] == 0x1FFFFFFF
+    assert socket.CAN_RAW_FD_FRAMES not in opened.options
+    with pytest.raises(RunError, match="does not do CAN FD"):
+        socketcan_port.open_socketcan(CanConfig(fd=True))
+    (tmp_path / "can0" / "mtu").write_text("72\n")
+    socketcan_port.open_socketcan(CanConfig(fd=True)).close()
+    assert opened.options[socket.CAN_RAW_FD_FRAMES] == 1
+
+
+def test_an_interface_that_cannot_be_used_leaves_no_socket_open(
+    opened: FakeSocket, tmp_path: Path
+) -> None:
+    (tmp_path / "can0" / "flags").write_text("0x0\n")
+    with pytest.raises(RunError, match="can0: is down"):
+        socketcan_port.open_socketcan(CanConfig())
+    assert opened.is_closed
+    (tmp_path / "can0" / "flags").write_text("0x1\n")
+    opened.is_closed = False
+    opened.bind_fault = errno.ENODEV
+    with pytest.raises(RunError, match="there is none"):
+        socketcan_port.open_socketcan(CanConfig())
+    assert opened.is_closed
+    opened.is_closed = False
+    opened.bind_fault = 0
+    port = socketcan_port.open_socketcan(CanConfig())
+    assert not opened.is_closed
+    port.close()
 
 
 FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
