@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import MAX_NAME, Binder, esc_prefix
-from kontronik_can_gw.dbc.reader import choose_node, listed
+from kontronik_can_gw.dbc.reader import NO_NODE, choose_node, listed
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -24,7 +24,7 @@ def copies_of(
     there for each ESC: with its name as prefix, its ids moved by ``id_step`` (None: the smallest step without a clash). ``base_id``
     becomes the lowest of our ids. UserError for names or ids that do not fit.
     """
-    node = choose_node(database, settings.node, file)
+    node = choose_node(database, settings.node, file, settings.messages)
     messages = _chosen(database, node, settings.messages, file)
     ours = [message for message in messages if node in message.senders]
     shift = 0
@@ -65,7 +65,7 @@ def _chosen(database: "Database", node: str, patterns: Sequence[str], file: str)
         if found := fnmatch.filter(ours, pattern):
             chosen.update(found)
             continue
-        hint = did_you_mean(pattern, ours)
+        hint = did_you_mean(pattern, others if node == NO_NODE else ours)
         for name in fnmatch.filter(others, pattern)[:1]:
             hint = f" {name} is sent by {', '.join(others[name].senders) or 'nobody'}."
         problems.append(f"dbc.messages: {pattern!r} is no message of {node} in {file}.{hint}")

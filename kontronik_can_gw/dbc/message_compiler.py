@@ -1,6 +1,7 @@
 """Compiles one message of a DBC: its frame, its times, its pages, its signals, its E2E protection."""
 
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,7 +39,7 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
     job.problems += _frame_problems(job, message, where)
     if _is_empty(message) or message.length > FD_LENGTHS[-1]:
         return None
-    send_type, cycle_ms, delay_ms = _timing(job, message, where)
+    send_type, cycle_ns, delay_ns = _timing(job, message, where)
     pages = sorted({page for signal in message.signals for page in signal.multiplexer_ids or ()})
     if problem := _too_many_pages(message, len(pages)):
         job.problems.append(f"{where}: {problem}")
@@ -56,8 +57,8 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
         fd=_is_fd(message),
         length=message.length,
         send_type=send_type,
-        cycle_ns=cycle_ms * MS if SendType.CYCLIC in send_type else 0,
-        delay_ns=delay_ms * MS,
+        cycle_ns=cycle_ns if SendType.CYCLIC in send_type else 0,
+        delay_ns=delay_ns,
         compiled=tuple(signals),
         escs=frozenset(s.esc for s in signals if s.esc is not None),
         paces=frozenset(s.source.pace or s.source.group for s in signals if s.source),
@@ -183,7 +184,7 @@ def _meanings() -> dict[str, str]:
 
 
 def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType, int, int]:
-    """Send type, cycle time and minimum distance in ms."""
+    """Send type, cycle time and minimum distance in ns."""
     cycle = 0
     # the last two: of what is sent only while something is active; it is sent always
     for attribute_name in ("GenMsgCycleTime", "GenMsgCycleTimeFast", "GenMsgCycleTimeActive"):
@@ -209,14 +210,21 @@ def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType,
 
 
 def _time(job: Compilation, message: "Message", name: str, where: str) -> int:
-    """An attribute in ms; 0 where it is not set or, with a line in the problems, no time."""
+    """Returns an attribute in ms as ns, exactly. Returns 0 if it is not set.
+
+    A value that is no time is a line in the problems, one below a millisecond a warning.
+    """
     value = attribute(message, name, job.database)
     if value is None or value == "":
         return 0
     try:
-        if float(value) < 0:
+        found = round(Fraction(str(value)) * MS)
+        if found < 0:
             raise ValueError
-        return round(float(value))
-    except (ValueError, OverflowError):
+    except (ValueError, OverflowError, ZeroDivisionError):
         job.problems.append(f"{where}: {name} is {str(value)[:40]!r}, which is no time in ms.")
         return 0
+    if 0 < found < MS:
+        job.warnings.append(f"{where}: {name} is {value} ms; 1 ms is used, the shortest time.")
+        return MS
+    return found

@@ -45,7 +45,7 @@ def prepare(
 
     ``taken_ids``: ids and blocks of ids already in use (as COB-IDs of our CANopen nodes), and their users.
     """
-    node = choose_node(database, settings.node, file)
+    node = choose_node(database, settings.node, file, settings.messages)
     copies = copies_of(database, file, escs, settings)
     ours = [copy for copy in copies if node in copy.message.senders]
     job = Compilation(database, file, settings, Binder(escs, settings.bind), fd_allowed)

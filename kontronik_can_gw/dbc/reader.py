@@ -1,7 +1,8 @@
 """Reads a DBC file with cantools: checked first for size and numbers, and rewritten where other tools write what cantools refuses."""
 
+import fnmatch
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,16 @@ _MAX_REASON = 300
 """Maximum length of a reason in characters: cantools may quote the whole file."""
 _PAIRS = r'(?:[^\s";]+\s+"\0\d+\0"\s*)*'
 """Values and their masked texts. Not simply up to a semicolon: NS_ lists keywords without one."""
+_BAUD_RATE = re.compile(
+    r"^([ \t]*BS_[ \t]*:)[ \t]*\d+[ \t]*:[ \t]*\d+[ \t]*,[ \t]*\d+[ \t]*;?", re.MULTILINE
+)
+"""The bit timing of a bus. The grammar allows it; cantools knows the empty form only."""
+_BYTE_ORDER = re.compile(
+    r"(?:\bBO_\s+\d+\s+(?P<message>\w+)\s*:)|"
+    r"\bSG_\s+(?P<signal>\w+)(?:\s+\w+)?\s*:\s*\d+\s*\|\s*\d+\s*@\s*(?P<order>\d+)"
+)
+NO_NODE = "Vector__XXX"
+"""What a DBC names as transmitter of a message that has none."""
 _NAME = r'("\0\d+\0")'
 """A masked string, such as an attribute's name."""
 _MASKED = re.compile(r'"\0(\d+)\0"')
@@ -30,6 +41,12 @@ _DEFINITION = re.compile(rf"^[ \t]*BA_DEF_\s+(?:\w+\s+)?{_NAME}", re.MULTILINE)
 _ATTRIBUTE = re.compile(rf"^[ \t]*(BA_|BA_DEF_DEF_)\s+{_NAME}[^;\n]*;", re.MULTILINE)
 _ENUMERATION = re.compile(
     rf"^[ \t]*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?{_NAME}\s+ENUM\s+([^;]*)", re.MULTILINE
+)
+_INTEGER_DEFINITION = re.compile(
+    rf"^([ \t]*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?{_NAME}\s+)INT\b", re.MULTILINE
+)
+_FRACTION = re.compile(
+    rf"^[ \t]*BA_(?:DEF_DEF_)?\s+{_NAME}[^;\n]*?\s-?\d*\.\d*[1-9]\d*\s*;", re.MULTILINE
 )
 _TEXT_VALUE = re.compile(rf"^([ \t]*BA_\s+){_NAME}(\s[^\";]*){_NAME}(\s*;)", re.MULTILINE)
 
@@ -102,8 +119,21 @@ class _Rewriting:
         self._strings: list[str] = []
         self.ignored: dict[str, list[str]] = {}
         """Reason to what was removed for it."""
-        text = self._with_tables(re.sub(STRING, self._mask, text))
-        self.result = self._shown(self._numbered(self._defined(text)))
+        text = _BAUD_RATE.sub(r"\1", re.sub(STRING, self._mask, text))
+        self._check_byte_orders(text)
+        text = self._with_tables(text)
+        self.result = self._shown(self._numbered(self._with_fractions(self._defined(text))))
+
+    def _check_byte_orders(self, text: str) -> None:
+        """UserError for a byte order other than 0 and 1, which cantools takes for 1."""
+        message = ""
+        for found in _BYTE_ORDER.finditer(text):
+            message = found["message"] or message
+            if found["signal"] and found["order"] not in ("0", "1"):
+                raise UserError(
+                    f"{self._path}: {message}.{found['signal']}: byte order {found['order']} is neither 0 (Motorola) nor "
+                    "1 (Intel). Write @0 or @1; a float is declared by SIG_VALTYPE_."
+                )
 
     def _mask(self, found: re.Match[str]) -> str:
         self._strings.append(found[0])
@@ -153,6 +183,15 @@ class _Rewriting:
 
         return _ATTRIBUTE.sub(rewritten, text)
 
+    def _with_fractions(self, text: str) -> str:
+        """Declares INT attributes as FLOAT if they have a value with a fraction, which would be cut off."""
+        names = {self._shown(name) for name in _FRACTION.findall(text)}
+
+        def rewritten(found: re.Match[str]) -> str:
+            return f"{found[1]}FLOAT" if self._shown(found[2]) in names else found[0]
+
+        return _INTEGER_DEFINITION.sub(rewritten, text)
+
     def _numbered(self, text: str) -> str:
         """Texts of enumeration attributes replaced by their numbers."""
         numbers = {
@@ -184,8 +223,19 @@ def listed(names: Iterable[str], limit: int = 6) -> str:
     return ", ".join(names[:limit]) + more
 
 
-def choose_node(database: "Database", wanted: str | None, file: str) -> str:
-    """The transmitter node whose messages we send. UserError where it is missing or ambiguous."""
+def choose_node(
+    database: "Database", wanted: str | None, file: str, patterns: Sequence[str] = ()
+) -> str:
+    """Returns the transmitter node whose messages the gateway sends.
+
+    If no message of the file has a transmitter, ``patterns`` alone select messages: those get
+    NO_NODE as their transmitter. UserError if the node is missing or ambiguous.
+    """
+    if wanted is None and patterns and not any(each.senders for each in database.messages):
+        for message in database.messages:
+            if any(fnmatch.fnmatchcase(message.name, pattern) for pattern in patterns):
+                message.senders.append(NO_NODE)
+        return NO_NODE
     senders = sorted({sender for message in database.messages for sender in message.senders})
     if wanted is not None:
         if wanted in senders:
@@ -196,7 +246,8 @@ def choose_node(database: "Database", wanted: str | None, file: str) -> str:
         )
     if not senders:
         raise UserError(
-            f"{file}: no message has a transmitter, so none is ours. Name one in the DBC (BU_ and BO_)."
+            f"{file}: no message has a transmitter, so none is ours. Select messages by dbc.messages, or name a transmitter "
+            "in the DBC (BU_ and BO_)."
         )
     if len(senders) == 1:
         return senders[0]

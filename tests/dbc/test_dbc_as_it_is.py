@@ -1,5 +1,6 @@
 """A user's DBC as other tools write it: entries for nothing, units, send types, counters, checksums, flags, unbound signals."""
 
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -7,7 +8,7 @@ from fractions import Fraction
 from typing import Any
 
 import pytest
-from dbc_bench import compiled, gateway_with, packed, refused
+from dbc_bench import FILE, compiled, gateway_with, packed, refused
 from packer_oracle import UNITS
 
 from kontronik_can_gw.capture.setup import CaptureSetup
@@ -17,7 +18,7 @@ from kontronik_can_gw.dbc.prepare import is_mute, reporter, unreported
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.desk.describe.tables import held
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.signals.plan import SEND_TYPES, Role, SendType
 from kontronik_can_gw.signals.units import conversion
 
@@ -399,3 +400,98 @@ def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
     for key in (*later, "send_types", "unbound"):
         del header["dbc"][key]
     assert CaptureSetup.of(header).dbc_settings == old
+
+
+# --- what the grammar allows and cantools refuses, or takes for something else -------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "line", ["BS_: 250000 : 0,0", "BS_ : 500000 : 1 , 28 ;", "\tBS_:125000:0,0", "BS_:"]
+)
+def test_a_bus_with_a_baud_rate_is_read(line: str) -> None:
+    text = f'VERSION ""\nNS_ :\n{line}\nBU_: GW\nBO_ 673 ESC_1: 8 GW\n' + signal("BatteryVoltage")
+    (message,) = compiled(text).messages
+    assert (message.name, message.can_id) == ("ESC_1", 673)
+
+
+def test_a_comment_that_looks_like_a_baud_rate_is_kept() -> None:
+    comment = "seen:\nBS_: 250000 : 0,0\nSG_ X : 0|16@3+"
+    (message,) = parse_database(f'{STATE}CM_ BO_ 256 "{comment}";\n'.encode(), "my.dbc").messages
+    assert message.comment == comment
+
+
+@pytest.mark.parametrize(("order", "said"), [("2", "2"), ("3", "3"), ("10", "10"), ("01", "01")])
+def test_a_byte_order_that_is_none_is_refused_by_name(order: str, said: str) -> None:
+    (line,) = refused(STATE.replace("@1", f"@{order}"))
+    assert line == (
+        f"{FILE}: Power.OperatingState: byte order {said} is neither 0 (Motorola) nor 1 (Intel). "
+        "Write @0 or @1; a float is declared by SIG_VALTYPE_."
+    )
+
+
+UNSENT = "".join(
+    f"BO_ {673 + n} ESC_{n + 1}: 8 Vector__XXX\n{signal('BatteryVoltage')}" for n in range(3)
+)
+
+
+@pytest.mark.parametrize(
+    ("patterns", "names"),
+    [
+        (("ESC_1",), ["ESC_1"]),
+        (("ESC_[13]",), ["ESC_1", "ESC_3"]),
+        (("*",), ["ESC_1", "ESC_2", "ESC_3"]),
+    ],
+)
+def test_messages_without_a_transmitter_are_selected_by_name(
+    patterns: tuple[str, ...], names: list[str]
+) -> None:
+    assert [each.name for each in compiled(HEAD + UNSENT, messages=patterns).messages] == names
+
+
+def test_messages_without_a_transmitter_need_a_selection_and_a_match() -> None:
+    (line,) = refused(HEAD + UNSENT)
+    assert "Select messages by dbc.messages, or name a transmitter" in line
+    (line,) = refused(HEAD + UNSENT, messages=("ESC_4",))
+    assert line.startswith("dbc.messages: 'ESC_4' is no message of") and "ESC_" in line[-30:]
+
+
+def test_a_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:
+    text = HEAD + UNSENT + "BO_ 700 Theirs: 8 Other\n" + signal("BatteryVoltage")
+    (line,) = refused(text, messages=("ESC_1",))
+    assert "ESC_1 is sent by nobody" in line
+
+
+@pytest.mark.parametrize("kind", ["FLOAT 0 65535", "INT 0 65535", "STRING"])
+@pytest.mark.parametrize(
+    ("written", "used_ns"),
+    [("12.5", 12_500_000), ("0.25", MS), ("33.333", 33_333_000), ("10", 10 * MS)],
+)
+def test_a_cycle_time_with_a_fraction_is_exact_or_named(
+    kind: str, written: str, used_ns: int
+) -> None:
+    quoted = f'"{written}"' if kind == "STRING" else written
+    default = '""' if kind == "STRING" else "0"
+    text = (
+        f'BA_DEF_ BO_ "GenMsgCycleTime" {kind};\nBA_DEF_DEF_ "GenMsgCycleTime" {default};\n'
+        f'BA_ "GenMsgCycleTime" BO_ 256 {quoted};\n'
+    )
+    layout = compiled(STATE + text)
+    assert layout.messages[0].cycle_ns == used_ns
+    said = [f"{FILE}: Power: GenMsgCycleTime is 0.25 ms; 1 ms is used, the shortest time."]
+    assert [line for line in layout.warnings if "CycleTime" in line] == said * (written == "0.25")
+
+
+def test_a_minimum_distance_with_a_fraction_is_exact() -> None:
+    text = 'BA_DEF_ BO_ "GenMsgDelayTime" INT 0 9;\nBA_DEF_DEF_ "GenMsgDelayTime" 7.5;\n'
+    assert compiled(STATE + text).messages[0].delay_ns == 7_500_000
+
+
+def test_frames_with_a_cycle_of_a_fraction_keep_it_on_average() -> None:
+    text = 'BA_DEF_ BO_ "GenMsgCycleTime" FLOAT 0 9;\nBA_DEF_DEF_ "GenMsgCycleTime" 12.5;\n'
+    gateway = gateway_with(compiled(STATE + text))
+    times = []
+    now = 0
+    while (now := max(now, gateway.next_deadline())) < 2000 * MS:
+        gateway.advance(now)
+        times += [now] * len(gateway.take_frames(now))
+    assert {b - a for a, b in itertools.pairwise(times)} == {12_500_000}
