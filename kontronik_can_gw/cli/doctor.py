@@ -3,6 +3,7 @@
 import argparse
 import platform
 import textwrap
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +19,9 @@ from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor import Finding, Findings, count
 from kontronik_can_gw.desk.doctor.can import check_can
 from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.desk.doctor.ports import check_port
+from kontronik_can_gw.desk.doctor.ports import check_port, diagnoses
 from kontronik_can_gw.desk.doctor.service import Unit, check_folder, check_service, unit_of
+from kontronik_can_gw.desk.monitor.status import NOT_RUNNING, look_at, status_file
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words, make_core
@@ -72,9 +74,12 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
             about.say("config", "mistake", problem=problem, command=command)
     if config is not None:
         _folders(machine, about, config, unit)
+        file = machine.path(str(config.statistics_path or status_file(path)))
+        seen = look_at(file, time.monotonic_ns(), path)
+        reasons = {} if seen.code == NOT_RUNNING else diagnoses(seen.document)
         for esc in config.esc:
             even = protocol_named(esc.protocol).even_parity
-            found += check_port(machine, esc.name, esc.port, even)
+            found += check_port(machine, esc.name, esc.port, even, reasons.get(esc.name, ""))
         found += check_can(machine, config.can)
     check_service(machine, rest, unit, full)
     # a Raspberry Pi's own alarm; it affects USB adapters first

@@ -6,6 +6,7 @@
 #define INFO_TIMEOUT (10 * SECOND)
 #define MIN_DISTANCE INT64_C(1000000)
 #define LONG_AGO (-(INT64_C(1) << 61))
+enum { LONGER_COVERED = 34 };                /* all bytes before the CRC of a legacy live frame; twin: deframer.has_longer_crc */
 enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
 enum { KNOWN = 1, TO_SEND = 2 };             /* of a page: its last frame is known; it follows without an event */
 enum { STARTED = 1, NEWS = 2, SEEN = 4 };    /* of a slot: it has changed since its last frame; its watched bits are known */
@@ -164,6 +165,8 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
         }
         if (v4 == 2) {
             e->count[KCG_N_HEADERS]++, e->count[KCG_N_CRC_ERRORS]++;
+            if (!is_info && kcg_crc32(0, f, LONGER_COVERED) == u32(f + LONGER_COVERED))
+                e->count[KCG_N_LONGER_CRCS]++;
             reject(e, b, at, forms[is_info][1].length, KCG_N_DROPPED_CRC);
             at += 4;
         } else if (!missing) {

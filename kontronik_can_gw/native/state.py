@@ -12,7 +12,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 
-_STREAM = COUNTS.index("long_run_bytes") + 1
+_STREAM = COUNTS.index("longer_crcs") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""
 _PLACES = (("has_live", "live"), ("has_info", "info"), ("had_live", "live"), ("had_info", "info"))
 """Of live data, info, and the newest ever of both: whether there is any, and its bytes."""

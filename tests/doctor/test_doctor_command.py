@@ -2,14 +2,17 @@
 
 import ast
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from command_line import run, written
+from statistics_bench import Bench
 
 from kontronik_can_gw.desk.doctor import ports
 from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.runtime.facts import PortFacts, program_facts
 
 
 @pytest.fixture
@@ -90,3 +93,24 @@ def test_no_module_of_doctor_opens_a_device() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             name = getattr(node, "attr", getattr(node, "id", ""))
             assert not name.startswith(("open", "write", "O_", "tcset")) or name == "openers"
+
+
+def test_why_the_gateway_hears_no_telemetry_is_a_warning(tmp_path: Path, esc: PtyEsc) -> None:
+    file = configuration(tmp_path, esc.path, '[statistics]\nfile = "status.json"')
+    why = "live frames of 38 bytes whose CRC covers 34 bytes instead of 32"
+
+    def told() -> list[str]:
+        findings, _ = document(file, 0)
+        return [f["text"] for f in findings if f["check"] == "port.telemetry"]
+
+    assert told() == []
+    bench = Bench(1)
+    bench.silent.add(0)
+    bench.run(2)
+    ports = [PortFacts("esc1", esc.path, True, diagnosis=why)]
+    text = json.dumps(
+        bench.document(ports=ports, program=program_facts(str(file)))
+        | {"monotonic_ns": time.monotonic_ns()}
+    )
+    written(tmp_path / "status.json", text)
+    assert told() == [f"the gateway hears no telemetry: {why}"]

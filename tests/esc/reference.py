@@ -22,6 +22,7 @@ COUNTED = [
         "dropped_unknown_kind",
         "dropped_incomplete",
         "long_run_bytes",
+        "longer_crcs",
     ),
 ]
 
@@ -119,6 +120,11 @@ def counters_of(stream: bytes) -> dict[str, int]:
                 count["headers"] += 1
                 if at + LONGEST_OF[header] <= size:
                     count["crc_errors"] += 1
+                    is_longer = (
+                        crc32(stream[at : at + 34]).to_bytes(4, "little")
+                        == stream[at + 34 : at + 38]
+                    )
+                    count["longer_crcs"] += header == b"KODL" and is_longer
                     failed_until = max(failed_until, at + LONGEST_OF[header])
                 else:
                     incomplete_until = size

@@ -7,6 +7,7 @@ from fractions import Fraction
 from functools import cache
 from itertools import zip_longest
 from typing import Any
+from zlib import crc32
 
 from packer_oracle import (
     LayoutMaker,
@@ -105,6 +106,8 @@ def stream(chance: random.Random) -> bytes:
             one = one[:at] + bytes((one[at] ^ 1 << chance.randrange(8),)) + one[at + 1 :]
         if chance.random() < 0.1:
             one = one[: chance.randrange(len(one))]
+        if chance.random() < 0.03:  # a CRC that covers 34 bytes
+            one = one[:34] + crc32(one[:34]).to_bytes(4, "little")
         if chance.random() < 0.08:
             one = bytes(chance.choices(b"KODLI\0\xff\xf0a", k=chance.randrange(60))) + one
         data += one

@@ -5,17 +5,31 @@ No port is opened: whether it takes the ESC's line settings is known once the ga
 
 import os
 import stat
+from collections.abc import Mapping
+from typing import Any
 
 from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
+from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.serial_port import is_mini_uart
 
 _RULES = "udev/rules.d/70-kontronik-can-gw.rules"
 """Keeps ModemManager away."""
 
 
-def check_port(machine: Machine, esc: str, port: str, even_parity: bool) -> list[Finding]:
-    """All findings about the port of one ESC. ``even_parity``: its line needs that."""
+def diagnoses(document: Mapping[str, Any] | None) -> dict[str, str]:
+    """Why the ESCs of a running gateway are not heard, by name, from its status document."""
+    escs = [] if document is None else document["escs"]
+    return {esc["name"]: printable(str(esc["diagnosis"])) for esc in escs if esc["diagnosis"]}
+
+
+def check_port(
+    machine: Machine, esc: str, port: str, even_parity: bool, diagnosis: str = ""
+) -> list[Finding]:
+    """Returns all findings about the port of one ESC.
+
+    ``even_parity``: its line needs that. ``diagnosis``: why the gateway that runs does not hear it.
+    """
     real, status = machine.real(port), machine.status(port)
     tty = real.rpartition("/")[2]
     findings = Findings(f"Serial port of {esc}", port=port, tty=tty, user=machine.user)
@@ -30,6 +44,8 @@ def check_port(machine: Machine, esc: str, port: str, even_parity: bool) -> list
     product = machine.text(f"{usb}/product") if usb else ""
     what = ", ".join(filter(None, [tty, product]))
     findings.say("port.exists", "pty" if is_pty else "ok", what=what)
+    if diagnosis:
+        findings.say("port.telemetry", "none", diagnosis=diagnosis)
     case = "ok"
     if not machine.may(port, os.R_OK | os.W_OK):
         is_shared = status.st_mode & 0o060 == 0o060 and status.st_gid != 0

@@ -72,6 +72,8 @@ class Counters:
     """Bytes after a header when the stream ended."""
     long_run_bytes: int = 0
     """Dropped bytes that look like a slower line read too fast (9600 baud of an old JIVE)."""
+    longer_crcs: int = 0
+    """Rejected live frames of 38 bytes whose CRC covers 34 bytes: no ESC is known to send them."""
 
     @property
     def live(self) -> int:
@@ -112,6 +114,11 @@ class Counters:
         received = self.bytes - old.bytes
         if not received:
             return "no bytes: ESC off, wire open, wrong port, or a KOSMIK that waits for one throttle pulse after power-up"
+        if self.longer_crcs > old.longer_crcs:
+            return (
+                "live frames of 38 bytes whose CRC covers 34 bytes instead of 32: no recording of such an ESC is known, so they are "
+                "not accepted. Please report device and firmware with a recording"
+            )
         if self.crc_errors > old.crc_errors:
             return "headers but no valid CRC: noise on the line, bytes lost, or another revision of the protocol"
         if self.headers > old.headers or self.pending >= 4:
@@ -126,6 +133,12 @@ class Counters:
 
 _NAMES = tuple(f.name for f in fields(Counters))
 _all_of = attrgetter(*_NAMES)
+
+
+def has_longer_crc(frame: bytes) -> bool:
+    """Whether the CRC of a legacy live frame covers everything before it, as one other receiver takes it."""
+    crc_at = _LEGACY_LIVE.crc_at
+    return bool(crc32(frame[:crc_at]) == _LEGACY_LIVE.crc_of(frame)[0])
 
 
 class Deframer:
@@ -191,6 +204,8 @@ class Deframer:
                     break
             else:
                 counters.crc_errors += 1
+                if forms[0] is _LEGACY_LIVE and has_longer_crc(frame):
+                    counters.longer_crcs += 1
                 self._reject(buffer, at, form.length, "dropped_crc")
                 at += 4
             if missing:
