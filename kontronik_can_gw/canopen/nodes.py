@@ -177,13 +177,16 @@ class Nodes(Output):
             for node in self.nodes
         ]
 
-    def traffic(self) -> tuple[float, float]:
-        """Frames a second of PDOs and heartbeats, to be expected when all is well, and the bits that they need with the most stuffing."""
+    def traffic(self, is_worst: bool = False) -> tuple[float, float]:
+        """Frames a second of PDOs and heartbeats, and the bits that they need with the most stuffing.
+
+        ``is_worst``: with all that is sent on change changing all the time.
+        """
         rates: list[tuple[int, float]] = []
         for node in (node for node in self.nodes if node.node_id != UNCONFIGURED):
             if period := node.dictionary.number(0x1017):
                 rates.append((1, 1000 / period))
-            rates += [(8, tpdo.rate_hz) for tpdo in node.tpdos]
+            rates += [(8, t.worst_rate_hz if is_worst else t.rate_hz) for t in node.tpdos]
         return sum(rate for _, rate in rates), sum(classic_bits(n) * rate for n, rate in rates)
 
     def own_ids(self) -> dict[int, Owner]:

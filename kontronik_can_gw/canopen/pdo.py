@@ -77,13 +77,21 @@ class Tpdo:
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second to be expected with the UART at 100 Hz; those sent on change or at SYNC (10 Hz taken) by their cycle."""
+        """Usual frames a second with the UART at 100 Hz and SYNC at 10 Hz. Changes are not counted."""
+        return self._rate_hz(is_worst=False)
+
+    @property
+    def worst_rate_hz(self) -> float:
+        """The same if the status objects that cause it change all the time."""
+        return self._rate_hz(is_worst=True)
+
+    def _rate_hz(self, is_worst: bool) -> float:
         if self._plan is None or not self.valid:
             return 0.0
         if self.type not in EVENT_TYPES:
             return 10.0 / max(1, self.type)
         cycle = SECOND / self.event_ns if self.event_ns else 0.0
-        if self.on_change:
+        if self.on_change and not is_worst:
             return cycle or 1.0
         events = EXPECTED_LIVE_HZ if self._plan.triggers & Event.LIVE else 1.0
         return max(cycle, min(events, SECOND / self.inhibit_ns) if self.inhibit_ns else events)

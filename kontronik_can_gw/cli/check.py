@@ -87,6 +87,9 @@ def summary(shown: dict[str, Any], loaded: Loaded, nodes: Nodes | None) -> Itera
         yield f"  captures  {in_words(config, folder)}"
     load, frames = shown["bus_load"], shown["frames_per_second"]
     yield f"  bus load  {load:.1%}, {frames:.0f} frames/s: ESCs at 100 Hz, worst stuffing, no SDO"
+    worst, worst_frames = shown["worst_bus_load"], shown["worst_frames_per_second"]
+    if worst_frames > frames:
+        yield f"  at worst  {worst:.1%}, {worst_frames:.0f} frames/s: while all that is sent on change changes"
 
 
 def details(loaded: Loaded) -> Iterator[str]:
@@ -110,15 +113,24 @@ def _counted(number: int, what: str) -> str:
 def document(
     path: Path, loaded: Loaded, nodes: Nodes | None, warnings: list[str]
 ) -> dict[str, Any]:
-    """What ``--json`` prints, and text is made of. What is sent on change is counted by its cycle."""
+    """The document of ``--json``, and what the text is made of."""
     config, layout = loaded.config, loaded.layout
     can = config.can
     load = layout.bus_load(can.bitrate, can.data_bitrate)
     frames = sum(message.rate_hz for message in layout.messages)
     traffic = [output.traffic() for output in loaded.outputs]
-    for more, bits in traffic if nodes is None else [*traffic, nodes.traffic()]:
+    worst = layout.bus_load(can.bitrate, can.data_bitrate, is_worst=True)
+    worst_frames = sum(message.worst_rate_hz for message in layout.messages)
+    usual_traffic, worst_traffic = [*traffic], [*traffic]
+    if nodes is not None:
+        usual_traffic.append(nodes.traffic())
+        worst_traffic.append(nodes.traffic(is_worst=True))
+    for more, bits in usual_traffic:
         load += bits / can.bitrate
         frames += more
+    for more, bits in worst_traffic:
+        worst += bits / can.bitrate
+        worst_frames += more
     return {
         "file": str(path),
         "mistakes": [],
@@ -128,6 +140,8 @@ def document(
         "can": {"interface": can.interface, "channel": can.channel, "bitrate": can.bitrate},
         "bus_load": load,
         "frames_per_second": frames,
+        "worst_bus_load": worst,
+        "worst_frames_per_second": worst_frames,
         "dbc": layout.file,
         "layout": layout.fingerprint,
         "outputs": {output.name: output.lines() for output in loaded.outputs},

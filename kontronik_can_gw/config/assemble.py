@@ -157,13 +157,14 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     warnings: list[str] = []
     taken: dict[int, str] = {}
     bits: dict[str, float] = {}
+    worst: dict[str, float] = {}
     if config.canopen.enabled:  # what only nodes need is not loaded without them
         from kontronik_can_gw.config import nodes
 
         with collecting(problems):
             plain = nodes.plain_setup(config)
             of_nodes = plain.esc_settings(config.escs)
-            taken, bits[_NODES] = nodes.needs(plain, of_nodes)
+            taken, bits[_NODES], worst[_NODES] = nodes.needs(plain, of_nodes)
         if plain is not None and not problems:
             stored, damaged, warnings = nodes.read_stored(config, store)
             escs = replace(plain, stored=tuple(stored)).esc_settings(config.escs)
@@ -177,15 +178,15 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     if problems:
         raise UserError(*problems)
     rates = config.can.bitrate, config.can.data_bitrate
-    load = check_load(layout, *rates, bits)
+    load = check_load(layout, *rates, bits, bits | worst)
     if plain is not None:
         foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
         canopen, given_way = nodes.with_stored(plain, stored, config, escs, foreign)
         warnings = [*given_way, *warnings]
         if canopen.stored != plain.stored:
-            _, bits[_NODES] = nodes.needs(canopen, escs)
+            _, bits[_NODES], worst[_NODES] = nodes.needs(canopen, escs)
             with collecting(warnings):  # more than the bus has is no reason not to start
-                load = check_load(layout, *rates, bits)
+                load = check_load(layout, *rates, bits, bits | worst)
     warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(rates[0])]
     mute = [*unreported(layout, config.dbc.silent_on_loss), *unsupplied(layout, escs)]
     said = (*config.warnings, *ignored, *mute, *filter(None, [load]), *warnings)

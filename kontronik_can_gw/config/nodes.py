@@ -75,11 +75,11 @@ def plain_setup(config: Config) -> CanopenSetup:
     return CanopenSetup(load_eds(config), tuple(settings), nothing, tuple(config.escs))
 
 
-def needs(setup: CanopenSetup, escs: Sequence[EscSettings]) -> tuple[dict[int, str], float]:
-    """COB-IDs of the nodes and what each is for, and what they need of the bus in bit/s."""
+def needs(setup: CanopenSetup, escs: Sequence[EscSettings]) -> tuple[dict[int, str], float, float]:
+    """COB-IDs of the nodes and their users, and the bits per second they need: usual and worst."""
     made = setup.nodes(escs)
     ids = {cob_id: what for node in made.nodes for cob_id, what, *_ in uses(node)}
-    return ids, made.traffic()[1]
+    return ids, made.traffic()[1], made.traffic(is_worst=True)[1]
 
 
 Kept = tuple[list[Stored], list[tuple[int, str]], list[str]]

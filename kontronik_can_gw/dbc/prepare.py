@@ -155,17 +155,28 @@ def check_load(
     bitrate: int,
     data_bitrate: int = 2_000_000,
     further: Mapping[str, float] | None = None,
+    worst_further: Mapping[str, float] | None = None,
 ) -> str | None:
-    """A warning above 50 % computed bus load, UserError above 100 %, else None. ``further``: other outputs and their bits per second."""
+    """Returns a warning if the worst bus load is above 50 %. UserError if the usual one is above 100 %.
+
+    ``further`` and ``worst_further``: other outputs and their bits per second, usual and worst.
+    """
     further = further or {}
+    worst_further = worst_further or further
     load = layout.bus_load(bitrate, data_bitrate) + sum(further.values()) / bitrate
+    worst = layout.bus_load(bitrate, data_bitrate, is_worst=True)
+    worst += sum(worst_further.values()) / bitrate
     who = [*([f"{layout.file}: the messages"] if layout.messages else []), *further]
     text = f"{' and '.join(who)} need {load:.0%} of {bitrate // 1000} kbit/s"
     if load > REFUSE_LOAD:
         raise UserError(
             f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime; inhibit times) or raise can.bitrate."
         )
-    return f"{text}; other nodes get little" if load > WARN_LOAD else None
+    if worst <= WARN_LOAD:
+        return None
+    if round(worst, 2) > round(load, 2):
+        text += f", and {worst:.0%} while everything changes that is sent on change"
+    return f"{text}; other nodes get little"
 
 
 def is_mute(signal: SignalPlan) -> bool:

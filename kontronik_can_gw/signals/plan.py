@@ -146,9 +146,17 @@ class MessagePlan:
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second to be expected with all UARTs at 100 Hz; messages sent on change are counted by their cycle."""
+        """Usual frames a second with all UARTs at 100 Hz. Frames sent on change are not counted."""
+        return self._rate_hz(SendType.EVENT)
+
+    @property
+    def worst_rate_hz(self) -> float:
+        """The same if every value that is sent on change changes all the time."""
+        return self._rate_hz(SendType.EVENT | SendType.ON_CHANGE)
+
+    def _rate_hz(self, counted: SendType) -> float:
         events = 0.0
-        if SendType.EVENT in self.send_type:
+        if counted & self.send_type:
             if Group.LIVE in self.paces:
                 events = EXPECTED_LIVE_HZ * len(self.escs)
             else:
@@ -186,9 +194,16 @@ class Layout:
             crc, comma = crc32(f"{comma}{found!r}".encode(), crc), ", "
         return f"{crc32(b']', crc):08X}"
 
-    def bus_load(self, bitrate: int, data_bitrate: int = 2_000_000) -> float:
-        """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s."""
-        return sum(
-            message.rate_hz * (message.bits[0] / bitrate + message.bits[1] / data_bitrate)
-            for message in self.messages
-        )
+    def bus_load(
+        self, bitrate: int, data_bitrate: int = 2_000_000, is_worst: bool = False
+    ) -> float:
+        """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s.
+
+        ``is_worst``: with ``worst_rate_hz`` instead of ``rate_hz``.
+        """
+        load = 0.0
+        for message in self.messages:
+            nominal, at_data_rate = message.bits
+            rate_hz = message.worst_rate_hz if is_worst else message.rate_hz
+            load += rate_hz * (nominal / bitrate + at_data_rate / data_bitrate)
+        return load

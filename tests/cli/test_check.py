@@ -113,3 +113,19 @@ def test_what_may_not_be_read_is_one_line(
         os.seteuid(user)
         own.parent.chmod(0o700)
     assert "Permission denied" in said
+
+
+def test_the_load_is_shown_as_it_is_usually_and_at_worst(tmp_path: Path) -> None:
+    """EscStatus of the shipped DBC is sent every 100 ms and on change; TPDO 4 on change."""
+    file = written(tmp_path / "g.toml", f"{LEAST}[canopen]\nenabled = true\nstore = 'x'\n")
+    found = json.loads(run("check", "--json", file).out)
+    more = found["worst_frames_per_second"] - found["frames_per_second"]
+    assert more >= 90 + 98
+    assert found["worst_bus_load"] - found["bus_load"] == pytest.approx(more * 135 / 500_000)
+    lines = run("check", file).out.splitlines()
+    usual, worst = lines[-2:]
+    assert (
+        usual.startswith("  bus load  ") and f"{found['frames_per_second']:.0f} frames/s" in usual
+    )
+    assert worst.startswith("  at worst  ") and f"{found['worst_bus_load']:.1%}" in worst
+    assert len(worst) <= 80

@@ -10,6 +10,7 @@ from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.dbc.prepare import check_load
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.signals.plan import Layout
 
 PAGE, VOLTAGE = Sig("Page", 0, 8, mux="M"), Sig("BatteryVoltage", 0, 16, factor="0.01", unit="V")
@@ -149,6 +150,42 @@ def test_a_message_is_counted_with_what_a_uart_at_100_hz_brings(
 ) -> None:
     layout = layout_of(message_of(*names), kind, cycle, delay)
     assert layout.bus_load(1_000_000) == pytest.approx(frames_a_second * 135e-6, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "kind", "cycle", "delay", "frames_a_second"),
+    [
+        (("LeftBatteryVoltage",), ON_CHANGE, 0, 0, 100),
+        (("LeftBatteryVoltage", "RightBatteryVoltage"), ON_CHANGE, 0, 0, 200),
+        (("LeftBatteryVoltage",), ON_CHANGE, 0, 40, 25),
+        (("LeftCellCount",), ON_CHANGE, 0, 0, 1),
+        (("LeftBatteryVoltage",), CYCLIC_AND_ON_CHANGE, 20, 0, 150),
+        (("LeftBatteryVoltage",), CYCLIC_AND_EVENT, 20, 0, 150),
+        (("LeftBatteryVoltage",), CYCLIC, 10, 0, 100),
+    ],
+)  # fmt: skip
+def test_the_worst_load_counts_each_change(
+    names: tuple[str, ...], kind: int, cycle: int, delay: int, frames_a_second: float
+) -> None:
+    layout = layout_of(message_of(*names), kind, cycle, delay)
+    worst = layout.bus_load(1_000_000, is_worst=True)
+    assert worst == pytest.approx(frames_a_second * 135e-6, rel=1e-12)
+
+
+def test_the_worst_load_warns_and_the_usual_one_refuses() -> None:
+    message = message_of("LeftBatteryVoltage")
+    layout = layout_of(message, CYCLIC_AND_ON_CHANGE, 20)
+    assert check_load(layout, 50 * 3 * 135 * 2) is None
+    warning = str(check_load(layout, 50 * 2 * 135))
+    assert (
+        "need 50% of 13 kbit/s, and 150% while everything changes that is sent on change" in warning
+    )
+    with pytest.raises(UserError, match="need 101%"):
+        check_load(layout, 50 * 135 * 100 // 101)
+    further = {"the CANopen nodes": 1_000.0}
+    assert check_load(Layout("", "", ()), 10_000, further=further) is None
+    loaded = check_load(Layout("", "", ()), 10_000, 0, further, {"the CANopen nodes": 6_000.0})
+    assert "need 10% of 10 kbit/s, and 60% while" in str(loaded)
 
 
 def test_the_bits_of_canopen_nodes_count_too() -> None:
