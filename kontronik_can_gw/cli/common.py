@@ -63,20 +63,25 @@ def logging_to_stderr() -> Iterator[None]:
 
 
 @contextmanager
-def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """SIGTERM, SIGINT and SIGHUP call ``stop``, a second one ends the process at once. Under nohup SIGHUP stays ignored."""
+def stopping_on_signals(stop: Callable[[], None]) -> Iterator[list[str]]:
+    """SIGTERM, SIGINT and SIGHUP call ``stop``, a second one ends the process at once. Under nohup SIGHUP stays ignored.
+
+    Yields a list that holds the signal's name once it was received.
+    """
+    received: list[str] = []
     numbers = [signal.SIGTERM, signal.SIGINT]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
 
-    def end(_number: int, _frame: object) -> None:
+    def end(received_number: int, _frame: object) -> None:
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)
+        received.append(signal.Signals(received_number).name)
         stop()
 
     before = {number: signal.signal(number, end) for number in numbers}
     try:
-        yield
+        yield received
     finally:
         for number, old in before.items():
             signal.signal(number, old)

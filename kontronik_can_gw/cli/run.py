@@ -77,15 +77,16 @@ class _Run:
     def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
         self._args, self._notifier = args, notifier
         self._loop: Loop | None = None
+        self._signals: list[str] = []
         self._stopping = False
 
     def main(self) -> None:
         """Run until a signal ends it."""
         sys.setswitchinterval(_LOCK_SWITCH_S)
-        with stopping_on_signals(self._stop):
+        with stopping_on_signals(self._stop) as self._signals:
             self._loop = loop = self._opened()
             if self._stopping:  # a signal came before the loop existed
-                loop.stop()
+                loop.stop(self._reason())
             settle_memory()
             loop.run()
 
@@ -93,7 +94,11 @@ class _Run:
         self._stopping = True
         self._notifier.stopping()
         if self._loop is not None:
-            self._loop.stop()
+            self._loop.stop(self._reason())
+
+    def _reason(self) -> str:
+        """Why the gateway ends."""
+        return f"stopped by {self._signals[0] if self._signals else 'a signal'}"
 
     def _opened(self) -> "Loop":
         """The loop with everything open."""

@@ -26,6 +26,8 @@ END_OF_TIME = 1 << 61
 _LIMIT = 1 << 63
 _MAX_DIGITS = 15
 """Digits that a factor of a DBC has at most."""
+_MAX_POWER = 100
+"""A factor that fits is searched within this power of ten."""
 
 
 def set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
@@ -120,10 +122,12 @@ def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
 def _fitting_factor(
     row: Any, signal: SignalPlan, value: Value, set_one: Callable[..., None]
 ) -> str:
-    """A hint that names a factor which the core can express: with fewer digits, or else a coarser one; "" if there is none."""
+    """A hint that names a factor which the core can express: with fewer digits, else a coarser or finer one; "" if there is none."""
     rounded = [f"{float(signal.factor):.{digits}g}" for digits in range(_MAX_DIGITS, 0, -1)]
-    coarser = [Fraction(rounded[-1]) * 10**power for power in range(1, _MAX_DIGITS)]
-    for factor in (*map(Fraction, rounded), *coarser):
+    first = Fraction(rounded[-1])
+    coarser = [first * 10**power for power in range(1, _MAX_POWER)]
+    finer = [first / 10**power for power in range(1, _MAX_POWER)]
+    for factor in (*map(Fraction, rounded), *coarser, *finer):
         ratio = signal.factor / factor
         other = replace(
             signal,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import Counters
-from kontronik_can_gw.esc.telemetry import SECOND, LinkState
+from kontronik_can_gw.esc.telemetry import MS, SECOND, LinkState
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.facts import PortFacts
@@ -23,6 +23,11 @@ from kontronik_can_gw.runtime.serial_port import (
 from kontronik_can_gw.runtime.usb_adapters import Identity, find_adapter, identity_at
 
 MAX_RETRY_NS = SECOND
+LOOK_NS = 100 * MS
+"""Interval at which the ports' settings are checked while the loop turns in Python (LOOK in linux.c).
+
+If another program switches echo on, the driver returns to the ESC what it sends until the next check.
+"""
 DIAGNOSIS_NS = 3 * SECOND
 """Without telemetry for this long, the reason is looked for."""
 
@@ -171,13 +176,18 @@ class EscPort:
         """True if the loop does not serve this port."""
         return self._stuck.is_stuck(self.port)
 
-    def report(self, now: int, looks_too: bool = True) -> None:
-        """Count line errors, look at the port's settings (``looks_too`` False: C does); say why nothing comes."""
+    def hold_settings(self) -> None:
+        """Restore the port's settings if another program has changed them; ``report`` logs that."""
+        if self.port is not None and not self.port.settings_hold():
+            self._noted.restored = True
+
+    def report(self, now: int) -> None:
+        """Count line errors; log restored settings, and the reason if no telemetry is received."""
         if self.port is None:
             return
         if (counts := self.port.line_errors()) is not self._counted:
             self._count(counts)
-        if self._noted.restored or (looks_too and not self.port.settings_hold()):
+        if self._noted.restored:
             self._noted.restored = False
             text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
             self._conditions.event(f"{self.name}: settings", text, now)
@@ -235,6 +245,7 @@ class EscLog:
         self._diagnosis_due = 0
         self._diagnosed: set[str] = set()
         self._lost_counters = (0, 0)
+        self._losses = self._esc.losses
         self._since: Counters | None = self._esc.counters.copy()
         """Counters at a time before that of ``_sampled``; None: not known since telemetry came."""
         self._sampled: tuple[int, Counters] | None = None
@@ -255,6 +266,8 @@ class EscLog:
         """The link's state, layout or device changed: say so."""
         esc, conditions, name = self._esc, self._conditions, self._esc.settings.name
         self.await_telemetry(now)
+        is_hidden_loss = esc.losses > self._losses and not conditions.is_on(self._link_condition)
+        self._losses = esc.losses
         if esc.link in (LinkState.LOST, LinkState.PORT_ERROR):
             self._lost_counters = (esc.counters.crc_errors, esc.counters.dropped_bytes)
             quiet = esc.link is LinkState.PORT_ERROR  # which is said by itself
@@ -263,6 +276,11 @@ class EscLog:
             conditions.forget(self._quality_condition)
         if esc.link not in (LinkState.OK, LinkState.DEGRADED):
             return
+        if is_hidden_loss:  # while the process was held up, or within one turn
+            text = (
+                f"{name}: telemetry was lost for a moment; its values were marked as not available"
+            )
+            conditions.event(self._link_condition, text, now)
         self._diagnosed.clear()
         conditions.forget(self._diagnosis_condition)
         layout = esc.protocol.layout_text(esc.layout) or "unknown layout"

@@ -26,11 +26,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("kontronik_can_gw")
 
-LOOK_NS = SECOND // 2
-"""How often there is a round while nobody else looks at the ports' settings: with echo on, what an ESC sends goes back to it.
-
-The loop is woken for a round only when it is late by as much: mostly it comes round before.
-"""
+ROUND_NS = SECOND
+MAX_LATE_NS = SECOND // 2
+"""The loop is woken for a round only if the round is late by this much: usually something else wakes the loop before."""
 PROCESS_NS = 10 * SECOND
 """How often the process's resources are asked for: that costs more than the rest of a round."""
 STATUS_NS = SECOND
@@ -68,17 +66,17 @@ class Housekeeping:
         self._process, self._process_due = ProcessFacts(), 0
         self._node_states: list[tuple[int, NmtState]] = []
 
-    def run(self, now: int, looks_too: bool = True) -> None:
-        """One round. ``looks_too`` False: the core in C looks at the ports' settings more often."""
-        self.due = now + (LOOK_NS if looks_too else SECOND)
+    def run(self, now: int) -> None:
+        """One round."""
+        self.due = now + ROUND_NS
         for esc in self._escs:
-            esc.report(now, looks_too)
+            esc.report(now)
         self._log_conflicts(now)
         self._conditions.advance(now)
         self.follow_recorder(now)
         self.publish(now)
         self._notify(now)
-        self.wake_due = self.due + LOOK_NS
+        self.wake_due = self.due + MAX_LATE_NS
         if (due := self._alive_due) is not None and due > now:  # else something is stuck
             self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
 

@@ -15,9 +15,9 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.esc_port import EscPort
+from kontronik_can_gw.runtime.esc_port import LOOK_NS, EscPort
 from kontronik_can_gw.runtime.facts import ProgramFacts
-from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.fault_log import FaultLog, duration
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
@@ -63,9 +63,10 @@ class Loop:
         self._notifier = notifier or Notifier({})
         self._statistics = statistics
         self._recorder = recorder
-        self._now = self._node_changes = 0
+        self._now = self._node_changes = self._look_due = 0
         self._due: int | None = None  # not known since something was done
         self._stopping = False
+        self._reason = "stopped"
         self._poller = poller or Poller(clock)
         self._lost: set[EscPort] = set()
         self.escs = [
@@ -90,8 +91,9 @@ class Loop:
         if store is not None:
             self._poller.register(store.fileno(), self._saver.take_results)
 
-    def stop(self) -> None:
-        """End ``run`` soon; safe in a signal handler and from another thread."""
+    def stop(self, reason: str = "stopped") -> None:
+        """End ``run`` soon; safe in a signal handler and from another thread. ``reason`` is logged."""
+        self._reason = reason
         self._stopping = True
         self._wake.wake()
 
@@ -121,6 +123,9 @@ class Loop:
         try:
             while not self._stopping:
                 self.turn()
+        except BaseException as error:
+            self._reason = f"ended by a fault of the program ({error!r})"
+            raise
         finally:
             self.end()
 
@@ -157,8 +162,12 @@ class Loop:
             self.can.ask(now)
             self._due = None
         self._now = now
+        if in_python and now >= self._look_due:
+            self._look_due = now + LOOK_NS
+            for esc in self.escs:
+                esc.hold_settings()
         if now >= self._housekeeping.due:
-            self._housekeeping.run(now, in_python)
+            self._housekeeping.run(now)
             self._due = None
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
@@ -193,6 +202,7 @@ class Loop:
         self._housekeeping.follow_recorder(now)  # what is known of the devices by now
         self.gateway.stop(now)
         self.can.transmit(now)
+        self.conditions.say(logging.INFO, f"{self._reason} {totals(self.gateway, now)}")
         self.close()
 
     def close(self) -> None:
@@ -246,3 +256,15 @@ class Loop:
         if now >= self.can.controller.due:
             self.can.ask(now)
         return max(now, self._clock())
+
+
+def totals(gateway: Gateway, now: int) -> str:
+    """What the gateway has done, in one line."""
+    status, escs = gateway.status, gateway.escs
+    live = sum(esc.counters.live for esc in escs)
+    crc_errors = sum(esc.counters.crc_errors for esc in escs)
+    losses = sum(esc.losses for esc in escs)
+    return (
+        f"after {duration(now - status.started_ns)}: {live} live frames received, {crc_errors} CRC errors, telemetry lost {losses} times; "
+        f"{status.sent_frames} CAN frames sent, {status.dropped_frames} dropped, bus-off {status.bus_off_count} times"
+    )

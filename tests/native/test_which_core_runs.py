@@ -165,10 +165,10 @@ def test_what_the_core_in_c_cannot_express_runs_in_python(monkeypatch: pytest.Mo
     ("signal", "more", "said"),
     [
         (VOLTAGE.format(16, "0.01"), "", ""),
-        (VOLTAGE.format(16, "1e70"), "", "does not fit"),
-        (VOLTAGE.format(16, "18446744073709551616"), "", "does not fit"),
+        (VOLTAGE.format(16, "1e70"), "", "leaves 64 bits. Factor"),
+        (VOLTAGE.format(16, "18446744073709551616"), "", "leaves 64 bits. Factor"),
         (VOLTAGE.format(16, "1e-70"), "", "M.BatteryVoltage: "),
-        ('LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] ""', "", "does not fit"),
+        ('LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] ""', "", "leaves 64 bits. Factor"),
         (VOLTAGE.format(16, "0.01"), CYCLE.format(10_000_000_000_000), "a cycle or distance"),
         (VOLTAGE.format(64, "0.01"), "", ""),
         (VOLTAGE.format(65, "0.01"), "", "M.BatteryVoltage: 65 bits"),

@@ -747,3 +747,65 @@ def test_the_loss_is_reported_before_the_node_stops_because_of_it(bench: Bench) 
     bench.run(SECOND)
     assert emergencies(bench) == [LOST]
     assert bench.state is NmtState.STOPPED
+
+
+def test_a_loss_that_a_hold_up_hides_is_logged_between_the_two_good_states(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The loss and the return are found in one turn: the end of the turn is as its beginning."""
+    world = World()
+    start = world.now
+    world.wires[0].stream(start, start + 3 * SECOND, 10 * MS)
+    loop = loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    run(loop, world, start + SECOND)
+    held_up = iter([300 * MS])
+    world.hold_up = lambda: next(held_up, 0)
+    run(loop, world, start + 3 * SECOND)
+    loop.close()
+    assert loop.gateway.escs[0].losses == 1
+    lines = [line.partition(" esc1: telemetry ")[2] for line in loop.conditions.recent]
+    assert [line.partition(" (")[0] for line in lines if line] == [
+        "ok",
+        "was lost for a moment; its values were marked as not available",
+        "ok",
+    ]
+
+
+def test_the_end_of_a_loop_is_one_line_with_reason_and_totals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World()
+    start = world.now
+    world.wires[0].stream(start, start + SECOND, 10 * MS)
+    loop = loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    run(loop, world, start + 2 * SECOND)
+    loop.stop("stopped by SIGTERM")
+    loop.end()
+    sent = len(world.bus.sent)
+    assert sent > 100
+    said = (
+        "stopped by SIGTERM after 2.0 s: 100 live frames received, 0 CRC errors, telemetry lost 1 times; "
+        f"{sent} CAN frames sent, 0 dropped, bus-off 0 times"
+    )
+    assert loop.conditions.recent[-1].endswith(said)
+
+
+def test_a_fault_of_the_program_is_named_in_the_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+    loop = loop_in(world, monkeypatch)
+    loop.open()
+
+    def fail() -> None:
+        raise ZeroDivisionError("x")
+
+    monkeypatch.setattr(loop, "turn", fail)
+    with pytest.raises(ZeroDivisionError):
+        loop.run()
+    assert (
+        "ended by a fault of the program (ZeroDivisionError('x')) after"
+        in loop.conditions.recent[-1]
+    )

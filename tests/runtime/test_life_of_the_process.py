@@ -90,6 +90,14 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
     assert not file.exists()
     logged = errors.read_text()
     assert "record.can_log: was removed and is ignored. `kontronik-can-gw convert" in logged
+    last = logged.splitlines()[-1]
+    totals = (
+        r"stopped by SIGHUP after [\d.]+ s: (\d+) live frames received, 0 CRC errors, telemetry lost 0 times; "
+        r"(\d+) CAN frames sent, 0 dropped, bus-off 0 times"
+    )
+    found_totals = re.search(totals, last)
+    assert found_totals is not None, last
+    assert min(map(int, found_totals.groups())) > 20
     if "not permitted" in logged:
         assert "Running without." in logged and policy == os.SCHED_OTHER
     else:
