@@ -12,16 +12,14 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import CanPort
+from kontronik_can_gw.runtime.link_commands import restart
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.socketcan_port import fault_of
 
 RETRY_S = 0.5
 """How often an interface that does not work is tried again, and one that works is checked."""
 _MAX_AT_ONCE = 4096
-_BUS_OFF = (
-    "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. "
-    "Start it anew: sudo ip link set {name} down && sudo ip link set {name} up type can restart-ms 100"
-)
+_BUS_OFF = "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. Start it again: {command}"
 
 
 class BusListener:
@@ -93,7 +91,10 @@ class BusListener:
                 self.problem = error.problems[0]
         else:
             is_off = self._port.state is CanState.BUS_OFF and config.interface == "socketcan"
-            self.problem = _BUS_OFF.format(name=config.channel) if is_off else ""
+            self.problem = ""
+            if is_off:
+                command = restart(config.channel, "type can restart-ms 100")
+                self.problem = _BUS_OFF.format(name=config.channel, command=command)
 
     def _take(self) -> list[CanFrame]:
         if self._port is None:

@@ -7,6 +7,7 @@ from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.link_commands import restart
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.snapshot import name_in_words
 
@@ -149,6 +150,6 @@ class CanController:
             return ""
         name = self._config.channel
         return (
-            f" restart-ms is 0, so it stays there until somebody restarts it: sudo ip link set {name} down && sudo ip link set {name} "
-            "up. For good: the same with up type can restart-ms 100."
+            f" restart-ms is 0, so it stays off until somebody restarts it: {restart(name)}. "
+            f"To let it restart by itself: {restart(name, 'type can restart-ms 100')}."
         )

@@ -20,6 +20,7 @@ from kontronik_can_gw.runtime.can_port import (
     CanPort,
     Received,
 )
+from kontronik_can_gw.runtime.link_commands import VIRTUAL, add_virtual, enable_fd, kind_of, set_up
 from kontronik_can_gw.transmit_queue import Sent
 
 _RECEIVE_BUFFER = 1 << 20
@@ -219,9 +220,9 @@ def open_socketcan(config: CanConfig) -> SocketCanPort:
     name = config.channel
     mtu = Path("/sys/class/net", name, "mtu")
     if config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
+        command = enable_fd(config, kind_of(name))
         raise RunError(
-            f"CAN interface {name}: does not do CAN FD. Adapter: sudo ip link set {name} up type can bitrate {config.bitrate} "
-            f"dbitrate {config.data_bitrate} fd on; vcan: sudo ip link set {name} mtu {_FD.size}; or set can.fd = false."
+            f"CAN interface {name}: CAN FD is not switched on. Switch it on: {command}; or set can.fd = false."
         )
     try:
         with contextlib.ExitStack() as undone:
@@ -243,18 +244,22 @@ def open_socketcan(config: CanConfig) -> SocketCanPort:
 
 
 def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
-    """What is said of an interface that cannot be used, with the remedy. ``number`` as in errno."""
+    """Return the error for an interface that cannot be used, with the remedy. ``number`` as in errno."""
     name = config.channel
-    make = f"sudo ip link set {name} up type can bitrate {config.bitrate} restart-ms 100"
     if number in (errno.ENODEV, errno.ENXIO):
-        virtual = f"sudo ip link add {name} type vcan && sudo ip link set {name} up"
+        kind = kind_of(name)
+        virtual = add_virtual(config)
+        if kind in VIRTUAL:
+            return RunError(f"CAN interface {name}: there is none. Create it: {virtual}.")
         return RunError(
-            f"CAN interface {name}: there is none. With an adapter plugged in: {make}. For a virtual one: {virtual}."
+            f"CAN interface {name}: there is none. With an adapter plugged in: {set_up(config, kind)}. "
+            f"For a virtual one: {virtual}."
         )
     if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
         return RunError(
             f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan."
         )
     if number == errno.ENETDOWN:
-        return RunError(f"CAN interface {name}: is down. Start it: {make}.")
+        command = set_up(config, kind_of(name))
+        return RunError(f"CAN interface {name}: is down. Start it: {command}.")
     return RunError(f"CAN interface {name}: cannot be opened: {text}")

@@ -95,6 +95,7 @@ class Tree(Machine):
         usual |= {"UnitFileState": "enabled", "NRestarts": "0", "Result": "success", "User": "anna"}
         text = "".join(f"{name}={value}\n" for name, value in {**usual, **shown}.items())
         self.programs["systemctl", "show"] = text
+        self.folder("/run/systemd/system")
 
     # --- what the checks see
 

@@ -117,8 +117,19 @@ def test_a_virtual_interface_is_noted_and_has_commands_of_its_own(tree: Tree) ->
     interface(tree, change)
     findings = check_can(tree, FD)
     assert grave(findings) == {"can.exists": NOTE, "can.up": ERROR, "can.fd": ERROR}
-    assert only(findings, "can.up").command == "sudo ip link set can0 up"
+    assert only(findings, "can.up").command == "sudo ip link set can0 mtu 72 up"
     assert only(findings, "can.fd").command.endswith("sudo ip link set can0 mtu 72 up")
+
+
+def test_vcan_gets_commands_of_its_own_also_without_ip(tree: Tree) -> None:
+    add = "sudo ip link add vcan0 type vcan && sudo ip link set vcan0 up"
+    assert only(check_can(tree, CanConfig(channel="vcan0")), "can.exists").command == add
+    tree.file("/sys/class/net/can1/type", "280\n")
+    assert only(check_can(tree, CanConfig(channel="vcan0")), "can.exists").command == add
+    for name, text in (("type", "280"), ("flags", "0x80"), ("mtu", "16")):
+        tree.file(f"/sys/class/net/vcan0/{name}", f"{text}\n")
+    found = check_can(tree, CanConfig(channel="vcan0"))  # without `ip`
+    assert only(found, "can.up").command == "sudo ip link set vcan0 up"
 
 
 def test_what_is_no_can_interface_and_no_driver_is_reported(tree: Tree) -> None:

@@ -53,6 +53,19 @@ def test_how_the_service_fares_is_reported(
     assert set(grave(findings)) <= {found.check}
 
 
+@pytest.mark.parametrize("folder", ["/usr/lib/systemd/system", "/etc/systemd/system"])
+def test_without_a_running_systemd_no_installation_is_advised(tree: Tree, folder: str) -> None:
+    found = only(service(tree), "machine.service")
+    assert (found.severity, found.command) == (NOTE, f"kontronik-can-gw run --wait -c {CONFIG}")
+    tree.file(f"{folder}/kontronik-can-gw.service", "")
+    found = only(service(tree), "machine.service")
+    assert "kontronik-can-gw.service is installed, but systemd does not run here" in found.text
+    assert (found.severity, found.command) == (
+        NOTE,
+        "sudo systemctl enable --now kontronik-can-gw.service",
+    )
+
+
 # --- files and folders
 
 

@@ -96,6 +96,19 @@ def test_an_interface_without_can_fd_is_refused_with_the_command_that_mends_it(v
         pass
 
 
+def test_an_interface_that_is_down_or_missing_is_refused_with_a_command_that_works(
+    vcan: str,
+) -> None:
+    ip("link", "set", vcan, "down")
+    with pytest.raises(RunError) as refused, port_on(vcan, []):
+        pass
+    command = f"sudo ip link set {vcan} up"
+    assert str(refused.value).endswith(f"is down. Start it: {command}.")
+    ip(*command.split()[2:])
+    with port_on(vcan, []) as port:
+        assert port.send(CanFrame(0x10, b"short")) is Sent.OK
+
+
 def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(
     vcan: str,
 ) -> None:

@@ -10,9 +10,12 @@ pytestmark = pytest.mark.extended
 
 BEFORE = """
 sudo() { "$@"; }
-# A command in front that never ends is ended by a signal, once it shows an ESC that is heard.
+# A command in front that never ends is ended by a signal, once it shows an ESC that is heard. The state that
+# `status` shows is up to a second old, and a reader takes longer for the line before.
 kontronik-can-gw() {
-    case $BASHPID.$1 in $$.run | $$.monitor) ;; *) command kontronik-can-gw "$@"; return ;; esac
+    case $BASHPID.$1 in $$.run | $$.monitor) ;;
+        $$.status) until command kontronik-can-gw "$@"; do sleep 0.1; done; return ;;
+        *) command kontronik-can-gw "$@"; return ;; esac
     : >said
     command kontronik-can-gw "$@" >said 2>&1 &
     until grep -Eq "esc1.*( ok|heard)" said || ! kill -0 $! 2>/dev/null; do sleep 0.1; done

@@ -7,6 +7,16 @@ from typing import Any
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
+from kontronik_can_gw.runtime.link_commands import (
+    VIRTUAL,
+    add_virtual,
+    controller_settings,
+    enable_fd,
+    kind_by_name,
+    leave_bus_off,
+    restart,
+    set_up,
+)
 
 _CAN_TYPE = "280"
 """ARPHRD_CAN"""
@@ -17,12 +27,13 @@ _MODES = {"LISTEN-ONLY": "listen_only", "LOOPBACK": "loopback"}
 
 def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
     """All findings about the CAN interface: the kernel's own facts, and where `ip` is there those of the controller."""
-    fd = f" dbitrate {can.data_bitrate} fd on" if can.fd else ""
     findings = Findings(
         f"CAN {can.channel}",
         channel=can.channel,
-        again=f"sudo ip link set {can.channel} down; sudo ip link set {can.channel} up",
-        set=f"type can bitrate {can.bitrate}{fd}",
+        again=restart(can.channel),
+        again_set=restart(can.channel, controller_settings(can)),
+        add=add_virtual(can),
+        leave_bus_off=leave_bus_off(can.channel),
     )
     net = "/sys/class/net"
     folder = f"{net}/{can.channel}"
@@ -31,17 +42,23 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         return findings.found
     if machine.text(f"{folder}/type") != _CAN_TYPE:
         there = [n for n in machine.names(net) if machine.text(f"{net}/{n}/type") == _CAN_TYPE]
-        case = "no_can" if machine.exists(folder) else "others" if there else "none"
+        case = "no_can"
+        if not machine.exists(folder):
+            is_virtual = kind_by_name(can.channel) in VIRTUAL
+            missing = "others" if there else "none"
+            case = "no_virtual" if is_virtual else missing
         findings.say("can.exists", case, there=", ".join(there) or "none")
         return findings.found
     link = _link(machine, can.channel)
-    kind = link.get("info_kind")
-    virtual = kind in ("vcan", "vxcan")
+    kind = link.get("info_kind") or kind_by_name(can.channel)
+    virtual = kind in VIRTUAL
+    findings.values["up"] = set_up(can, kind)
+    findings.values["fd"] = enable_fd(can, kind)
     findings.say("can.exists", "virtual" if virtual else "ok", kind=kind)
     is_up = bool(int(machine.text(f"{folder}/flags") or "0", 0) & 1)
-    findings.say("can.up", "ok" if is_up else "down_virtual" if virtual else "down")
+    findings.say("can.up", "ok" if is_up else "down")
     if can.fd and int(machine.text(f"{folder}/mtu") or "0") < _FD_MTU:
-        findings.say("can.fd", "off_virtual" if virtual else "off")
+        findings.say("can.fd", "off")
     if not link:
         findings.say("can.details", "no_ip")
     elif not virtual:

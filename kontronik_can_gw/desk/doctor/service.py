@@ -11,6 +11,9 @@ from kontronik_can_gw.desk.doctor.machine import Machine
 NAME = "kontronik-can-gw"
 _SHOWN = "LoadState,ActiveState,SubState,UnitFileState,NRestarts,Result,User"
 _MIN_BYTES = 1_000_000
+_BOOTED = "/run/systemd/system"
+"""Exists if systemd runs (sd_booted)."""
+_UNIT_FOLDERS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
 
 
 class Unit(NamedTuple):
@@ -27,18 +30,34 @@ class Unit(NamedTuple):
 
 def unit_of(machine: Machine, config: str) -> Unit | None:
     """The unit for a configuration file, by its absolute path; None where systemd has none."""
-    path = PurePath(config)
-    is_instance = str(path.parent) == f"/etc/{NAME}" and path.stem != "gateway"
-    name = f"{NAME}@{path.stem}.service" if is_instance else f"{NAME}.service"
+    name = _unit_name(config)
     lines = machine.run("systemctl", "show", name, f"--property={_SHOWN}").splitlines()
     shown = dict(line.partition("=")[::2] for line in lines)
     return Unit(name, shown) if shown.get("LoadState") == "loaded" else None
 
 
+def _unit_name(config: str) -> str:
+    path = PurePath(config)
+    is_instance = str(path.parent) == f"/etc/{NAME}" and path.stem != "gateway"
+    return f"{NAME}@{path.stem}.service" if is_instance else f"{NAME}.service"
+
+
 def check_service(machine: Machine, findings: Findings, unit: Unit | None, config: str) -> None:
     """Check whether it is installed, enabled and running, and how often it was restarted."""
     if unit is None:
-        findings.say("machine.service", "none")
+        name = _unit_name(config)
+        if not machine.exists(_BOOTED):
+            is_packaged = any(
+                machine.exists(f"{folder}/{NAME}.service") for folder in _UNIT_FOLDERS
+            )
+            findings.say(
+                "machine.service",
+                "not_booted" if is_packaged else "no_systemd",
+                unit=name,
+                file=config,
+            )
+        else:
+            findings.say("machine.service", "none")
         return
     state = unit.shown.get("ActiveState", "")
     restarts, result = unit.shown.get("NRestarts", "0"), unit.shown.get("Result", "")
