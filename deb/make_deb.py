@@ -123,7 +123,7 @@ def manual_page() -> str:
     tool = str(Path(sys.executable).with_name("argparse-manpage"))
     words = ["--module", "kontronik_can_gw.cli", "--function", "make_parser", "--prog", NAME]
     words += ["--project-name", NAME, "--version", version(), "--manual-title", "User Commands"]
-    words += ["--description", "gateway from KONTRONIK ESC telemetry to CAN and CANopen"]
+    words += ["--description", "gateway from KONTRONIK ESC telemetry to CAN, CANopen, DroneCAN"]
     return output_of(tool, *words)
 
 
@@ -151,7 +151,8 @@ def make_tree(tree: Path, wheel: Path, libraries: Sequence[Path], seconds: int) 
     for each in [wheel, *libraries]:
         unpack(each, modules)
     put(tree / "usr/bin" / NAME, (HERE / "program").read_bytes(), 0o755)
-    put(modules / "take-over", (HERE / "take-over").read_bytes(), 0o755)
+    for name in ("take-over", "make-user"):
+        put(modules / name, (HERE / name).read_bytes(), 0o755)
     put(
         tree / f"usr/share/python3/runtime.d/{NAME}.rtupdate",
         (HERE / "rtupdate").read_bytes(),

@@ -194,6 +194,7 @@ def test_it_can_be_installed_and_purged_without_systemd(
     before = root.files()
     root.install(packages["amd64"])
     assert "core: C" in root.gateway("doctor", "-c", f"/{CONFIGURATION}", code=1)
+    assert "(dialout)" in root.run("id", "kontronik-can-gw")
     purge(root, before)
 
 

@@ -9,6 +9,7 @@ import importlib.metadata
 import io
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -119,7 +120,7 @@ def test_nothing_is_in_etc_or_var_and_all_is_roots(made: dict[str, bytes]) -> No
     assert [name for name in found if name.startswith(("./etc", "./var", "./run"))] == []
     for name, member in found.items():
         executable = member.isdir() or name.endswith(
-            ("/bin/kontronik-can-gw", "take-over", "rtupdate")
+            ("/bin/kontronik-can-gw", "take-over", "make-user", "rtupdate")
         )
         assert (member.uid, member.gid, member.uname) == (0, 0, "root"), name
         assert member.mode & 0o777 == (0o755 if executable else 0o644), name
@@ -236,6 +237,47 @@ def test_a_purge_leaves_network_files_and_what_another_installation_needs(board:
     assert "userdel kontronik-can-gw" in script(board, "postrm", "purge")
     left = [path.name for name in ("etc", "var") for path in (board / name).rglob("*kontronik*")]
     assert left == [network.name]
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_without_systemd_the_user_is_the_one_that_sysusers_would_create(
+    is_there: bool, tmp_path: Path
+) -> None:
+    """Only stand-ins are on the path, so systemd-sysusers is missing."""
+    for name in ("useradd", "groupadd"):
+        make_deb.put(tmp_path / name, f'#!/bin/sh\necho {name} "$@"\n', 0o755)
+    make_deb.put(tmp_path / "getent", f"#!/bin/sh\nexit {0 if is_there else 2}\n", 0o755)
+    done = subprocess.run(
+        ["/bin/sh", make_deb.HERE / "make-user"],
+        env={"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    if is_there:
+        assert done.stdout == ""
+        return
+    made = done.stdout.splitlines()
+    assert made[:2] == ["groupadd --system dialout", "groupadd --system uucp"]
+    rows = [
+        shlex.split(line)
+        for line in (make_deb.PLAIN / "sysusers.conf").read_text().splitlines()
+        if not line.startswith("#")
+    ]
+    groups = [row[2] for row in rows if row[0] == "m"]
+    ((_, user, _, comment, home, shell),) = [row for row in rows if row[0] == "u"]
+    assert shell == "-"  # means nologin for a system user
+    assert made[2] == (
+        f"useradd --system --user-group --groups {','.join(groups)} --no-create-home --home-dir {home} "
+        f"--shell /usr/sbin/nologin --comment {comment} {user}"
+    )
+
+
+def test_with_systemd_sysusers_creates_the_user(tmp_path: Path) -> None:
+    make_deb.put(tmp_path / "systemd-sysusers", '#!/bin/sh\necho sysusers "$@"\n', 0o755)
+    command = ["/bin/sh", str(make_deb.HERE / "make-user")]
+    said = subprocess.check_output(command, env={"PATH": str(tmp_path)}, text=True)
+    assert said == "sysusers kontronik-can-gw.conf\n"
 
 
 def test_every_library_is_pinned_or_left_out_by_name() -> None:
