@@ -76,10 +76,27 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     library.cache_clear()
 
 
+OF_SYSTEMD = (
+    *("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "JOURNAL_STREAM", "INVOCATION_ID"),
+    *("RUNTIME_DIRECTORY", "STATE_DIRECTORY", "XDG_STATE_HOME"),
+)
+"""Set where the tests run in a service; the gateway would take them as its own."""
+OF_TERMINALS = ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE")
+
+
+def clear_environment(patch: pytest.MonkeyPatch) -> None:
+    """Removes variables that change how the gateway runs or prints, and sets UTC as local time."""
+    for name in (*OF_SYSTEMD, *OF_TERMINALS):
+        patch.delenv(name, raising=False)
+    patch.setenv("TZ", "UTC")
+    time.tzset()
+
+
 @pytest.fixture(autouse=True, scope="session")
 def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Makes the tests independent of how this machine is set up.
 
+    - No variables that change how the gateway runs or prints, and UTC as the local time.
     - A machine id: containers and fresh roots have none, and the configuration warns about that.
     - No configuration in /etc: an installed gateway has one.
     - A runtime folder of their own, for this process and its children. A user without a session
@@ -93,6 +110,7 @@ def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     file.write_text("0123456789abcdef0123456789abcdef\n")
     runtime = tmp_path_factory.mktemp("runtime")
     with pytest.MonkeyPatch.context() as patch:
+        clear_environment(patch)
         patch.setenv("XDG_RUNTIME_DIR", str(runtime))
         patch.setattr(folders, "RUN", runtime)
         patch.setattr(machine, "_IDENTITIES", (str(file), "/etc/machine-id"))

@@ -58,6 +58,26 @@ def test_make_test_goes_on_after_a_hangup_only_under_nohup(ignored: bool, code: 
     assert done.returncode == code, done.stderr
 
 
+def test_the_environment_of_a_service_and_a_time_zone_do_not_reach_tests() -> None:
+    script = (
+        "import conftest, os, pytest, time; conftest.clear_environment(pytest.MonkeyPatch()); "
+        "print({'NOTIFY_SOCKET', 'STATE_DIRECTORY', 'COLUMNS'} & os.environ.keys(), "
+        "time.localtime(0).tm_hour)"
+    )
+    outside = {"NOTIFY_SOCKET": "/x", "STATE_DIRECTORY": "/x", "COLUMNS": "9", "TZ": "Asia/Tokyo"}
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=TESTS,
+        env=os.environ | outside | {"KCG_VCAN": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "set() 0\n", done.stderr
+    assert not {"NOTIFY_SOCKET", "STATE_DIRECTORY", "COLUMNS"} & os.environ.keys()
+    assert os.environ["TZ"] == "UTC"
+
+
 def test_locks_of_tests_are_in_a_folder_that_every_user_can_write() -> None:
     """Without a session a user has no /run/user/UID."""
     folder = runtime_folder("lock")
