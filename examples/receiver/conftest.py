@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from display import Display
 
 CHANNEL = os.environ.get("CAN_CHANNEL", "vcan0")
+DBC = Path(__file__).parents[1] / "one-esc/bus.dbc"
 
 
 class Bench:
@@ -61,3 +63,11 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     bench = Bench(tmp_path)
     yield bench
     bench.end()
+
+
+@pytest.fixture
+def display() -> Iterator[Display]:
+    """The receiver under test. Put yours in its place."""
+    display = Display(CHANNEL, str(DBC))
+    yield display
+    display.close()

@@ -1,20 +1,7 @@
 """A display against a real gateway: telemetry, an ESC that goes and comes back, error bits, a bus that goes down."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-from conftest import CHANNEL, Bench, until
+from conftest import Bench, until
 from display import Display
-
-DBC = Path(__file__).parents[1] / "one-esc/bus.dbc"
-
-
-@pytest.fixture
-def display() -> Iterator[Display]:
-    display = Display(CHANNEL, str(DBC))
-    yield display
-    display.close()
 
 
 def test_telemetry_is_shown(bench: Bench, display: Display) -> None:

@@ -1,7 +1,8 @@
-"""The blocks of shell commands in README, CONTRIBUTING, docs and examples, as a reader would type them.
+"""The blocks of shell commands and Python in README, CONTRIBUTING, docs and examples, as a reader would run them.
 
-The word after ``sh`` says where a block can be run: without one on any machine, with ``vcan`` by root on a kernel that has it;
-``root``, ``systemd``, ``network`` and ``hardware`` say what no test has or may change.
+The word after ``sh`` is the place in which a block can be run: any machine without a word, as root on a kernel with
+vcan for ``vcan``. ``root``, ``systemd``, ``network`` and ``hardware`` are things that no test has or may change.
+Python is run as root on a kernel with vcan.
 """
 
 import contextlib
@@ -28,20 +29,20 @@ WORDS = ("", "vcan", "root", "systemd", "network", "hardware")
 
 
 class Block(NamedTuple):
-    """A block of a page; ``word``: one of WORDS."""
+    """A block of a page. ``word``: one of WORDS for shell commands, "" for another language."""
 
     place: str
     word: str
     text: str
 
 
-def blocks(*words: str) -> list[Block]:
-    """Those that have one of these words."""
+def blocks(*words: str, language: str = "sh") -> list[Block]:
+    """The blocks of a language that have one of these words."""
     found = []
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         for match in re.finditer(
-            r"^```sh *(.*)\n([^`]*(?:`[^`]+`[^`]*)*?)^```$", text, re.MULTILINE
+            rf"^```{language} *(.*)\n([^`]*(?:`[^`]+`[^`]*)*?)^```$", text, re.MULTILINE
         ):
             line = text.count("\n", 0, match.start()) + 1
             place = f"{page.relative_to(PROJECT)}:{line}"

@@ -3,6 +3,7 @@
 Shell blocks can be typed as they stand, on any machine; tests/vcan has those that need a CAN interface.
 """
 
+import json
 import re
 import shutil
 import subprocess
@@ -83,6 +84,13 @@ def test_configurations_are_valid() -> None:
     for block in re.findall(r"```toml\n(.*?)```", ALL, re.DOTALL):
         # some show a table alone
         parse({"esc": [{"port": "/dev/ttyUSB0"}]} | tomllib.loads(block), "README.md")
+
+
+def test_json_blocks_are_valid() -> None:
+    found = blocks(language="json")
+    assert found
+    for block in found:
+        json.loads(block.text)
 
 
 def test_every_command_is_named() -> None:
