@@ -87,14 +87,19 @@ install_project() { # $1: demo or test, $2: what pip installs
 vm_packages="user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
 vm_line="sudo apt-get install $vm_packages"
 
+# What another user has installed is used without rights to install.
 # User Mode Linux 6.1 does not know the registers of the newest processors: there it starts with the help of uml_xstate.c.
 install_uml() {
     key=$(cksum <tests/vm/uml_xstate.c)
     command -v linux.uml >/dev/null && [ "$(cat .venv/.uml-starts 2>/dev/null)" = "$key" ] && return
-    can_root || { lacking "$vm_packages" "a kernel with vcan"; return 1; }
-    apt_update
-    say "User Mode Linux"
-    tests/vm/setup.sh uml || { say "failed; by hand:  $vm_line"; return 1; }
+    for program in linux.uml busybox cc ip candump; do
+        command -v $program >/dev/null && continue
+        can_root || { lacking "$vm_packages" "a kernel with vcan"; return 1; }
+        apt_update
+        say "User Mode Linux"
+        tests/vm/setup.sh uml || { say "failed; by hand:  $vm_line"; return 1; }
+        break
+    done
     if ! "$venv" -B tests/vm/vm_run.py --backend uml --timeout 60 -- true 2>/dev/null; then
         say "it does not start on this processor by itself: tests/vm/uml_xstate.c"
         tests/vm/setup.sh xstate && "$venv" -B tests/vm/vm_run.py --backend uml --timeout 60 -- true || return 1

@@ -4,7 +4,7 @@
 #   uml        User Mode Linux, 41 MB, and a C compiler: what `make test` uses where the kernel has no vcan
 #   xstate     what it needs to start on a processor with AMX (uml_xstate.c)
 #   qemu       QEMU and Debian's stock kernel, 90 MB: serial ports and CAN controllers besides vcan
-# Needs root or a sudo that asks nothing. The kernel for QEMU is downloaded and unpacked, not installed.
+# Needs root, or a sudo without a password, if a package is missing. The kernel for QEMU is downloaded and unpacked, not installed.
 # VM_CACHE: where it goes (tests/vm/.cache). VM_APT_UPDATED=1: the package lists are fresh.
 set -eu
 
@@ -22,30 +22,37 @@ for part in "$@"; do
     esac
 done
 
-if [ "$(id -u)" = 0 ]; then
-    sudo=
-elif sudo -n true 2>/dev/null; then
-    sudo="sudo -n"
-else
-    echo "setup.sh: needs root:  sudo apt-get install $packages" >&2
-    exit 1
-fi
-
 apt() { $sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 "$@" </dev/null; }
+
+# Quiet, but the whole log when it fails.
+install() {
+    if [ "$(id -u)" = 0 ]; then
+        sudo=
+    elif sudo -n true 2>/dev/null; then
+        sudo="sudo -n"
+    else
+        echo "setup.sh: needs root:  sudo apt-get install $*" >&2
+        exit 1
+    fi
+    log=$(mktemp)
+    if { [ -n "${VM_APT_UPDATED:-}" ] || apt update; apt install -y --no-install-recommends "$@"; } >"$log" 2>&1; then
+        rm -f "$log"
+    else
+        cat "$log" >&2
+        rm -f "$log"
+        echo "setup.sh: apt-get install $*: failed" >&2
+        exit 1
+    fi
+}
 
 work=
 trap '[ -z "$work" ] || rm -rf "$work"' EXIT
 
-# Quiet, but the whole log when it fails.
-log=$(mktemp)
-if { [ -n "${VM_APT_UPDATED:-}" ] || apt update; apt install -y --no-install-recommends $packages; } >"$log" 2>&1; then
-    rm -f "$log"
-else
-    cat "$log" >&2
-    rm -f "$log"
-    echo "setup.sh: apt-get install $packages: failed" >&2
-    exit 1
-fi
+missing=
+for package in $packages; do
+    dpkg-query -W -f='${Status}' "$package" 2>/dev/null | grep -q ' installed$' || missing="$missing $package"
+done
+[ -z "$missing" ] || install $missing
 if [ $xstate = yes ]; then
     mkdir -p "$cache"
     gcc -O2 -Wall -shared -fPIC -o "$cache/uml_xstate.so" "$here/uml_xstate.c" -ldl
