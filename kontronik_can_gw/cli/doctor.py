@@ -21,7 +21,7 @@ from kontronik_can_gw.desk.doctor.can import check_can
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.ports import check_port, diagnoses
 from kontronik_can_gw.desk.doctor.service import Unit, check_folder, check_service, unit_of
-from kontronik_can_gw.desk.monitor.status import NOT_RUNNING, look_at, status_file
+from kontronik_can_gw.desk.monitor.status import NOT_RUNNING, look_at_first, possible_files
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words, make_core
@@ -74,8 +74,8 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
             about.say("config", "mistake", problem=problem, command=command)
     if config is not None:
         _folders(machine, about, config, unit)
-        file = machine.path(str(config.statistics_path or status_file(path)))
-        seen = look_at(file, time.monotonic_ns(), path)
+        files = [machine.path(str(file)) for file in possible_files(path)]
+        seen = look_at_first(files, time.monotonic_ns(), path)
         reasons = {} if seen.code == NOT_RUNNING else diagnoses(seen.document)
         for esc in config.esc:
             even = protocol_named(esc.protocol).even_parity

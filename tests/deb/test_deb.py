@@ -23,7 +23,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from kontronik_can_gw.cli.service import planned
+from kontronik_can_gw.cli.service import PLAIN, planned
 
 PROJECT = make_deb.PROJECT
 LEFT_OUT = {"wrapt", "markdown-it-py", "pygments", "argparse-addons", "crccheck"}
@@ -261,7 +261,7 @@ def test_without_systemd_the_user_is_the_one_that_sysusers_would_create(
     assert made[:2] == ["groupadd --system dialout", "groupadd --system uucp"]
     rows = [
         shlex.split(line)
-        for line in (make_deb.PLAIN / "sysusers.conf").read_text().splitlines()
+        for line in (PLAIN / "sysusers.conf").read_text().splitlines()
         if not line.startswith("#")
     ]
     groups = [row[2] for row in rows if row[0] == "m"]

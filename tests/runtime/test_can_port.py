@@ -318,7 +318,7 @@ def test_frames_that_the_controller_or_the_kernel_lost_are_noted_once(
 @pytest.fixture
 def opened(fake: FakeSocket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSocket:
     """The socket that ``open_socketcan`` gets. In tmp_path is /sys/class/net."""
-    monkeypatch.setattr(socketcan_port.socket, "socket", lambda *_: fake)
+    monkeypatch.setattr(socket, "socket", lambda *_: fake)
     monkeypatch.setattr(socketcan_port, "Path", lambda _, *parts: tmp_path.joinpath(*parts))
     (tmp_path / "lo").mkdir()
     (tmp_path / "can0").mkdir()
