@@ -17,11 +17,11 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_controller import CanController
+from kontronik_can_gw.runtime.can_opener import CanOpener
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.locks import IdLocks
-from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.poller import Poller, PortInput, Retry, StuckCheck
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.transmitter import Transmitter
@@ -51,7 +51,6 @@ class CanLink:
         self._poller = poller
         self._conditions = conditions
         self.condition = f"CAN {config.channel}: interface"
-        self._esc_at = esc_at
         self._clock = clock
         self._retry = Retry(MAX_RETRY_NS)
         self._own_ids = IdLocks(config, gateway, conditions)
@@ -64,6 +63,9 @@ class CanLink:
         self._stuck = StuckCheck(self._noted)
         if (fd := self.controller.fileno()) is not None:
             poller.register(fd, self.hear)
+        self.must_open = False  # the first opening is under way, and its failure ends the gateway
+        self._opener = CanOpener(config, esc_at)
+        poller.register(self._opener.fileno(), self._follow_opener)
 
     @property
     def due(self) -> int:
@@ -71,23 +73,24 @@ class CanLink:
 
         Otherwise the controller is asked when the loop comes round: it need not be woken for that.
         """
-        due, retry = self.transmitter.due, self._retry.due
-        if self.controller.is_off and self.controller.due < due:
-            due = self.controller.due
-        return due if retry is None or due < retry else retry
+        due = self.transmitter.due
+        if self.controller.is_off:
+            due = min(due, self.controller.due)
+        return due if self._retry.due is None else min(due, self._retry.due)
 
     @property
     def is_open(self) -> bool:
         return self.port is not None
 
     def open(self, now: int, wait: bool) -> None:
-        """Open the interface. RunError where that fails, unless ``wait``: then it is tried again.
+        """Open the interface, or start to. RunError if that fails, unless ``wait``; a driver's failure is raised by a later turn.
 
-        Where another gateway has one of our node-IDs or sends our messages it is a RunError in any case.
+        RunError in any case if another gateway has one of our node-IDs or sends our messages.
         """
         self._own_ids.lock(at_start=True)
         try:
-            self._open(now)
+            if not self._open(now):
+                self.must_open = not wait
         except RunError as error:
             if not wait:
                 raise
@@ -98,28 +101,42 @@ class CanLink:
         if self._retry.due is None or now < self._retry.due or self.port is not None:
             return
         try:
-            self._open(now)
+            if self._open(now):
+                self._gateway.can_returned(max(now, self._clock()))  # to open may take long
         except RunError as error:
             self._failed(str(error), now)
-            return
-        self._gateway.can_returned(max(now, self._clock()))  # to open may take long
+
+    def _follow_opener(self, now: int, _events: int = 0) -> None:
+        """An opening beside the loop has ended."""
+        result = self._opener.take()
+        if isinstance(result, CanPort):
+            self._use(result, now)
+            self._gateway.can_returned(now)
+        elif result is not None:
+            if self.must_open:
+                raise result
+            self._failed(str(result), now)
+        self.must_open = self.must_open and result is None
 
     def close(self) -> None:
         """Close everything."""
+        self._poller.unregister(self._opener.fileno())
+        self._opener.close()
         self._close_port()
         self._own_ids.close()
         if (fd := self.controller.fileno()) is not None:
             self._poller.unregister(fd)
             self.controller.close()
 
-    def _open(self, now: int) -> None:
-        self._refuse_escs_as_channel()
-        try:
-            port = open_can(self.config)
-        except OSError as error:  # it went away a moment ago
-            raise RunError(
-                f"CAN interface {self.config.channel}: {error.strerror or error}."
-            ) from None
+    def _open(self, now: int) -> bool:
+        """Opens the interface. False if it will be open later."""
+        self._retry.due = None
+        if (port := self._opener.open()) is not None:
+            self._use(port, now)
+        return port is not None
+
+    def _use(self, port: CanPort, now: int) -> None:
+        """Takes over an open port."""
         self.port = port
         self._retry.due = None
         self.transmitter.forget_failures()
@@ -131,17 +148,9 @@ class CanLink:
         self.follow_ids()
         self._gateway.can_opened(now)
         self.controller.refresh(now)  # older reports, as that it was down, are past
-        if not self._conditions.is_on(self.condition):
-            # otherwise it is said when a frame is sent
+        if not self._conditions.is_on(self.condition):  # otherwise logged when a frame is sent
             self._conditions.say(
                 logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open"
-            )
-
-    def _refuse_escs_as_channel(self) -> None:
-        """Whatever its name is now: what leads to an ESC must not be opened as a CAN interface, which would send to it."""
-        if (esc := self._esc_at(self.config.channel)) is not None:
-            raise RunError(
-                f"can.channel {self.config.channel} is the port of {esc}: nothing may be sent to an ESC."
             )
 
     def _close_port(self) -> None:
@@ -150,7 +159,7 @@ class CanLink:
             if (fd := self.port.fileno()) is not None:
                 with contextlib.suppress(KeyError, ValueError):
                     self._poller.unregister(fd)
-            self.port.close()
+            self._opener.close_port(self.port)
             self.port = None
 
     def _failed(self, reason: str, now: int) -> None:
@@ -163,13 +172,7 @@ class CanLink:
     def _lost(self, answer: Sent, now: int) -> None:
         """The interface is down or gone: to be opened anew."""
         self._close_port()
-        number = errno.ENETDOWN if answer is Sent.DOWN else errno.ENODEV
-        if self.config.interface == "socketcan":
-            self._failed(str(socketcan_error(self.config, number)), now)
-        else:
-            self._failed(
-                f"CAN {self.config.interface} {self.config.channel}: the adapter has failed.", now
-            )
+        self._failed(_reason_of_loss(self.config, answer), now)
         self.controller.ask(now)  # it may be there again already
 
     # --- what comes
@@ -281,3 +284,11 @@ class CanLink:
             self._lost(Sent.GONE, now)
         else:
             self.controller.follow(port, now)
+
+
+def _reason_of_loss(config: CanConfig, answer: Sent) -> str:
+    """What is wrong with an interface that answered DOWN or GONE."""
+    if config.interface != "socketcan":
+        return f"CAN {config.interface} {config.channel}: the adapter has failed."
+    number = errno.ENETDOWN if answer is Sent.DOWN else errno.ENODEV
+    return str(socketcan_error(config, number))

@@ -2,7 +2,7 @@
 
 What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` may be called from elsewhere (a signal handler,
 another thread). Threads of their own (worker.py) have the parameter store (store.py), the statistics (statistics.py), captures
-(recorder.py), the log (fault_log.py), and reception where python-can has no descriptor (open_can.py).
+(recorder.py), the log (fault_log.py), and of python-can's drivers opening (can_opener.py) and reception (open_can.py).
 """
 
 import logging
@@ -67,6 +67,7 @@ class Loop:
         self._due: int | None = None  # not known since something was done
         self._stopping = False
         self._reason = "stopped"
+        self._is_ready = False
         self._poller = poller or Poller(clock)
         self._lost: set[EscPort] = set()
         self.escs = [
@@ -123,6 +124,9 @@ class Loop:
         try:
             while not self._stopping:
                 self.turn()
+        except UserError as error:
+            self._reason = f"ended ({error})"
+            raise
         except BaseException as error:
             self._reason = f"ended by a fault of the program ({error!r})"
             raise
@@ -136,7 +140,13 @@ class Loop:
         self.gateway.start(now, self.can.is_open)
         self.can.follow_ids()  # before the boot-up message: a master may ask as soon as it sees it
         self.can.transmit(now)
-        self._notifier.ready(self._housekeeping.status_words())
+        self._report_ready()
+
+    def _report_ready(self) -> None:
+        """Tell the service manager once that the gateway runs: not before an interface that must open is open."""
+        if not (self._is_ready or self.can.must_open):
+            self._is_ready = True
+            self._notifier.ready(self._housekeeping.status_words())
 
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
@@ -184,6 +194,7 @@ class Loop:
         if has_outputs:
             self._follow_outputs(now)
         can.transmit(now)
+        self._report_ready()
         if changes := gateway.take_link_changes():
             for index in dict.fromkeys(changes):
                 self.escs[index].log.follow_link(now)

@@ -86,7 +86,7 @@ class FakeNativePoller(NativePoller):
             self.changes += 1
 
     def unregister(self, fd: int) -> None:
-        del self._watched[fd]
+        self._watched.pop(fd, None)
         self._world.unregister(fd)
         self.changes += 1
 

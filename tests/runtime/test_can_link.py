@@ -16,7 +16,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime import can_controller, can_link, folders
+from kontronik_can_gw.runtime import can_controller, can_link, can_opener, folders
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
@@ -138,7 +138,7 @@ class Bench:
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     made = Kernel()
-    monkeypatch.setattr(can_link, "open_can", Port)
+    monkeypatch.setattr(can_opener, "open_can", Port)
     monkeypatch.setattr(can_controller, "link_monitor", lambda _name: made)
     monkeypatch.setattr(Port, "there", True)
     return made
@@ -249,7 +249,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
         raise socketcan_error(bench.can.config, 100)
 
     with monkeypatch.context() as patch:
-        patch.setattr(can_link, "open_can", is_down)
+        patch.setattr(can_opener, "open_can", is_down)
         bench.turn(5000)
     assert (bench.can.is_open, bench.gateway.status.can_state) == (False, CanState.DOWN)
     bench.changes(ACTIVE)

@@ -25,7 +25,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway, MakeOutput
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
-from kontronik_can_gw.runtime import can_link
+from kontronik_can_gw.runtime import can_opener
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Received
 from kontronik_can_gw.runtime.loop import Loop
@@ -352,7 +352,7 @@ def loop_in(
         return world.bus
 
     by_path = {wire.path: wire for wire in world.wires}
-    patch.setattr(can_link, "open_can", open_bus)
+    patch.setattr(can_opener, "open_can", open_bus)
     patch.setattr(esc_input, "SerialPort", lambda path, _protocol: by_path[path])
     if in_c := os.environ.get(load.PURE, "1") != "1":
         patch.setattr(load, "library", lambda: (native_world.library(), ""))
