@@ -4,7 +4,8 @@
 
 test      lint (ruff), types (mypy), unit (pytest on this machine), vcan (pytest on a real vcan: this kernel's, or a VM's)
 test-all  what `test` leaves out: faults (the fault programme in User Mode Linux) and, by the marker "extended", tools (the service
-          under a real systemd, a browser, a broker ...) and masters (CANopen masters of others, and more, on a vcan)
+          under a real systemd, a browser, a broker ...) and masters (CANopen masters of others, and more, on a vcan).
+          tools repeats the tests marked "rights": CI runs `test` as an ordinary user and `test-all` as root
 release   by hand, on a quiet machine: qemu (the fault programme on emulated hardware), soak (random faults), hour (recorded),
           put-in (a list of faults that the tests must see), machines (the exported core on other machines),
           fuzz (the core in C under fuzzers, ten minutes each), wheels, deb (the Debian packages in fresh roots of both releases)
@@ -52,7 +53,7 @@ STEPS = {
     "unit": f"{PYTEST} -n logical --maxprocesses=8 -m 'not extended' --ignore=tests/vcan {{args}}",
     "vcan": f"{ON_VCAN} -m 'not extended' {{args}}",
     "faults": FAULTS.format("uml"),
-    "tools": f"{PYTEST} -m extended --ignore=tests/vcan {{args}}",
+    "tools": f"{PYTEST} -m 'extended or rights' --ignore=tests/vcan {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
     "qemu": FAULTS.format("qemu"),
     "soak": FAULTS.format("soak") + " --minutes=60",

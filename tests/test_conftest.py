@@ -78,6 +78,7 @@ def test_the_environment_of_a_service_and_a_time_zone_do_not_reach_tests() -> No
     assert os.environ["TZ"] == "UTC"
 
 
+@pytest.mark.rights
 def test_locks_of_tests_are_in_a_folder_that_every_user_can_write() -> None:
     """Without a session a user has no /run/user/UID."""
     folder = runtime_folder("lock")

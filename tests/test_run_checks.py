@@ -104,3 +104,4 @@ def test_every_step_is_in_one_tier_and_a_test_of_each_marker_is_run_somewhere() 
             if place in step and (found := re.search(" -m '?(not extended|extended)", step))
         ]
         assert sorted(chosen) == ["extended", "not extended"]
+    assert "-m 'extended or rights'" in checks.STEPS["tools"], "CI runs this one as root"

@@ -82,6 +82,7 @@ def forbidden(path: str, mode: int) -> list[str]:
     return ["setpriv", "--clear-groups", "--regid=65533", no_override]
 
 
+@pytest.mark.rights
 @pytest.mark.parametrize(
     ("mode", "remedy"),
     [(0o660, "Join its group: sudo usermod -aG {} $USER"), (0o600, "chmod g+rw")],

@@ -38,6 +38,7 @@ def size_of(folder: Path) -> int:
     return sum(part.stat().st_size for part in folder.iterdir())
 
 
+@pytest.mark.rights
 def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
     tmp_path: Path,
 ) -> None:

@@ -34,6 +34,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
+@pytest.mark.rights
 def test_what_one_has_another_cannot_have_until_it_is_given_back(folder: Path) -> None:
     first, second = Locks(), Locks()
     assert first.hold(NODES[:2]) == []
