@@ -5,6 +5,8 @@ three cycles, one sent with telemetry for a second, one sent on change when noth
 cycles (at least 3 s; never if no message has a cycle).
 """
 
+from collections.abc import Sequence
+
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import SendType
@@ -21,6 +23,8 @@ class View:
     def __init__(self, reader: SignalReader) -> None:
         self.reader = reader
         self.values: list[Value] = [None] * len(reader.columns)
+        self.of_parts: list[Sequence[Value]] = [[None] * part.count for part in reader.parts]
+        """The same values for each of ``reader.parts``. A list is replaced, never changed."""
         self.frames = 0
         """Number of frames of the layout received."""
         self.last_ns: int | None = None
@@ -46,8 +50,10 @@ class View:
         for first, new in chunks:
             values[first : first + len(new)] = new
             part = self._part_of[first]
+            self.of_parts[part] = new
             seen[part] = now
-            due = self._due(part)
+            life = self._life[part]
+            due = self._due(part) if life is None else now + life
             if due is not None and (self.next_expiry is None or due < self.next_expiry):
                 self.next_expiry = due
         return chunks
@@ -61,7 +67,8 @@ class View:
         for index, (part, due) in enumerate(zip(self.reader.parts, dues, strict=True)):
             if due is not None and now > due:
                 self._seen[index] = None
-                self.values[part.first : part.first + part.count] = [None] * part.count
+                self.of_parts[index] = [None] * part.count
+                self.values[part.first : part.first + part.count] = self.of_parts[index]
                 forgotten = True
         self.next_expiry = min(
             (due for due in dues if due is not None and due >= now), default=None

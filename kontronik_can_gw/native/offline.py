@@ -117,10 +117,12 @@ class Rows:
     def numbers(self, column: int, begin: int, end: int) -> list[float | None]:
         """Of the rows ``begin`` to ``end``; None where not available."""
         found: list[float | None] = self.values(column)[begin:end].tolist()
-        valid = self.valid[column]
-        if valid.count(0xFF) * 8 < self.count:
-            for row in range(begin, end):
-                if not valid[row >> 3] >> (row & 7) & 1:
+        first = begin >> 3
+        for at, bits in enumerate(self.valid[column][first : (end + 7) >> 3], first):
+            if bits == 0xFF:
+                continue
+            for row in range(max(8 * at, begin), min(8 * at + 8, end)):
+                if not bits >> (row & 7) & 1:
                     found[row - begin] = None
         return found
 

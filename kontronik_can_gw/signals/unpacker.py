@@ -8,7 +8,7 @@ Error code). A flag, which has no code for that, is not available where the othe
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 from kontronik_can_gw.esc.values import Group
@@ -120,6 +120,8 @@ class SignalReader:
         return chunks
 
 
+_KEPT_VALUES = 2048
+"""Values of a longer signal that are kept, because computing one takes several times as long as finding it."""
 _TABLE_BITS = 8
 """Up to this length a signal's values are looked up in a table of all its raw values."""
 
@@ -145,6 +147,8 @@ def _row(signal: SignalPlan) -> tuple[int, int, Callable[[int], Value]]:
     value_of = _value_of(signal)
     if signal.length <= _TABLE_BITS:
         value_of = tuple(value_of(raw) for raw in range(1 << signal.length)).__getitem__
+    else:
+        value_of = lru_cache(_KEPT_VALUES)(value_of)
     pieces = [(piece.at, (1 << piece.width) - 1, piece.shift) for piece in signal.pieces]
     if len(pieces) == 1:
         ((at, mask, _),) = pieces

@@ -424,7 +424,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
 ) -> None:
     """Not at the start, and not later when an adapter has come back under another name."""
     opened: list[object] = []
-    monkeypatch.setattr(can_link, "open_can", opened.append)
+    monkeypatch.setattr(can_opener, "open_can", opened.append)
     bench.can._esc_at = lambda path: "left" if path == bench.can.config.channel else None
     if wait:
         bench.start()

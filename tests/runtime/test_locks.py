@@ -136,7 +136,7 @@ def waiting_gateway(monkeypatch: pytest.MonkeyPatch) -> CanLink:
     }
     loaded = assemble(parse(tables, "test"))
     gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
-    monkeypatch.setattr(can_link, "open_can", lambda _config: Bus(World()))
+    monkeypatch.setattr(can_opener, "open_can", lambda _config: Bus(World()))
     monkeypatch.setattr(can_controller, "link_monitor", lambda _name: None)
     link = CanLink(loaded.config.can, gateway, World().poller, FaultLog())
     link.open(0, wait=False)

@@ -55,6 +55,8 @@ class Field:
     """The greatest value, at which a counter begins again."""
     value: EscValue | None = None
     """As its ESC supplies it, of a value that came of its bytes."""
+    period_ns: int | None = None
+    """Of a value that came in a CAN frame: the longest time between two of them, 0 for one with each telemetry frame."""
 
     @property
     def header(self) -> str:

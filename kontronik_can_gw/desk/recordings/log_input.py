@@ -14,12 +14,14 @@ from kontronik_can_gw.desk.recordings.log_clock import LogClock
 from kontronik_can_gw.desk.recordings.recording import (
     ERROR,
     LATEST_NS,
+    ROWS,
+    Block,
     ClockStep,
     Input,
     LogFrame,
     Sample,
 )
-from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
+from kontronik_can_gw.desk.recordings.samples import ColumnMaker, fields_of_log, rows_of_frames
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -72,7 +74,7 @@ def _reader_of(format_: str) -> type[text.LogReader]:
 
 
 class CanLogInput(Input):
-    """A log of CAN frames. UserError for a table in MF4, RunError where it cannot be read."""
+    """A log of CAN frames. UserError for a table in MF4, RunError if it cannot be read."""
 
     def __init__(
         self, path: Path, layout: BusLayout, format_: str, stream: Stream | None = None
@@ -187,8 +189,16 @@ class CanLogInput(Input):
     def fields(self) -> Sequence[Field]:
         return fields_of_log(self.reader, self.bus.escs)
 
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
+        maker = ColumnMaker(self.reader, range(len(self.fields)) if chosen is None else chosen)
+        rows = rows_of_frames(self.frames(), self.reader)
+        while some := list(islice(rows, ROWS if self.stream is None else 1)):
+            times, parts = zip(*some, strict=True)
+            # the clock of a log is the same from its first frame to its last
+            yield Block(times, maker.columns(parts), self.wall_ns(0))
+
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
-        return samples_of_frames(self.frames(), self.reader, chosen)
+        return self.samples(chosen)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")

@@ -207,6 +207,7 @@ class Input(ABC):
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
         """Rows of the values of ``chosen`` fields, in that order; None: of all."""
         samples = self.samples_in_python(range(len(self.fields)) if chosen is None else chosen)
+        # with each row, because a clock that was set later must not move the rows before it
         found = ((self._wall_of(row), *row) for row in samples)
         while some := list(islice(found, ROWS if self.stream is None else 1)):
             for wall_ns, rows in groupby(some, itemgetter(0)):

@@ -6,17 +6,19 @@ message, within 5 ms goes into the same row.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Sample
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
-from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.esc.values import Kind as How
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.plan import MessagePlan, SendType
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
 SAME_ROW_NS = 5 * MS
@@ -105,7 +107,8 @@ class RowMaker(Output):
 def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[Field]:
     """A field for each signal of a layout, with the name and in the unit of the value that it is bound to."""
     found = []
-    for column in reader.columns:
+    periods = [_period_ns(part.plan) for part in reader.parts for _ in range(part.count)]
+    for column, period_ns in zip(reader.columns, periods, strict=True):
         prefix = "" if column.esc is None or len(escs) == 1 else f"{escs[column.esc].name}."
         unit, slope, shift = _to_value(column)
         kind, high = Kind.FLOAT, column.high
@@ -118,8 +121,14 @@ def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[Fie
         elif column.is_whole:
             kind = Kind.WHOLE
         what = prefix + column.source, unit, kind, column.message, column.texts, column.source
-        found.append(Field(*what, column.esc, column.name, high))
+        found.append(Field(*what, column.esc, column.name, high, period_ns=period_ns))
     return distinct(found)
+
+
+def _period_ns(plan: MessagePlan) -> int | None:
+    if SendType.EVENT in plan.send_type and Group.LIVE in plan.paces:
+        return 0
+    return plan.cycle_ns * max(1, len(plan.pages)) or None
 
 
 def _to_value(column: Column) -> tuple[str, float, float]:
@@ -129,29 +138,81 @@ def _to_value(column: Column) -> tuple[str, float, float]:
     return (column.unit, 1, 0) if factors is None else (unit, float(factors[0]), float(factors[1]))
 
 
+PartsOfRow = tuple[Sequence[Value], ...]
+"""The values of a row in lists, one for each part of the SignalReader."""
+
+
+class ColumnMaker:
+    """Makes columns of the ``chosen`` signals from rows. Most lists of a row are those of the row before, which saves most of the work."""
+
+    def __init__(self, reader: SignalReader, chosen: Sequence[int]) -> None:
+        self._width = len(chosen)
+        self._wanted: dict[int, list[tuple[int, int]]] = {}
+        """By part: places among the columns, and in the part's list."""
+        for place, at in enumerate(chosen):
+            index, part = next(
+                (index, part)
+                for index, part in enumerate(reader.parts)
+                if part.first <= at < part.first + part.count
+            )
+            self._wanted.setdefault(index, []).append((place, at - part.first))
+        scales = [(place, *_to_value(reader.columns[at])[1:]) for place, at in enumerate(chosen)]
+        self._scales = [one for one in scales if one[1:] != (1, 0)]
+
+    def columns(self, rows: Sequence[PartsOfRow]) -> list[Sequence[Value]]:
+        """The columns of some rows, in the units of the values."""
+        found: list[Sequence[Value]] = [()] * self._width
+        for index, wanted in self._wanted.items():
+            lists = [row[index] for row in rows]
+            if 2 * len(set(map(id, lists))) > len(lists):
+                every = [*zip(*lists, strict=True)]
+                for place, at in wanted:
+                    found[place] = every[at]
+                continue
+            runs = [(next(run), 1 + sum(1 for _ in run)) for _, run in groupby(lists, id)]
+            for place, at in wanted:
+                column: list[Value] = []
+                for values, count in runs:
+                    column += [values[at]] * count
+                found[place] = column
+        for place, slope, shift in self._scales:
+            found[place] = [_converted(value, slope, shift) for value in found[place]]
+        return found
+
+
+def _converted(value: Value, slope: float, shift: float) -> Value:
+    is_number = isinstance(value, (int, float))
+    return round((value - shift) / slope, _DIGITS) if is_number else value  # type: ignore[operator]
+
+
 def samples_of_frames(
     frames: Iterable[TimedFrame], reader: SignalReader, chosen: Sequence[int]
 ) -> Iterator[Sample]:
-    """Rows of CAN frames, as a listener has them: values hold while they are fresh."""
-    view = View(reader)
-    scales = [(place, *_to_value(reader.columns[at])[1:]) for place, at in enumerate(chosen)]
-    others = [(place, slope, shift) for place, slope, shift in scales if (slope, shift) != (1, 0)]
+    """Rows of CAN frames, one by one."""
+    maker = ColumnMaker(reader, chosen)
+    for time_ns, parts in rows_of_frames(frames, reader):
+        yield Sample(time_ns, tuple(column[0] for column in maker.columns([parts])))
 
-    def row(time_ns: int) -> Sample:
-        values = [view.values[index] for index in chosen]
-        for place, slope, shift in others:
-            value = values[place]
-            if isinstance(value, (int, float)):
-                values[place] = round((value - shift) / slope, _DIGITS)
-        return Sample(time_ns, tuple(values))
+
+def rows_of_frames(
+    frames: Iterable[TimedFrame], reader: SignalReader
+) -> Iterator[tuple[int, PartsOfRow]]:
+    """Time and values of each row, as a listener on the bus has them: values hold while they are fresh."""
+    view = View(reader)
+
+    def row(time_ns: int) -> tuple[int, PartsOfRow]:
+        return time_ns, tuple(view.of_parts)
 
     row_ns: int | None = None
     in_row: set[int] = set()
     last = -LATEST_NS
+    keys = reader.keys
     for frame_ns, frame, _ in frames:
-        last = time_ns = max(frame_ns, last)  # a log of several interfaces may not be in order
+        if frame_ns > last:  # a log of several interfaces may not be in order
+            last = frame_ns
+        time_ns = last
         key = frame.key
-        if key not in reader.keys:
+        if key not in keys:
             continue
         if row_ns is not None and (key in in_row or time_ns - row_ns > SAME_ROW_NS):
             yield row(row_ns)

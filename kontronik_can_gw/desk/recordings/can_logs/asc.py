@@ -11,6 +11,7 @@ from kontronik_can_gw.desk.recordings.can_logs.text import (
     OLDEST_WALL_S,
     SECOND_NS,
     TextReader,
+    checked,
     error_frame,
     nanoseconds,
     remote_frame,
@@ -76,7 +77,9 @@ class AscReader(TextReader):
         is_fd = words[1:2] == [b"canfd"]
         if b"errorframe" in words[2:5]:
             channel = words[2] if is_fd else words[1]
-            return LogFrame(time_ns, error_frame(), b"tx" not in words[2:5], str(int(channel)))
+            return checked(
+                LogFrame(time_ns, error_frame(), b"tx" not in words[2:5], str(int(channel)))
+            )
         if is_fd:
             return self._fd_frame(time_ns, line, words[2:])
         if len(words) > 4 and words[3] in _DIRECTIONS:
@@ -97,7 +100,7 @@ class AscReader(TextReader):
             frame = CanFrame(number, self._bytes(data[1:], length), extended)
         else:
             raise ValueError
-        return LogFrame(time_ns, frame, direction == b"rx", str(int(channel)))
+        return checked(LogFrame(time_ns, frame, direction == b"rx", str(int(channel))))
 
     def _fd_frame(self, time_ns: int, line: bytes, words: list[bytes]) -> LogFrame | None:
         if not words[0].isdigit() or words[1] == _REQUEST:
@@ -113,7 +116,7 @@ class AscReader(TextReader):
             frame = remote_frame(number, code, extended)
         else:
             frame = CanFrame(number, self._bytes(data, length), extended, True)
-        return LogFrame(time_ns, frame, direction == b"rx", str(int(channel)))
+        return checked(LogFrame(time_ns, frame, direction == b"rx", str(int(channel))))
 
     def _bytes(self, words: list[bytes], length: int) -> bytes:
         if len(words) < length:

@@ -6,6 +6,7 @@ left out. ASC: asc.py.
 
 import io
 import re
+from binascii import unhexlify
 from collections.abc import Iterator, Sequence
 from io import BufferedReader
 from typing import Any, BinaryIO
@@ -111,7 +112,7 @@ class TextReader(LogReader):
             try:
                 item = self._frame(line) if line.strip() else None
                 if item is not None:
-                    yield checked(item)
+                    yield item
             except (ValueError, LookupError):  # of numbers, texts, lengths
                 if number != last:  # a long line comes several times
                     last, count = number, count + 1
@@ -127,7 +128,7 @@ class TextReader(LogReader):
         raise NotImplementedError
 
     def _frame(self, line: bytes) -> LogFrame | None:
-        """The frame of a line; None for a line without one. ValueError, LookupError where it is damaged."""
+        """The frame of a line, checked; None for a line without one. ValueError or LookupError if the line is damaged."""
         raise NotImplementedError
 
 
@@ -163,6 +164,11 @@ candump_screen_line = re.compile(
     re.MULTILINE,
 ).match
 """Matches a line of candump without ``-L``: ``(000.000000)  can0  681   [8]  00 11 22 33``."""
+_common_line = re.compile(
+    rb"\((\d{1,9}|[0-3]\d{9})\.(\d{6})\) ([\x21-\x7e]{1,64}) ([0-7][0-9A-F]{2}|[01][0-9A-F]{7})"
+    rb"#((?:[0-9A-F]{2}){0,8})(?: ([RT]))?\n"
+).fullmatch
+"""Matches most lines that candump writes. Its groups need no further check."""
 
 
 class CandumpReader(TextReader):
@@ -174,6 +180,11 @@ class CandumpReader(TextReader):
             self.wall_start_ns = 0
 
     def _frame(self, line: bytes) -> LogFrame | None:
+        if (common := _common_line(line)) is not None:
+            seconds, micros, channel, can_id, digits, direction = common.groups()
+            frame = CanFrame(int(can_id, 16), unhexlify(digits), len(can_id) == 8)
+            time_ns = int(seconds + micros) * 1000
+            return LogFrame(time_ns, frame, direction == b"R", channel.decode("ascii"))
         match = candump_line(line)
         if match is None:
             raise ValueError
@@ -188,8 +199,9 @@ class CandumpReader(TextReader):
             is_fd = found["fd"] is not None
             frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, is_fd)
         received = (found["dir"] or b"")[:1] in (b"R", b"r")
-        channel = found["channel"].decode("ascii")
-        return LogFrame(nanoseconds(found["time"]), frame, received, channel)
+        return checked(
+            LogFrame(nanoseconds(found["time"]), frame, received, found["channel"].decode("ascii"))
+        )
 
 
 # --- PEAK TRC
@@ -241,7 +253,7 @@ class TrcReader(TextReader):
         if self._is_error(columns):
             time_ns = round(float(columns[self._columns["O"]]) * 1_000) * 1_000
             channel = columns[self._columns["B"]] if "B" in self._columns else "1"
-            return LogFrame(time_ns, error_frame(), True, channel)
+            return checked(LogFrame(time_ns, error_frame(), True, channel))
         message = self._parser._parse_cols(columns)
         if message is None:
             return None
