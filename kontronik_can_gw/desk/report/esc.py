@@ -271,7 +271,8 @@ class EscFlight:
         for quantities, best in ((MAXIMA, max), (MINIMA, min)):
             for source in quantities.keys() & columns.keys():
                 values = columns[source]
-                value = best((v for v in values if v is not None), default=None)
+                known = [v for v in values if v is not None] if None in values else values
+                value = best(known, default=None)
                 before = self.extremes.get(source)
                 if value is not None and (
                     before is None or best(value, before.value) != before.value

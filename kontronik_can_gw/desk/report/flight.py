@@ -155,15 +155,24 @@ class Decimator:
     def _append(self, times: Sequence[int], columns: Sequence[Sequence[Number]], size: int) -> None:
         """Add rows, of each ``size`` of them two points."""
         for begin, end in _runs(columns, len(times)):
-            buckets = [(at, min(at + size, end)) for at in range(begin, end, size)]
-            for first, past in buckets:
-                self.times += (times[first], times[past - 1])[: past - first]
+            whole = end - (end - begin) % size
+            if size == 1:
+                self.times += times[begin:end]
+            else:
+                for first in range(begin, end, size):
+                    past = min(first + size, end)
+                    self.times += (times[first], times[past - 1])[: past - first]
             for points, values in zip(self.columns, columns, strict=True):
                 if size == 1:
                     points += values[begin:end]
-                else:
-                    for first, past in buckets:
-                        points += _ends_of(values[first:past])[: past - first]
+                    continue
+                if values[begin] is None:  # all of the run are
+                    points += [None] * (len(self.times) - len(points))
+                    continue
+                for bucket in zip(*[iter(values[begin:whole])] * size, strict=True):
+                    points += _ends_of(bucket)
+                if whole < end:
+                    points += _ends_of(values[whole:end])[: end - whole]
 
 
 def _runs(columns: Sequence[Sequence[Number]], count: int) -> Iterator[tuple[int, int]]:
@@ -177,8 +186,7 @@ def _runs(columns: Sequence[Sequence[Number]], count: int) -> Iterator[tuple[int
 
 
 def _ends_of(values: Sequence[Number]) -> tuple[Number, Number]:
-    """Minimum and maximum in the order in which they came; of values only, or of None only."""
-    if values[0] is None:
-        return None, None
-    low, high = min(values), max(values)  # type: ignore[type-var]  # no None here
+    """Minimum and maximum in the order in which they came; none of the values is None."""
+    low = min(values)  # type: ignore[type-var]
+    high = max(values)  # type: ignore[type-var]
     return (low, high) if values.index(low) <= values.index(high) else (high, low)
