@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from report_flights import Row, column, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
-from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.report.esc import EscFlight, Event, Events
 from kontronik_can_gw.desk.report.flight import Flight
+from kontronik_can_gw.desk.report.page import render
 from kontronik_can_gw.desk.report.quantities import MINIMA
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
 from kontronik_can_gw.esc.kontronik.states import (
@@ -23,6 +25,7 @@ from kontronik_can_gw.esc.kontronik.states import (
     SelfTestError,
 )
 from kontronik_can_gw.esc.telemetry import SECOND as S
+from kontronik_can_gw.signals.unpacker import Value
 
 GAP_NS = 500_000_000
 FAULTS = Faults(
@@ -64,6 +67,19 @@ def table(bus: BusLayout, rows: list[Row], esc: int, *sources: str) -> pd.DataFr
     return frame.assign(time_ns=times, held=np.where(held > GAP_NS, 0, held))
 
 
+MEASURED = ("battery_voltage", "battery_current", "cell_count")
+
+
+def with_computed(data: pd.DataFrame, source: str) -> pd.DataFrame:
+    """A table with the values that a report of a CAN log computes: those that are sent less often than their parts."""
+    if source == "battery_power":
+        data = data.assign(battery_power=(data.battery_voltage * data.battery_current).round(3))
+    if source == "mean_cell_voltage":
+        computed = (data.battery_voltage / data.cell_count).round(3)
+        data = data.assign(mean_cell_voltage=computed.fillna(data.mean_cell_voltage))
+    return data[[*dict.fromkeys((source, "time_ns"))]]
+
+
 @pytest.mark.parametrize("esc", [0, 1])
 def test_the_numbers_are_those_of_pandas(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
@@ -76,7 +92,7 @@ def test_the_numbers_are_those_of_pandas(
     live = data[data.battery_voltage.notna()]
     assert found.telemetry_ns == live.held.sum()
     assert found.turning_ns == live[live.electrical_speed.fillna(0) > 0].held.sum()
-    power = live.battery_power.fillna(0).to_numpy(float)
+    power = (live.battery_voltage * live.battery_current).fillna(0).to_numpy(float)
     assert found.energy_wh == pytest.approx((power.clip(min=0) * live.held).sum() / 3.6e12)
     counter = data.energy_used.dropna().to_numpy(float)  # of the gateway, of finer values
     assert found.energy_wh == pytest.approx(counter[-1] - counter[0], abs=0.4)
@@ -92,7 +108,7 @@ def test_the_numbers_are_those_of_pandas(
     assert found.cells == 6
     assert {"battery_power", "motor_current", "battery_voltage"} <= found.extremes.keys()
     for source, extreme in found.extremes.items():
-        data = table(bus, rows, esc, source).dropna()
+        data = with_computed(table(bus, rows, esc, source, *MEASURED), source).dropna()
         values = data[source].to_numpy(float)
         at = (np.argmin if source in MINIMA else np.argmax)(values)
         assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), source
@@ -138,6 +154,45 @@ def test_losses_are_gaps_in_lines_and_events(
         inside = [v for t, v in points if event.begin_ns < t < (event.end_ns or 0)]
         assert None in inside
         assert all(v is None for v in inside[5:-5])
+
+
+def test_peak_power_of_a_log_is_that_of_its_voltage_and_current(tmp_path: Path) -> None:
+    """The shipped DBC sends power every 100 ms, voltage and current with each telemetry frame."""
+    bus = layout_of(["esc1"])
+    times = range(0, S, S // 100)
+    currents = [10.0] * 100
+    currents[55] = 230.0
+    columns: dict[str, list[Value]] = {
+        "battery_voltage": [23.0] * 100,
+        "battery_current": [*currents],
+        "battery_power": [230.0] * 100,
+    }
+    flight = flight_of(bus, rows_of(bus, times, **columns))
+    assert flight.escs[0].extremes["battery_power"] == (5290, 55 * S // 100)
+    assert flight.escs[0].energy_wh == pytest.approx((98 * 230 + 5290) / 360_000)
+    assert max(v or 0 for v in flight.lines[0, "battery_power"]) == 5290
+    assert "Battery power is computed from voltage and current" in render(flight, source="y")
+    text = bus_file_with_power_in_each_frame(tmp_path)
+    fast = layout_of_dbc(text)
+    flight = flight_of(fast, rows_of(fast, times, **columns))
+    assert flight.escs[0].extremes["battery_power"].value == 230
+    assert "is computed from voltage and current" not in render(flight, source="y")
+
+
+def bus_file_with_power_in_each_frame(tmp_path: Path) -> Path:
+    """A DBC that sends voltage, current and power together."""
+    signals = "".join(
+        f' SG_ {name} : {at}|16@1- ({factor},0) [0|0] "{unit}" Gw\n'
+        for at, (name, factor, unit) in zip(
+            (0, 16, 32),
+            (("BatteryVoltage", 0.01, "V"), ("BatteryCurrent", 0.1, "A"), ("BatteryPower", 1, "W")),
+            strict=True,
+        )
+    )
+    (file := tmp_path / "fast.dbc").write_text(
+        f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw\nBO_ 257 Main: 8 Gw\n{signals}'
+    )
+    return file
 
 
 def test_many_events_and_states_stay_bounded() -> None:

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.desk.report.quantities import (
+    COMPUTED_FROM,
     COUNTERS,
     DRAWN,
     MAXIMA,
@@ -121,6 +122,8 @@ class EscFlight:
         """Every device seen, in words; usually one."""
         self._index, self._events, self._protocol = index, events, protocol_named(settings.protocol)
         self._at = at = {f.source: i for i, f in reversed([*enumerate(fields)]) if f.esc == index}
+        self.computed = _values_to_compute([fields[place] for place in at.values()])
+        """Values that the recording has, but less often than the values from which they follow."""
         self._floats = {f.source for f in fields if f.signal and f.kind is Kind.FLOAT}
         """Values of CAN frames, which may be infinite: that is no value."""
         self._live = next((source for source in LIVE if source in at), None)
@@ -191,19 +194,25 @@ class EscFlight:
                 yield row, value
 
     def _derive(self, columns: Columns) -> None:
-        """Add what follows from other values, where the recording does not have it."""
+        """Add values that follow from others, if the recording lacks them or has them less often."""
         counts = [count for count in columns.get("cell_count", ()) if count]
         cells = self.cells = round(counts[-1]) if counts else self.cells
         voltage, current = columns.get("battery_voltage"), columns.get("battery_current")
-        if voltage is not None and "mean_cell_voltage" not in columns:
+        if voltage is None:
+            return
+        if cells and self._is_computed("mean_cell_voltage", columns):
             columns["mean_cell_voltage"] = [
-                None if v is None or not cells else round(v / cells, 3) for v in voltage
+                None if v is None else round(v / cells, 3) for v in voltage
             ]
-        if voltage is not None and current is not None and "battery_power" not in columns:
+        columns.setdefault("mean_cell_voltage", (None,) * len(voltage))
+        if current is not None and self._is_computed("battery_power", columns):
             columns["battery_power"] = [
                 None if v is None or i is None else round(v * i, 3)
                 for v, i in zip(voltage, current, strict=True)
             ]
+
+    def _is_computed(self, source: str, columns: Columns) -> bool:
+        return source in self.computed or source not in columns
 
     # --- events
 
@@ -302,6 +311,18 @@ class EscFlight:
             elif self.load_voltage is None and abs(current) <= REST_CURRENT and voltage > 0:
                 self.rest_voltage = voltage
         self._held = since, was_there, held_power, turned
+
+
+def _values_to_compute(fields: Sequence[Field]) -> set[str]:
+    """Values in CAN frames that are sent less often than all values from which they follow."""
+    periods = {field.source: field.period_ns for field in fields}
+    found = set()
+    for source, parts in COMPUTED_FROM.items():
+        own = periods.get(source)
+        of_parts = [periods.get(part) for part in parts]
+        if own is not None and all(period is not None and period < own for period in of_parts):
+            found.add(source)
+    return found
 
 
 def _state_of(columns: Columns) -> str:

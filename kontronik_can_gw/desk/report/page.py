@@ -176,3 +176,7 @@ def _notes(flight: Flight) -> str:
     if flight.seen.left_out:
         lines.append(f"{flight.seen.left_out} more events are not listed.")
     return "".join(f'<p class="note">{line}</p>' for line in lines)
+    if any("battery_power" in esc.computed for esc in flight.escs):
+        lines.append(
+            "Battery power is computed from voltage and current, because this CAN log has them more often than the power."
+        )

@@ -57,6 +57,11 @@ SPEEDS = ("electrical_speed", "motor_speed", "output_speed")
 
 PHASES = (
     "Motor off, standby",
+COMPUTED_FROM = {
+    "battery_power": ("battery_voltage", "battery_current"),
+    "mean_cell_voltage": ("battery_voltage",),
+}
+"""Values that follow from others. ``mean_cell_voltage`` also needs the number of cells."""
     "Waiting",
     "Self-test, signal",
     "Spooling up, synchronising",
