@@ -1,6 +1,7 @@
 """The page in a real browser (headless Chromium): nothing fails, everything is drawn, and it reacts to input."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -92,8 +93,8 @@ def test_every_plot_is_drawn_and_the_page_fits(
     width, height = (390, 844) if look == "phone" else (1280, 900)
     browser.open(pages[name], width, height, dark=look == "dark", phone=look == "phone")
     keys = browser.run("flight.plots.map((p) => p.key)")
-    speeds = ["speed", "speed-1", "speed-2"]
-    assert keys[:5] == ["states", *speeds, "battery_voltage"]
+    assert keys[:2] == ["states", "battery_voltage"]
+    assert [key for key in keys if key.startswith("speed")] == ["speed"]
     assert keys == ["states", *browser.run("flight.data.plots.map((p) => p.key)")]
     for key in keys[1:]:
         drawn = [count(browser, key, f"--c{style}") for style in range(1 if name == "one" else 2)]
@@ -102,6 +103,62 @@ def test_every_plot_is_drawn_and_the_page_fits(
     assert min(bands) > 100, bands
     assert browser.run("document.documentElement.scrollWidth") == width
     assert browser.run("window.hit") is None
+
+
+# Each time label of a plot with its left and right edge, in pixels of the plot's canvas.
+LABELS = """((key) => {
+  const { u } = flight.plots.find((p) => p.key === key), axis = u.axes[0];
+  u.ctx.font = axis.font[0];
+  return axis._values.map((text, i) => {
+    const at = u.valToPos(axis._splits[i], "x", true), half = u.ctx.measureText(text ?? "").width / 2;
+    return [text, at - half, at + half, u.ctx.canvas.width];
+  }).filter(([text]) => text);
+})"""
+
+
+@pytest.mark.parametrize("phone", [False, True])
+@pytest.mark.parametrize("span", [(0, 60), (0, 0.2), (12, 12.06), (10, 50)])
+def test_time_labels_are_whole_and_apart(
+    browser: Browser, pages: dict[str, Path], phone: bool, span: tuple[float, float]
+) -> None:
+    browser.open(pages["one"], 390 if phone else 1280, 844, phone=phone)
+    browser.run(f"flight.setRange{span}")
+    browser.settle()
+    for key in ("states", "battery_voltage"):
+        labels = browser.run(f"{LABELS}('{key}')")
+        assert len(labels) >= 3
+        assert labels[-1][2] <= labels[-1][3], "the last one is cut off"
+        for (_, _, right, _), (_, left, _, _) in pairwise(labels):
+            assert left - right > 5, labels
+
+
+def test_one_line_of_the_speeds_is_drawn_and_the_cursor_shows_all(
+    browser: Browser, pages: dict[str, Path]
+) -> None:
+    browser.open(pages["one"])
+    assert count(browser, "speed", "--c0") > 100
+    assert count(browser, "speed", "--c1") == count(browser, "speed", "--c2") == 0
+    browser.mouse("Moved", *centre(browser, "speed", 0.3))
+    browser.settle()
+    cells = "[...document.querySelectorAll('#plot-speed .u-series:not(:first-child) .u-value')]"
+    shown = browser.run(f"{cells}.map((c) => +c.textContent.replaceAll('\u202f', ''))")
+    assert len(shown) == 3
+    assert 0 < shown[0] < shown[1] < shown[2]
+
+
+def test_on_a_phone_the_first_numbers_are_above_the_details(
+    browser: Browser, pages: dict[str, Path]
+) -> None:
+    browser.open(pages["two"], 390, 844, phone=True)
+    top = "document.querySelector('{}').getBoundingClientRect().top"
+    tiles, details = (browser.run(top.format(name)) for name in (".tiles", "dl"))
+    assert tiles < details
+    boxes = browser.run(
+        "[...document.querySelectorAll('.tiles > div')].map((d) => d.getBoundingClientRect().right)"
+    )
+    assert max(boxes) <= 390
+    assert browser.run("getComputedStyle(document.querySelector('.touch')).display") != "none"
+    assert browser.run("getComputedStyle(document.querySelector('.mouse')).display") == "none"
 
 
 def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Path]) -> None:

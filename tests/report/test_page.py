@@ -6,14 +6,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from report_flights import data_of, flight_of, simulated
+from report_flights import data_of, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
+from kontronik_can_gw.desk.recordings.recording import Block
+from kontronik_can_gw.desk.recordings.samples import fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
 from kontronik_can_gw.desk.report.summary import clock, duration, number, wall_clock
 from kontronik_can_gw.esc.telemetry import SECOND as S
+from kontronik_can_gw.signals.unpacker import SignalReader
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"
 
@@ -95,13 +98,64 @@ def test_the_data_in_the_page_are_those_of_the_lines(flight: Flight) -> None:
     ]
     assert len(written) == len(flight.lines)
     assert ("Current", "Motor", flight.lines[0, "motor_current"]) in written
-    assert ("Output speed", "Output", flight.lines[0, "output_speed"]) in written
+    assert ("Speed", "Output", flight.lines[0, "output_speed"]) in written
 
 
 def test_lines_of_different_sizes_have_a_plot_each() -> None:
     speeds = {"output_speed": 850.0, "motor_speed": 8327.0, "electrical_speed": 58344.0}
     assert of_like_size(speeds) == [[source] for source in speeds]
     assert of_like_size({"a": 96.0, "b": 101.0, "c": 0.0, "d": 30.0}) == [["a", "b", "c", "d"]]
+
+
+def test_speeds_share_a_plot_behind_the_battery_of_which_one_line_is_drawn(flight: Flight) -> None:
+    plots = data_of(render(flight, source="y"))["plots"]
+    keys = [plot["key"] for plot in plots]
+    assert keys[:5] == ["battery_voltage", "cell_voltage", "current", "power", "speed"]
+    (speed,) = (plot for plot in plots if plot["key"].startswith("speed"))
+    assert speed["lines"] == ["Output", "Motor", "Electrical"]
+    assert [line["drawn"] for line in speed["series"]] == [True, False, False]
+    assert speed["note"] == "output drawn, the others differ only by pole pairs and gear"
+    others = [line for plot in plots for line in plot["series"] if plot is not speed]
+    assert all(line["drawn"] for line in others)
+
+
+def test_numbers_come_before_details_and_help_before_plots(flight: Flight) -> None:
+    html = render(flight, source="y", damage=["3 damaged lines"])
+    places = [
+        html.index(text)
+        for text in ("<h1>", "3 damaged lines", 'class="tiles"', "<dl>", 'id="help"', 'id="plots"')
+    ]
+    assert places == sorted(places)
+
+
+def test_a_gap_of_years_is_cut_out_and_noted() -> None:
+    """As on a board without a clock whose time is set while it records."""
+    bus = layout_of(["esc1"])
+    jump = 53 * 365 * 86_400 * S
+    times = [at * S // 10 + (jump if at >= 100 else 0) for at in range(200)]
+    rows = rows_of(bus, times, battery_voltage=[24.0] * 199 + [20.0])
+    flight = flight_of(bus, rows)
+    assert (flight.end_ns - flight.start_ns) / S == pytest.approx(22, abs=1)
+    assert [cut.begin_ns for cut in flight.cuts] == [99 * S // 10]
+    assert flight.cuts[0].length_ns == pytest.approx(jump, abs=3 * S)
+    assert [event.text for event in flight.events].count("No telemetry") == 1
+    assert flight.escs[0].telemetry_ns < 21 * S
+    html = render(flight, source="y", wall_ns=5 * S)
+    assert "Gaps of more than a day are cut out" in html
+    assert "<li>after 0:09.9: 19\u202f345 days 0 h</li>" in html
+    assert "<dd>1970-01-01 00:00:05 UTC</dd>" in html
+    (cut,) = data_of(html)["cuts"]
+    assert cut == [9.9, flight.cuts[0].length_ns / S]
+
+
+def test_a_part_behind_a_gap_of_years_begins_at_its_own_time_of_day() -> None:
+    bus = layout_of(["esc1"])
+    times = [at * S // 10 + (400 * 86_400 * S if at >= 100 else 0) for at in range(200)]
+    made = Flight(bus.escs, fields_of_log(SignalReader(bus.layout), bus.escs), window=(15.0, None))
+    for time_ns, values in rows_of(bus, times, battery_voltage=[24.0] * 200):
+        made.take(Block([time_ns], [[value] for value in values], None))
+    html = render(made.finish(), source="y", wall_ns=0)
+    assert "<dd>1971-02-05 00:00:12 UTC</dd>" in html
 
 
 def test_what_the_dbc_does_not_have_is_left_out(tmp_path: Path) -> None:
@@ -123,6 +177,7 @@ def test_times_and_numbers_in_words() -> None:
     assert [duration(ns) for ns in (12_540_000_000, 245 * S, 3_725 * S)] == [
         *("12.5 s", "4 min 05 s", "1 h 02 min 05 s"),
     ]
+    assert duration(472_221 * 3600 * S) == "19\u202f675 days 21 h"
     assert number(-12345.678, 1) == "−12\u202f345.7"
     assert wall_clock(1_763_751_137 * S) == "2025-11-21 18:52:17 UTC"
     assert wall_clock(1 << 90) == f"{(1 << 90) // S} s of Unix time"

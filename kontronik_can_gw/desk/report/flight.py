@@ -6,6 +6,7 @@ time-out have a gap between them. Times are ns of the recording's clock.
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
@@ -16,6 +17,10 @@ from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayState
 
+LONGEST_GAP_NS = 86_400 * SECOND
+"""Longer gaps are cut out: the clock was set forward, or the recording holds runs of different days."""
+_GAP_LEFT_NS = 2 * SECOND
+"""What is left of them, beside the length from which a gap is one."""
 SAME_SPEED = 0.005
 """Share that the maxima of equal speeds may differ by: in a CAN log they come in different messages."""
 _ERRORS = {name for each in PROTOCOLS for name in (*each.errors, *each.bits)}
@@ -28,6 +33,13 @@ def needed_columns(fields: Sequence[Field]) -> list[int]:
     words = {field.source for field in fields} & {word for p in PROTOCOLS for word in p.errors}
     flags = {bit.text for p in PROTOCOLS for word in words for bit in p.errors.get(word, ())}
     return [i for i, field in enumerate(fields) if field.source in _SOURCES - flags]
+
+
+class Cut(NamedTuple):
+    """A long gap that was cut out. ``begin_ns``: the time of the row in front of it; ``length_ns``: how much is left out."""
+
+    begin_ns: int
+    length_ns: int
 
 
 class Flight:
@@ -49,7 +61,10 @@ class Flight:
         self.seen = Events()
         self._has_begun = False
         self.origin_ns = self.start_ns = self.end_ns = 0
-        """Times of the recording's first row (time 0 of the page), and of the window's first and last."""
+        """Times of the recording's first row (time 0 of the page), and of the window's first and last, without long gaps."""
+        self.cuts: list[Cut] = []
+        """Long gaps, which are cut out of all times."""
+        self._cut_ns = self._last_ns = 0
         self.rows = 0
         self.replayed = False
         self.escs = [EscFlight(i, each, fields, self.seen) for i, each in enumerate(escs)]
@@ -69,7 +84,9 @@ class Flight:
     def take(self, block: Block) -> bool:
         """Take rows; False where all that follow are after the window."""
         if not self._has_begun:
-            self._has_begun, self.origin_ns = True, block.times[0]
+            self._has_begun = True
+            self.origin_ns = self._last_ns = block.times[0]
+        block = self._without_long_gaps(block)
         high = LATEST_NS if self._to_ns is None else self.origin_ns + self._to_ns
         rows = block.between(self.origin_ns + self._from_ns, high)
         begin = 0
@@ -84,6 +101,22 @@ class Flight:
         self.rows += len(rows)
         self._analyse(rows.part(begin, len(rows)))
         return block.times[-1] <= high
+
+    def _without_long_gaps(self, block: Block) -> Block:
+        """The rows with their times on the page."""
+        times: Sequence[int] = block.times
+        last_ns, self._last_ns = self._last_ns, times[-1]
+        if times[-1] - last_ns <= LONGEST_GAP_NS and not self._cut_ns:
+            return block
+        moved = []
+        for time_ns in times:
+            if time_ns - last_ns > LONGEST_GAP_NS:
+                length_ns = time_ns - last_ns - _GAP_LEFT_NS - self._gap_ns
+                self.cuts.append(Cut(last_ns - self._cut_ns, length_ns))
+                self._cut_ns += length_ns
+            moved.append(time_ns - self._cut_ns)
+            last_ns = time_ns
+        return Block(moved, block.columns, None)
 
     def finish(self) -> "Flight":
         """Have ``lines`` and ``events`` made after the last row."""

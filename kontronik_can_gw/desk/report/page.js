@@ -12,6 +12,8 @@
   const MIN_SPAN = 0.05;
   const AXIS = narrow ? 48 : 58;
   const ROW = 15; // height of a row of text
+  const LETTER = 6.6; // width of a digit in an axis label
+  const RIGHT = 34; // room for half of the last time label
   const COLOURS = 8;
   const DASHES = { solid: [], dashed: [8, 4], dotted: [2, 3] }; // by the style of a border in CSS
   const FONT = "11px system-ui, sans-serif";
@@ -84,12 +86,15 @@
 
   const stateAt = (esc, t) => states[esc].findLast((state) => state.from <= t && t <= end(state));
 
+  // Seconds of the long gaps in front of a time, which are not on the page.
+  const cutBefore = (t) => data.cuts.reduce((sum, [begin, length]) => sum + (t > begin ? length : 0), 0);
+
   // What is at the cursor, in the bar.
   function showNow() {
     const t = cursorTime;
     if (t === null) return byId("now").replaceChildren(`${clock(range[0])} to ${clock(range[1])}`);
     const parts = [clock(t, 2)];
-    if (data.wall !== null) parts.push(new Date(data.wall + t * 1000).toISOString().slice(11, 21) + " UTC");
+    if (data.wall !== null) parts.push(new Date(data.wall + (t + cutBefore(t)) * 1000).toISOString().slice(11, 21) + " UTC");
     data.escs.forEach((name, esc) => {
       const state = visible[esc] && stateAt(esc, t);
       if (state) parts.push((several ? name + ": " : "") + state.text);
@@ -126,9 +131,18 @@
   const STEPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600,
     7200, 14400, 28800, 86400];
 
+  const digitsOf = (step) => Math.max(0, Math.ceil(-Math.log10(step * 1.001)));
+
   function timeLabels(u, splits) {
     const step = splits.length > 1 ? splits[1] - splits[0] : 1;
-    return splits.map((t) => clock(t, Math.max(0, Math.ceil(-Math.log10(step * 1.001)))));
+    return splits.map((t) => clock(t, digitsOf(step)));
+  }
+
+  // Least distance of two time labels: the longest label, and a gap.
+  function timeSpace(u, index, from, to, width) {
+    const step = ((to - from) * 70) / Math.max(width, 70);
+    const longest = Math.max(clock(from, digitsOf(step)).length, clock(to, digitsOf(step)).length);
+    return Math.max(60, longest * LETTER + 18);
   }
 
   function axis(more) {
@@ -140,7 +154,7 @@
       ...more,
     };
   }
-  const timeAxis = (more) => axis({ incrs: STEPS, values: timeLabels, space: 70, size: 28, ...more });
+  const timeAxis = (more) => axis({ incrs: STEPS, values: timeLabels, space: timeSpace, size: 28, ...more });
 
   function addPlot(figure, key, title, height, options, columns) {
     const box = make("div", { class: "plot", tabindex: "0", role: "group", "aria-label": `${title} over time` });
@@ -151,7 +165,7 @@
     plot.u = new uPlot({
       width: Math.max(200, box.clientWidth),
       height,
-      padding: [8, 10, 0, 0],
+      padding: [8, RIGHT, 0, 0],
       legend: { show: false },
       ...options,
       scales: { x: { time: false, range: (u, from, to) => [from, to] }, ...options.scales },
@@ -172,7 +186,7 @@
           cursorTime = u.cursor.left >= 0 ? u.posToVal(u.cursor.left, "x") : null;
           showNow();
         }],
-        draw: [options.draw ?? (() => {}), drawMarks],
+        draw: [drawMarks, options.draw ?? (() => {})],
       },
     }, [data.times, ...columns], box);
     plots.push(plot);
@@ -204,8 +218,11 @@
     const styleOf = ({ esc, line }) => (several ? esc : line);
     const tone = (item) => ink(colour(styleOf(item)));
     const series = spec.series.map((item) => {
-      const single = isolated(item.values);
+      const single = item.drawn ? isolated(item.values) : [];
       return {
+        // a line that is not drawn has a scale of its own, on which it would cover the one that is
+        scale: item.drawn ? "y" : `y${item.line}`,
+        ...(item.drawn ? {} : { paths: () => null }),
         label: [several ? data.escs[item.esc] : "", several && spec.lines.length === 1 ? "" : spec.lines[item.line]].join(" ").trim(),
         stroke: () => tone(item),
         width: several ? WIDTHS[item.line] : 1.6,
@@ -215,10 +232,16 @@
       };
     });
     const styleAt = (index) => styleOf(spec.series[index - 1]);
-    const markers = { width: 2, dash: (u, index) => dashes(styleAt(index)), stroke: (u, index) => `var(${colour(styleAt(index))})` };
-    const caption = make("figcaption", {}, make("h3", {}, spec.title + " ", make("small", {}, spec.unit)));
+    const markers = {
+      width: 2,
+      dash: (u, index) => dashes(styleAt(index)),
+      stroke: (u, index) => (spec.series[index - 1].drawn ? `var(${colour(styleAt(index))})` : "transparent"),
+    };
+    const about = spec.unit + (spec.note ? ` (${spec.note})` : "");
+    const caption = make("figcaption", {}, make("h3", {}, spec.title + " ", make("small", {}, about)));
+    const scales = Object.fromEntries(["y", ...spec.lines.map((label, line) => `y${line}`)].map((key) => [key, { range: scaleRange }]));
     const plot = addPlot(make("figure", {}, caption), spec.key, spec.title, narrow ? 180 : 220, {
-      scales: { y: { range: scaleRange } },
+      scales,
       axes: [timeAxis(), axis({ size: AXIS, space: 32, values: (u, splits) => splits.map((v) => withSpaces(v.toLocaleString("en"))) })],
       series: [{}, ...series],
       legend: { markers, mount: (u, legend) => caption.append(legend) },
@@ -240,6 +263,8 @@
       const row = taken.findIndex((spans) => right <= bbox.left + bbox.width && spans.every(([from, to]) => right <= from || left >= to));
       if (row < 0) return true;
       taken[row].push([left, right]);
+      ctx.fillStyle = ink("--card"); // the marks of other errors end at a text
+      ctx.fillRect(left - ratio, bbox.top + (row * ROW + 1) * ratio, right - left - 4 * ratio, (ROW - 2) * ratio);
       ctx.fillStyle = toneOf(event);
       ctx.fillText(textOf(event), left, bbox.top + (row + 0.5) * ROW * ratio);
       return false;

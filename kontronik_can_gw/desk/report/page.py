@@ -19,6 +19,7 @@ from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
 
 HERE = Path(__file__).parent
+_MAX_CUTS = 20
 APART = 4
 """Lines whose greatest values are further apart than this factor have a plot each."""
 
@@ -41,7 +42,8 @@ def render(
         "policy": escape(policy),
         "title": escape(source),
         "style": style,
-        "head": _head(flight, source, provenance or {}, wall_ns) + _damage(damage),
+        "head": _head(flight, source, provenance or {}, wall_ns),
+        "problems": _damage(damage) + _cuts(flight),
         "tiles": tiles(flight),
         "tables": tables(flight),
         "several": "groups several" if len(flight.escs) > 1 else "groups",
@@ -75,6 +77,7 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
         "from": seconds(flight.start_ns),
         "to": seconds(flight.end_ns),
         "wall": None if wall_ns is None else wall_ns // 1_000_000,
+        "cuts": [[seconds(cut.begin_ns), cut.length_ns / SECOND] for cut in flight.cuts],
         "times": [seconds(time_ns) for time_ns in flight.points.times],
         "phases": PHASES,
         "plots": list(_plots(flight)),
@@ -86,7 +89,7 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
 
 
 def _plots(flight: Flight) -> Iterator[dict[str, Any]]:
-    """The plots that have data. Lines of one plot whose sizes differ come in plots of their own, each with its axis."""
+    """The plots that have data. Lines of one plot whose sizes differ get plots of their own, unless they have one shape."""
     for plot in PLOTS:
         lines: dict[str, dict[int, list[Number]]] = {}
         for (esc, source), values in flight.lines.items():
@@ -99,22 +102,39 @@ def _plots(flight: Flight) -> Iterator[dict[str, Any]]:
             for source in plot.lines
             if source in lines
         }
-        groups = of_like_size(tops)
+        groups = [[*tops]] if plot.has_one_shape and tops else of_like_size(tops)
         for index, sources in enumerate(groups):
             labels = [plot.lines[source] for source in sources]
             named = f"{', '.join(labels)} {plot.title[0].lower()}{plot.title[1:]}"
             yield {
                 "key": f"{plot.key}-{index}" if index else plot.key,
                 "title": named if len(groups) > 1 else plot.title,
+                "note": _note_on_shape(labels) if plot.has_one_shape else "",
                 "unit": VALUES[sources[0]].unit,
                 "digits": plot.digits,
                 "lines": labels,
                 "series": [
-                    {"esc": esc, "line": line, "values": values}
+                    {
+                        "esc": esc,
+                        "line": line,
+                        "values": values,
+                        "drawn": not plot.has_one_shape or line == _first_line(lines, sources, esc),
+                    }
                     for line, source in enumerate(sources)
                     for esc, values in lines[source].items()
                 ],
             }
+
+
+def _first_line(lines: Mapping[str, Mapping[int, object]], sources: list[str], esc: int) -> int:
+    return next(line for line, source in enumerate(sources) if esc in lines[source])
+
+
+def _note_on_shape(labels: Sequence[str]) -> str:
+    """Why one line stands for several, and which one it is."""
+    if len(labels) < 2:
+        return ""
+    return f"{labels[0].lower()} drawn, the others differ only by pole pairs and gear"
 
 
 def of_like_size(tops: Mapping[str, float]) -> list[list[str]]:
@@ -141,7 +161,8 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
         begin, end = (clock(t - flight.origin_ns) for t in (flight.start_ns, flight.end_ns))
         facts["Part"] = f"{begin} to {end} of the recording"
     if wall_ns is not None:
-        facts["Begin"] = wall_clock(wall_ns + flight.start_ns - flight.origin_ns)
+        cut_ns = sum(cut.length_ns for cut in flight.cuts if cut.begin_ns < flight.start_ns)
+        facts["Begin"] = wall_clock(wall_ns + flight.start_ns - flight.origin_ns + cut_ns)
     for esc in flight.escs:
         devices, noted = ", then ".join(esc.devices[:8]), provenance.get(esc.name, "")
         port = noted.rpartition(", at ")[2]
@@ -166,6 +187,21 @@ def _damage(damage: Sequence[str]) -> str:
     return f'<div class="damage">{title}<ul>{lines}</ul></div>'
 
 
+def _cuts(flight: Flight) -> str:
+    if not flight.cuts:
+        return ""
+    lines = "".join(
+        f"<li>after {clock(cut.begin_ns - flight.origin_ns)}: {duration(cut.length_ns)}</li>"
+        for cut in flight.cuts[:_MAX_CUTS]
+    )
+    if len(flight.cuts) > _MAX_CUTS:
+        lines += f"<li>and {len(flight.cuts) - _MAX_CUTS} more</li>"
+    title = (
+        "<strong>Gaps of more than a day are cut out, and all times count without them.</strong>"
+    )
+    return f'<div class="damage">{title} Was the clock set?<ul>{lines}</ul></div>'
+
+
 def _notes(flight: Flight) -> str:
     lines = []
     if flight.points.rows_in_bucket > 1:
@@ -173,10 +209,10 @@ def _notes(flight: Flight) -> str:
             f"Lines are drawn from the minimum and the maximum of each {flight.points.rows_in_bucket} rows: no peak is lost, its time is "
             "exact to within them. All numbers in the tables are from every row."
         )
-    if flight.seen.left_out:
-        lines.append(f"{flight.seen.left_out} more events are not listed.")
-    return "".join(f'<p class="note">{line}</p>' for line in lines)
     if any("battery_power" in esc.computed for esc in flight.escs):
         lines.append(
             "Battery power is computed from voltage and current, because this CAN log has them more often than the power."
         )
+    if flight.seen.left_out:
+        lines.append(f"{flight.seen.left_out} more events are not listed.")
+    return "".join(f'<p class="note">{line}</p>' for line in lines)

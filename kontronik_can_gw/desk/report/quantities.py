@@ -4,21 +4,25 @@ from typing import NamedTuple
 
 
 class Plot(NamedTuple):
-    """A plot. ``key`` names it in the page; ``lines``: label by source; ``digits``: decimals of values shown."""
+    """A plot. ``key`` names it in the page; ``lines``: label by source; ``digits``: decimals of values shown.
+
+    ``has_one_shape``: the lines differ only by a factor. One is drawn, and the cursor shows the values of all.
+    """
 
     key: str
     title: str
     digits: int
     lines: dict[str, str]
+    has_one_shape: bool = False
 
 
 # fmt: off
 PLOTS = (
-    Plot("speed", "Speed", 0, {"output_speed": "Output", "motor_speed": "Motor", "electrical_speed": "Electrical"}),
     Plot("battery_voltage", "Battery voltage", 2, {"battery_voltage": "Battery"}),
     Plot("cell_voltage", "Mean cell voltage", 3, {"mean_cell_voltage": "Cell"}),
     Plot("current", "Current", 1, {"battery_current": "Battery", "motor_current": "Motor", "peak_current": "Peak (held)"}),
     Plot("power", "Battery power", 0, {"battery_power": "Power"}),
+    Plot("speed", "Speed", 0, {"output_speed": "Output", "motor_speed": "Motor", "electrical_speed": "Electrical"}, has_one_shape=True),
     Plot("temperature", "Temperature", 0, {"power_stage_temperature": "Power stage", "bec_temperature": "BEC"}),
     Plot("throttle", "Throttle and output stage opening", 0, {"throttle": "Throttle", "output_opening": "Opening"}),
     Plot("pwm", "PWM input", 0, {"pwm_input": "PWM input"}),
@@ -53,15 +57,15 @@ COUNTERS = {
     "crc_errors": "CRC errors",
     "dropped_bytes": "Bytes dropped",
 }
-SPEEDS = ("electrical_speed", "motor_speed", "output_speed")
-
-PHASES = (
-    "Motor off, standby",
 COMPUTED_FROM = {
     "battery_power": ("battery_voltage", "battery_current"),
     "mean_cell_voltage": ("battery_voltage",),
 }
 """Values that follow from others. ``mean_cell_voltage`` also needs the number of cells."""
+SPEEDS = ("electrical_speed", "motor_speed", "output_speed")
+
+PHASES = (
+    "Motor off, standby",
     "Waiting",
     "Self-test, signal",
     "Spooling up, synchronising",

@@ -154,7 +154,10 @@ def clock(time_ns: int) -> str:
 
 
 def duration(length_ns: int) -> str:
-    """A length as 12.5 s, 4 min 05 s or 1 h 02 min 05 s."""
+    """A length as 12.5 s, 4 min 05 s, 1 h 02 min 05 s, or 19 675 days 17 h."""
+    if length_ns >= 100 * 3600 * SECOND:
+        days, hours = divmod(round(length_ns / (3600 * SECOND)), 24)
+        return f"{number(days, 0)} days {hours} h"
     if length_ns < 60 * SECOND:
         return f"{length_ns / SECOND:.1f} s"
     minutes, seconds = divmod(round(length_ns / SECOND), 60)
