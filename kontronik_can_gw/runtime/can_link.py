@@ -119,9 +119,10 @@ class CanLink:
         self.must_open = self.must_open and result is None
 
     def close(self) -> None:
-        """Close everything."""
-        self._poller.unregister(self._opener.fileno())
-        self._opener.close()
+        """Close everything. A second call changes nothing."""
+        if (opener_fd := self._opener.fileno()) >= 0:
+            self._poller.unregister(opener_fd)
+            self._opener.close()
         self._close_port()
         self._own_ids.close()
         if (fd := self.controller.fileno()) is not None:

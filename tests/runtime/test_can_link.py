@@ -16,7 +16,7 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.runtime import can_controller, can_link, can_opener, folders
+from kontronik_can_gw.runtime import can_controller, can_opener, folders
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
@@ -425,7 +425,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
     """Not at the start, and not later when an adapter has come back under another name."""
     opened: list[object] = []
     monkeypatch.setattr(can_opener, "open_can", opened.append)
-    bench.can._esc_at = lambda path: "left" if path == bench.can.config.channel else None
+    bench.can._opener._esc_at = lambda path: "left" if path == bench.can.config.channel else None
     if wait:
         bench.start()
         bench.turn(3000)

@@ -73,7 +73,7 @@ class Status(Notifier):
         super().__init__({})
         self.is_ready = False
 
-    def ready(self, status: str) -> None:
+    def ready(self, status: str = "") -> None:
         self.is_ready = True
 
 

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
@@ -193,9 +193,9 @@ class CanLogInput(Input):
         maker = ColumnMaker(self.reader, range(len(self.fields)) if chosen is None else chosen)
         rows = rows_of_frames(self.frames(), self.reader)
         while some := list(islice(rows, ROWS if self.stream is None else 1)):
-            times, parts = zip(*some, strict=True)
-            # the clock of a log is the same from its first frame to its last
-            yield Block(times, maker.columns(parts), self.wall_ns(0))
+            for wall_ns, group in groupby(some, lambda row: self.wall_offset_ns(row[0])):
+                times, parts = zip(*group, strict=True)
+                yield Block(times, maker.columns(parts), wall_ns)
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         return self.samples(chosen)

@@ -208,7 +208,7 @@ class Input(ABC):
         """Rows of the values of ``chosen`` fields, in that order; None: of all."""
         samples = self.samples_in_python(range(len(self.fields)) if chosen is None else chosen)
         # with each row, because a clock that was set later must not move the rows before it
-        found = ((self._wall_of(row), *row) for row in samples)
+        found = ((self.wall_offset_ns(row.time_ns), *row) for row in samples)
         while some := list(islice(found, ROWS if self.stream is None else 1)):
             for wall_ns, rows in groupby(some, itemgetter(0)):
                 _, times, values = zip(*rows, strict=True)
@@ -241,9 +241,10 @@ class Input(ABC):
         with self.resources:
             self.close()
 
-    def _wall_of(self, row: Sample) -> int | None:
-        wall_ns = self.wall_ns(row.time_ns)
-        return None if wall_ns is None else wall_ns - row.time_ns
+    def wall_offset_ns(self, time_ns: int) -> int | None:
+        """Unix time minus the recording's own time at ``time_ns``. None if the time of day is unknown."""
+        wall_ns = self.wall_ns(time_ns)
+        return None if wall_ns is None else wall_ns - time_ns
 
 
 def counted(count: int, noun: str) -> str:
