@@ -5,7 +5,7 @@ A value holds until the next row; while telemetry is lost nothing is counted. Ti
 
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, repeat
 from math import isfinite
 from typing import Any, Literal, NamedTuple
 
@@ -195,21 +195,30 @@ class EscFlight:
 
     def _derive(self, columns: Columns) -> None:
         """Add values that follow from others, if the recording lacks them or has them less often."""
-        counts = [count for count in columns.get("cell_count", ()) if count]
-        cells = self.cells = round(counts[-1]) if counts else self.cells
         voltage, current = columns.get("battery_voltage"), columns.get("battery_current")
+        cells = self._cells_of_rows(columns.get("cell_count", ()))
         if voltage is None:
             return
-        if cells and self._is_computed("mean_cell_voltage", columns):
+        if self._is_computed("mean_cell_voltage", columns):
+            sent = columns.get("mean_cell_voltage", repeat(None))
             columns["mean_cell_voltage"] = [
-                None if v is None else round(v / cells, 3) for v in voltage
+                _mean_cell(*of_row) for of_row in zip(voltage, cells, sent, strict=False)
             ]
-        columns.setdefault("mean_cell_voltage", (None,) * len(voltage))
         if current is not None and self._is_computed("battery_power", columns):
             columns["battery_power"] = [
                 None if v is None or i is None else round(v * i, 3)
                 for v, i in zip(voltage, current, strict=True)
             ]
+
+    def _cells_of_rows(self, counts: Sequence[Any]) -> Iterable[int | None]:
+        """The number of cells as it is known at each row."""
+        if counts.count(self.cells) == len(counts):
+            return repeat(self.cells)
+        found = []
+        for count in counts:
+            self.cells = round(count) if count else self.cells
+            found.append(self.cells)
+        return found
 
     def _is_computed(self, source: str, columns: Columns) -> bool:
         return source in self.computed or source not in columns
@@ -311,6 +320,12 @@ class EscFlight:
             elif self.load_voltage is None and abs(current) <= REST_CURRENT and voltage > 0:
                 self.rest_voltage = voltage
         self._held = since, was_there, held_power, turned
+
+
+def _mean_cell(voltage: Number, cells: int | None, sent: Number) -> Number:
+    if voltage is None:
+        return None
+    return round(voltage / cells, 3) if cells else sent
 
 
 def _values_to_compute(fields: Sequence[Field]) -> set[str]:
