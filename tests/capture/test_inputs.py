@@ -7,6 +7,14 @@ import pytest
 from capture_bench import START, Bench, capture, made
 from simulated_bus import write_log
 
+from kontronik_can_gw.capture.format import (
+    Entry,
+    Kind,
+    block,
+    data_payload,
+    json_payload,
+    numbers_data,
+)
 from kontronik_can_gw.desk.recordings.inputs import (
     CanLogInput,
     CaptureInput,
@@ -100,3 +108,63 @@ def test_a_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: P
         assert (
             "20260101T000000Z-aaaaaa-00000.kcap: has no header that could be read" in found.damage
         )
+
+
+def byte_entry(time_ns: int) -> Entry:
+    return Entry(time_ns, Kind.BYTES, 0, b"x", 0, time_ns)
+
+
+def clock_entry(time_ns: int, wall_ns: int) -> Entry:
+    return Entry(time_ns, Kind.CLOCK, 0, numbers_data(wall_ns), 0, None)
+
+
+def test_a_clock_that_is_set_counts_from_the_entry_after_it_on(tmp_path: Path) -> None:
+    """And each part of a run begins with the wall clock of its own header."""
+    setup = made(1)[0]
+    wall = 1_700_000_000 * SECOND
+    first = [
+        byte_entry(START),
+        byte_entry(START + SECOND),
+        clock_entry(START + SECOND, wall + 3600 * SECOND),
+        byte_entry(START + 2 * SECOND),
+    ]
+    second = [byte_entry(START + 5 * SECOND)]
+    capture(tmp_path / "20260101T000000Z-aaaaaa-00000.kcap", setup, first)
+    capture(
+        tmp_path / "20260101T000000Z-aaaaaa-00001.kcap",
+        setup,
+        second,
+        part=1,
+        monotonic_ns=START + 4 * SECOND,
+        wall_ns=wall + 50 * SECOND,
+    )
+    with open_input(tmp_path) as found:
+        assert isinstance(found, CaptureInput)
+        times = [each.time_ns for each in found.entries() if each.kind == Kind.BYTES]
+        walls = [found.wall_ns(time_ns) for time_ns in times]
+        assert found.damage == []
+    assert [time_ns - START for time_ns in times] == [0, SECOND, 2 * SECOND, 5 * SECOND]
+    assert walls == [wall, wall + SECOND, wall + 3601 * SECOND, wall + 51 * SECOND]
+
+
+def test_a_capture_without_some_blocks_or_its_end_is_read_and_tells_so(tmp_path: Path) -> None:
+    """Entries never go back in time, whatever a file holds."""
+    header = made(1)[0].header() | {"run": "r", "part": 0, "created_ns": START}
+    steps = (3, 2, 7)
+    blocks = [block(b"H", 0, json_payload(header | {"monotonic_ns": START, "wall_ns": START}))]
+    blocks += [
+        block(b"D", number, data_payload([byte_entry(START + step * SECOND)]))
+        for number, step in zip((1, 2, 5), steps, strict=True)
+    ]
+    path = tmp_path / "a.kcap"
+    path.write_bytes(b"".join(blocks))
+    with open_input(path) as found:
+        assert isinstance(found, CaptureInput)
+        times = [each.time_ns - START for each in found.entries()]
+        damage = list(found.damage)
+    assert times == [3 * SECOND, 3 * SECOND, 7 * SECOND]
+    place = sum(map(len, blocks[:3]))
+    assert damage == [
+        f"a.kcap: 2 blocks in front of byte {place} are missing",
+        "a.kcap: was not closed: up to the last second before its end may be missing",
+    ]
