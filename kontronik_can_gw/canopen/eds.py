@@ -12,13 +12,12 @@ there; an object has sub-indices where it has sections of them, else it is a var
 Types of 24, 40, 48 and 56 bits and times are refused.
 """
 
-import codecs
 import re
 import struct
-import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from kontronik_can_gw.canopen.eds_text import decode_text, to_ascii
 from kontronik_can_gw.errors import UserError
 
 # --- data types of CiA 301 (table 44) that the object dictionary can have
@@ -70,11 +69,8 @@ _HEADING = re.compile(r"\s*\[([^\]]*)\]")
 _COMMENT = re.compile(r"(?:^|\s);.*|^\s*#.*")
 OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
 """The section of an object or of one of its sub-indices."""
-_CTRL_Z = re.compile(r"[\s\x1a]*\x1a\s*\Z")
-"""The end of a file as DOS editors mark it."""
 _EXACT_KEYS = frozenset({"defaultvalue", "parametervalue"})
 """Keys whose values nodes send: no letter of them may be replaced."""
-_PLAIN_LETTERS = {"\u00b5": "u", "\u03bc": "u", "\u00b0": "deg", "\u00df": "ss"}
 _NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
 
 
@@ -104,36 +100,13 @@ class Section:
         return found
 
 
-def decode_text(data: bytes) -> str:
-    """Returns the text of an EDS with LF as line end, as UTF-16 or UTF-8 if it is that, else as Windows-1252."""
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        text = data.decode("utf-16", "replace")
-    else:
-        try:
-            text = data.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = data.decode("cp1252", "replace")
-    return _CTRL_Z.sub("", text.replace("\r\n", "\n").replace("\r", "\n"))
-
-
-def _to_ascii(text: str) -> str:
-    """Replaces letters beyond ASCII by the nearest ones, and others by "?"."""
-    if text.isascii():
-        return text
-    for letter, plain in _PLAIN_LETTERS.items():
-        text = text.replace(letter, plain)
-    parts = unicodedata.normalize("NFKD", text)
-    bare_letters = "".join(each for each in parts if not unicodedata.combining(each))
-    return bare_letters.encode("ascii", "replace").decode("ascii")
-
-
 def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
     """The sections by their names in lower case, those of objects in one spelling. What is wrong is added to ``problems``."""
     found: dict[str, Section] = {}
     section, where = Section(""), ""
     for line in decode_text(data).split("\n"):
         if heading := _HEADING.match(line):
-            section = Section(_to_ascii(heading[1].strip()))
+            section = Section(to_ascii(heading[1].strip()))
             where = f"[{section.name}] "
             if found.setdefault(_spelling(section.name), section) is not section:
                 problems.append(f"{where}this section is there twice. Remove one.")
@@ -143,7 +116,7 @@ def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
                 if key.lower() in _EXACT_KEYS:
                     what = f"{_quoted(text)} has letters beyond ASCII. Write it in plain letters."
                     problems.append(where + what)
-                value = _to_ascii(value)
+                value = to_ascii(value)
             if not (equals and key and where):
                 what = f"'{_quoted(text)}' is neither a section, nor key=value, nor a comment after ';'."
                 problems.append(where + what)

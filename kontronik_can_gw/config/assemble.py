@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -142,6 +142,19 @@ def _outputs(
     return tuple(found)
 
 
+def _load_warning(
+    config: Config, layout: Layout, bits: Mapping[str, float], worst: Mapping[str, float]
+) -> str | None:
+    """A warning of the bus load. ``worst`` has the outputs whose worst load is another one."""
+    can = config.can
+    return check_load(layout, can.bitrate, can.data_bitrate, bits, {**bits, **worst})
+
+
+def _output_warnings(config: Config, outputs: Sequence[OutputSetup]) -> list[str]:
+    bitrate = config.can.bitrate
+    return [f"{config.file}: {text}" for each in outputs for text in each.warnings(bitrate)]
+
+
 def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     """The objects made from a configuration. Without a store its files are only read.
 
@@ -177,8 +190,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             layout = prepare(database, file, escs, config.dbc, config.can.fd, taken)
     if problems:
         raise UserError(*problems)
-    rates = config.can.bitrate, config.can.data_bitrate
-    load = check_load(layout, *rates, bits, bits | worst)
+    load = _load_warning(config, layout, bits, worst)
     if plain is not None:
         foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
         canopen, given_way = nodes.with_stored(plain, stored, config, escs, foreign)
@@ -186,8 +198,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         if canopen.stored != plain.stored:
             _, bits[_NODES], worst[_NODES] = nodes.needs(canopen, escs)
             with collecting(warnings):  # more than the bus has is no reason not to start
-                load = check_load(layout, *rates, bits, bits | worst)
-    warnings += [f"{config.file}: {text}" for each in outputs for text in each.warnings(rates[0])]
+                load = _load_warning(config, layout, bits, worst)
+    warnings += _output_warnings(config, outputs)
     mute = [*unreported(layout, config.dbc.silent_on_loss), *unsupplied(layout, escs)]
     said = (*config.warnings, *ignored, *mute, *filter(None, [load]), *warnings)
     return Loaded(

@@ -7,8 +7,8 @@ from fractions import Fraction
 from typing import Any
 
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.native.header import KCG, enumeration, structure
 from kontronik_can_gw.native.header import NotInCore as NotInCore
-from kontronik_can_gw.native.header import enumeration, structure
 
 Piece, Pair = structure("kcg_piece"), structure("kcg_pair")
 Signal, Message = structure("kcg_signal"), structure("kcg_message")
@@ -17,6 +17,8 @@ COUNTS = enumeration("KCG_N_BYTES", "KCG_N_")
 """Of kcg_esc.count, in its order; the last ones, from ``link_state`` on, are states and sums."""
 GATEWAY = enumeration("KCG_ESCS_OK")[:-1]
 """Of kcg.gateway, in its order."""
+_MASK_BITS = 32
+"""Of kcg_signal.mask."""
 MAX_POLES = MAX_CELLS = 0xFF
 MAX_GEAR = 0xF_FFFF
 """Of numerator and denominator of a gear in its lowest terms: 9.81818 has 490909 and 50000."""
@@ -40,6 +42,21 @@ class Rows:
 
     def __iter__(self) -> Iterator[Any]:
         return (self[place] for place in range(len(self)))
+
+
+def bind_direction(
+    row: Any, negative_in: tuple[int, frozenset[int]], places: list[tuple[int, int]]
+) -> None:
+    """Makes a row of live data negative in some states: the word of the state, and these states.
+
+    ``places``: offset and wire type of each word. NotInCore for a state that has no bit.
+    """
+    word, states = negative_in
+    if row.kind != KCG.OF_LIVE or max(states) >= _MASK_BITS or row.mask:
+        raise NotInCore("a sign by a state of this number")
+    row.kind = KCG.OF_DIRECTED
+    row.shift = places[word][0]
+    row.mask = sum(1 << state for state in states)
 
 
 def settings_of(esc: EscSettings) -> Any:

@@ -27,6 +27,7 @@ from kontronik_can_gw.native.rows import (
     Piece,
     Rows,
     Signal,
+    bind_direction,
     settings_of,
 )
 from kontronik_can_gw.native.scale import END_OF_TIME, set_scale
@@ -45,8 +46,6 @@ _DIVISORS = {
     Divisor.CELLS: KCG.BY_CELLS,
 }
 _M64 = (1 << 64) - 1
-MASK_BITS = 32
-"""Bits of kcg_signal.mask."""
 
 
 class Tables:
@@ -228,12 +227,7 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         if value.mask != -1:
             row.shift, row.mask = value.shift, value.mask
         if value.negative_in is not None:
-            word, negative = value.negative_in
-            if is_info or max(negative) >= MASK_BITS or value.mask != -1:
-                raise NotInCore("a sign by a state of this number")
-            row.kind = KCG.OF_DIRECTED
-            row.shift = places[False][word][0]
-            row.mask = sum(1 << state for state in negative)
+            bind_direction(row, value.negative_in, places[False])
         elif row.kind == KCG.OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
             row.flags = KCG.DIRECT
     elif value.kind is Kind.PRODUCT:
