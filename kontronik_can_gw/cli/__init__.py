@@ -16,15 +16,18 @@ from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import TextIO
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cli.arguments import add_options, refuse_removed_options
+from kontronik_can_gw.cli.arguments import Parser, add_options, refuse_removed_options
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 
+_CLOSED_OUTPUT = 128 + signal.SIGPIPE
+"""Exit code if nobody reads the output any more: a shell shows this for a program that SIGPIPE ended."""
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
-    "run": "the gateway: ESC telemetry in, CAN frames and CANopen out",
+    "run": "the gateway: ESC telemetry in; DBC messages, CANopen, DroneCAN out",
     "status": "show the state of the running gateways",
     "check": "check a configuration and print what it will send",
     "doctor": "check machine, ports, CAN interface and configuration, with remedies",
@@ -49,12 +52,20 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _run(list(sys.argv[1:] if argv is None else argv))
+    except BrokenPipeError:  # the reader of our output has ended, as `| head` does
+        discard_output()
+        return _CLOSED_OUTPUT
+
+
+def _run(words: list[str]) -> int:
+    """Run one command. BrokenPipeError if nobody reads its output or its messages any more."""
     command = next((word for word in words if not word.startswith("-")), None)
     try:
         _prepare_streams()
         refuse_removed_options(command, words)
-        args = make_parser([] if command is None else [command]).parse_args(words)
+        args = _parsed(command, words)
         # before, while modules are loaded, Ctrl-C ends the process (see __main__)
         if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -65,8 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for problem in error.problems:
             say(problem, command)
         return error.exit_code
-    except BrokenPipeError:  # the reader of our output ended, as `| head` does
-        discard_output()
+    except BrokenPipeError:
+        raise
     except OSError as error:
         if error.errno == errno.ENOSPC:
             discard_output()
@@ -82,9 +93,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     return RunError.exit_code
 
 
+def _parsed(command: str | None, words: list[str]) -> argparse.Namespace:
+    try:
+        return make_parser([] if command is None else [command]).parse_args(words)
+    except SystemExit:
+        for stream in (
+            sys.stdout,
+            sys.stderr,
+        ):  # a failure at the very end would be reported by Python
+            stream.flush()
+        raise
+
+
 def discard_output() -> None:
-    """Let what is buffered for standard output, and what follows, go nowhere."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    """Discard the buffered part of standard output and all further output, and so for messages that nobody reads."""
+    _discard(sys.stdout)
+    try:
+        sys.stderr.flush()
+    except BrokenPipeError:
+        _discard(sys.stderr)
+
+
+def _discard(stream: TextIO) -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def say(text: str, command: str | None = None) -> None:
@@ -102,9 +133,10 @@ def show(text: str = "") -> None:
 
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """The parser of the program. Only commands in ``complete`` get their options; a run needs only those of one command."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="kontronik-can-gw",
-        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN: messages of a DBC, and CANopen nodes of an EDS.",
+        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN: messages of a DBC, CANopen nodes of an EDS, and "
+        "DroneCAN.",
         epilog="kontronik-can-gw COMMAND --help describes a command.",
         allow_abbrev=False,
     )
@@ -128,7 +160,9 @@ def _complete(parser: argparse.ArgumentParser, module: ModuleType) -> None:
     if actions := getattr(module, "ACTIONS", None):
         subs = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
         for name, (line, options) in actions.items():
-            add_options(subs.add_parser(name, help=line, allow_abbrev=False), options)
+            text = line[0].upper() + line[1:] + "."
+            sub = subs.add_parser(name, help=line, description=text, allow_abbrev=False)
+            add_options(sub, options)
 
 
 class _Plain(logging.Formatter):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import UserError, did_you_mean
 
 REMOVED_OPTIONS: dict[tuple[str, str], str] = {
     (command, removed): advice
@@ -16,6 +16,33 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
     for removed, advice in rows.items()
 }
 """By command and option, and what to type instead."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser of one command. A mistake shows the usage of this command, and what was meant."""
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse. Exits with the usage for options that do not exist, so that no word is left over."""
+        found, rest = super().parse_known_args(args, namespace)
+        for action in self._actions:
+            # argparse takes an optional argument for missing if it comes after an option
+            is_text = not action.option_strings and action.type is None
+            is_missing = is_text and action.nargs == "?" and getattr(found, action.dest) is None
+            if is_missing and rest and (rest[0] == "-" or not rest[0].startswith("-")):
+                setattr(found, action.dest, rest.pop(0))
+        if rest:
+            names = [name for action in self._actions for name in action.option_strings]
+            known = [name for name in names if name.startswith("--")]
+            near = did_you_mean(rest[0].partition("=")[0], known)
+            self.error(f"unrecognized arguments: {' '.join(rest)}{near and '.'}{near}")
+        return found, rest
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            near = did_you_mean(str(value).lower(), map(str, action.choices), or_known=True)
+            raise argparse.ArgumentError(action, f"there is no {value!r}.{near}")
 
 
 class Option(NamedTuple):
@@ -89,10 +116,14 @@ _DEFAULTS = " or ".join(map(str, CONFIG_PLACES))
 # fmt: off
 CONFIG = (
     option("-c --config FILE", f"TOML configuration (default: {_DEFAULTS})", type=Path),
-    option("config FILE", "the same", type=Path, nargs="?", action=_Named),
+    option("config FILE", "TOML configuration, as with -c", type=Path, nargs="?", action=_Named),
 )
 JSON = option("--json", "one JSON document on standard output")
-OUTPUT = option("-o --output FILE", "where to (default: standard output)", default="-")
+FORCE = option("--force", "replace the output file if it exists")
+OUTPUT: "Rows" = (
+    option("-o --output FILE", "file to write (default: standard output)", default="-"),
+    FORCE,
+)
 LAYOUT = (
     option("-c --config FILE", "TOML configuration of the gateway whose frames they are", type=Path),
     option("--dbc FILE", "DBC of the frames (default: on the bus that of gateway.toml; else the shipped one, one ESC)", type=Path),

@@ -6,20 +6,28 @@ from collections.abc import Iterator
 import shtab
 
 from kontronik_can_gw.cli import make_parser
-from kontronik_can_gw.cli.arguments import option
+from kontronik_can_gw.cli.arguments import OUTPUT, option
+from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.desk.libraries import install_command
 from kontronik_can_gw.errors import RunError
 
 _SHELLS = ("bash", "zsh", "tcsh", "fish")
-OPTIONS = (option("SHELL", ", ".join(_SHELLS), choices=_SHELLS),)
+OPTIONS = (option("SHELL", ", ".join(_SHELLS), choices=_SHELLS), *OUTPUT)
 EPILOG = """\
-bash:  kontronik-can-gw completion bash > ~/.local/share/bash-completion/completions/kontronik-can-gw
-       or once, for this shell: eval "$(kontronik-can-gw completion bash)"
-zsh:   kontronik-can-gw completion zsh > ~/.zfunc/_kontronik-can-gw     (~/.zfunc is in fpath before compinit)
-tcsh:  kontronik-can-gw completion tcsh > ~/.kontronik-can-gw.tcsh      (source it in ~/.tcshrc)
-fish:  kontronik-can-gw completion fish > ~/.config/fish/completions/kontronik-can-gw.fish
+Where the shells look for the script:
 
-exit codes: 0 done, 1 the installed shtab does not know this shell, 2 wrong usage
+  bash  ~/.local/share/bash-completion/completions/kontronik-can-gw
+  zsh   ~/.zfunc/_kontronik-can-gw, with ~/.zfunc in fpath before compinit
+  tcsh  ~/.kontronik-can-gw.tcsh, with "source ~/.kontronik-can-gw.tcsh" in
+        ~/.tcshrc
+  fish  ~/.config/fish/completions/kontronik-can-gw.fish
+
+examples:
+  kontronik-can-gw completion zsh -o ~/.zfunc/_kontronik-can-gw
+  eval "$(kontronik-can-gw completion bash)"    # for this shell only
+
+exit codes: 0 done; 1 the installed shtab does not know this shell, or the file
+cannot be written; 2 wrong usage
 """
 _KINDS = dict.fromkeys(("FILE", "SOURCE", "PATH", "IN", "OUT"), shtab.FILE) | {
     "DIR": shtab.DIRECTORY
@@ -42,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
             complete = shtab.glob(*endings)
         if complete is not None:
             action.complete = complete  # type: ignore[attr-defined]
-    print(shtab.complete(parser, args.shell))
+    write_output(args.output, shtab.complete(parser, args.shell) + "\n", force=args.force)
     return 0
 
 

@@ -7,9 +7,16 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, LOG_CHANNEL, REMOVED_OPTIONS, option
+from kontronik_can_gw.cli.arguments import FORCE, LAYOUT, LOG_CHANNEL, REMOVED_OPTIONS, option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.desk import OpenInput, given_layout, reading, was_ended, watched
+from kontronik_can_gw.cli.output import (
+    check_output,
+    configuration_files,
+    output_of,
+    recording_files,
+    writing,
+)
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
     FORMATS,
@@ -17,14 +24,13 @@ from kontronik_can_gw.desk.recordings.convert import (
     ON_SCREEN,
     SUFFIXES,
     TABLES,
-    Output,
     to_bytes,
     to_log,
     to_table,
 )
 from kontronik_can_gw.desk.recordings.fields import Choice
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
-from kontronik_can_gw.desk.recordings.stream import is_standard_input, name_of
+from kontronik_can_gw.desk.recordings.stream import name_of
 from kontronik_can_gw.errors import RunError, UserError
 
 _STOPPED = 130
@@ -53,9 +59,10 @@ def _names(text: str) -> list[str]:
 # fmt: off
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
-    option("OUT", "file to write, or - for standard output", dest="output"),
+    option("OUT", "file to write, or - for standard output", nargs="?"),
+    option("-o --output OUT", "another way to give OUT"),
     option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS),
-    option("--force", "write over OUT if it is there"),
+    FORCE,
     option("-q --quiet", "no summary"),
     LAYOUT,
     LOG_CHANNEL,
@@ -69,34 +76,42 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = """\
-IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
-BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. Its format is found from its content.
-It may be a pipe. UART bytes and candump text are then converted as they arrive; Ctrl-C ends the input and keeps the rows so far.
+IN is a capture of this gateway (.kcap; a folder stands for all parts of a
+run), a log of CAN frames (candump, Vector ASC or BLF, PEAK TRC, MF4 bus
+logging), or the plain UART bytes of one ESC. The content decides which it is.
+IN may be a pipe. UART bytes and candump text are then converted as they
+arrive, and Ctrl-C ends the input and keeps the rows so far.
 
-OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
-bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .log .candump .asc .blf .trc .bin; --to where it
-does not. - is standard output, for text. Parquet needs pyarrow, mf4-log needs asammdf.
+OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames
+(candump, asc, blf, trc, mf4-log), or the plain UART bytes of one ESC (bin).
+Its suffix selects the format: .csv .jsonl .ndjson .parquet .log .candump .asc
+.blf .trc .bin. With another suffix give --to. - is standard output, for text.
+Parquet needs pyarrow, mf4-log needs asammdf.
 
-A table has a row at each telemetry frame, or at each group of CAN frames that belong together, and a column for each value by its
-name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]). What is not available is empty in CSV, null elsewhere.
-A CAN log of several channels needs --channel for a table if more than one has messages of the DBC. Another log keeps all channels:
-can0 is 1 in formats that have numbers.
-Of a damaged recording everything that is intact is converted, and a summary says what is not.
-OUT takes its name only when it is whole; until then it is called OUT.part.
+A table has a row for each telemetry frame, or for each group of CAN frames
+that belong together. It has a column for each value, called by its name:
+battery_voltage [V], or with several ESCs esc1.battery_voltage [V]. A value
+that is not available is empty in CSV and null elsewhere. A table of a CAN log
+with several channels needs --channel if more than one has messages of the DBC.
+Other logs keep all channels; in formats with numbers can0 is 1. If a recording
+is damaged, all intact parts are converted, and a summary lists the damage.
+OUT gets its name when it is complete. Until then it is called OUT.part.
 
 examples:
   kontronik-can-gw convert flight.kcap flight.csv
   candump -L vcan0 | kontronik-can-gw convert - flight.csv
 
-exit codes: 0 converted, even if a part of IN is damaged; 1 there is nothing to convert, something cannot be read or written, or a
-library is missing; 2 wrong usage, or IN is not a recording; 130 stopped by a signal
+exit codes: 0 converted, also if a part of IN is damaged; 1 there is nothing to
+convert, OUT cannot be written, or a library is missing; 2 wrong usage, or IN
+cannot be opened or is not a recording; 130 stopped by a signal
 """
 
 
 def main(args: argparse.Namespace, opened_by: OpenInput = open_input) -> int:
     """Convert args.input, which ``opened_by`` opens. UserError for wrong usage, RunError if something cannot be read or written."""
-    if args.output != "-" and Path(args.output).is_dir():
-        raise UserError(f"{args.output}: is a directory. Give a file.")
+    args.output = output_of(args, "OUT")
+    inputs = [*recording_files(Path(args.input)), *configuration_files(args.config, args.dbc)]
+    check_output(args.output, inputs, force=args.force)
     form = _format(args)
     _check(args, form)
     try:
@@ -107,26 +122,17 @@ def main(args: argparse.Namespace, opened_by: OpenInput = open_input) -> int:
 
 
 def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
-    target = None if args.output == "-" else Path(args.output)
     begun = time.monotonic()
     with reading(Path(args.input), given_layout(args), opened_by) as recording:
         if args.channel is not None:
             recording.select_channel(args.channel)
         conversion = _conversion(args, form, recording)
-        out = Output(target)
         # the rows of a pipe cannot be read again, but only text can be used without its end
-        out.keeps_part = recording.stream is not None and form in ON_SCREEN
-        try:
-            with out:
-                name = f"{Path(args.input).name or recording.name} to {form}:"
-                out.watch = partial(watched, name=name, data_on_screen=target is None)
-                summary = conversion(recording, out)
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            where = target or "standard output"
-            kept = f" The data so far are in {out.kept_part}." if out.kept_part else ""
-            raise RunError(f"{where}: cannot be written: {error.strerror}.{kept}") from None
+        keeps_part = recording.stream is not None and form in ON_SCREEN
+        with writing(args.output, keeps_part=keeps_part, handles_signals=False) as out:
+            name = f"{Path(args.input).name or recording.name} to {form}:"
+            out.watch = partial(watched, name=name, data_on_screen=args.output == "-")
+            summary = conversion(recording, out)
         if summary is None and was_ended(recording):
             raise KeyboardInterrupt
         _report(args, form, recording, summary, time.monotonic() - begun)
@@ -204,16 +210,8 @@ def _check(args: argparse.Namespace, form: str) -> None:
     for is_wrong, problem in rules:
         if is_wrong:
             raise UserError(problem)
-    source, target = Path(args.input), Path(args.output)
-    if is_standard_input(source):
-        source = Path("/dev/stdin")
-    if to_screen or not target.exists():
-        return
-    if source.exists() and source.samefile(target):
-        raise UserError(f"{target}: is IN. Give another OUT.")
-    if target.is_file() and not args.force:
-        raise UserError(f"{target}: is there already. Give --force to write over it.")
-    if not target.is_file() and form not in ON_SCREEN:
+    target = Path(args.output)
+    if not to_screen and target.exists() and not target.is_file() and form not in ON_SCREEN:
         raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from kontronik_can_gw.canopen.dbc import pdo_text, waiting_for_lss
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
-from kontronik_can_gw.cli.desk import write_output
+from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.output_keys import DbcConfig
@@ -26,7 +26,7 @@ OPTIONS = (
     option("--canopen", "describe what the CANopen nodes send: PDOs as they are mapped now, heartbeats, emergencies"),
     option("--from DBC", "one-ESC DBC to start from (default: the shipped one)", type=Path),
     option("--esc N", "number of ESCs, called esc1, esc2 ... (default 1)", type=_ESCS),
-    OUTPUT,
+    *OUTPUT,
 )
 # fmt: on
 EPILOG = (
@@ -57,7 +57,8 @@ def main(args: argparse.Namespace) -> int:
         say(
             "warning: written in UTF-8, because it has characters that Windows-1252, the usual encoding of a DBC, has not"
         )
-    write_output(args.output, text, encoding)
+    inputs = configuration_files(args.config, source)
+    write_output(args.output, text, inputs, force=args.force, encoding=encoding)
     return 0
 
 

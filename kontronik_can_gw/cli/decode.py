@@ -3,30 +3,34 @@
 import argparse
 
 from kontronik_can_gw.cli import convert, make_parser
-from kontronik_can_gw.cli.arguments import option
+from kontronik_can_gw.cli.arguments import OUTPUT, option
 from kontronik_can_gw.desk.recordings.inputs import open_bytes
 
 OPTIONS = (
     option("FILE", "file or pipe of UART bytes, or - for standard input"),
     option("--csv", "CSV with a header instead of JSON lines"),
+    *OUTPUT,
 )
 EPILOG = """\
-Short for kontronik-can-gw convert FILE - --to jsonl (or csv), except that FILE is read as the bytes of one ESC, whatever its
-content is: a row for each live frame, with all values. If it has no frame, a line describes the bytes. The bytes of a pipe are
-decoded as they arrive.
+Decodes like kontronik-can-gw convert FILE - --to jsonl (or csv), but takes
+FILE for the bytes of one ESC, whatever it holds. There is a row for each live
+frame, with all values. If no frame is found, a line describes the bytes. The
+bytes of a pipe are decoded as they arrive.
 
 examples:
   kontronik-can-gw decode esc.bin --csv
   cat esc.bin | kontronik-can-gw decode -
 
-exit codes: 0 decoded, even if a part of FILE is damaged; 1 no frame is found, or something cannot be read or written; 2 wrong usage;
-130 stopped by a signal
+exit codes: 0 decoded, also if a part of FILE is damaged; 1 no frame is found,
+or the output cannot be written; 2 wrong usage, or FILE cannot be opened; 130
+stopped by a signal
 """
 
 
 def main(args: argparse.Namespace) -> int:
-    """Decode args.file. RunError where something cannot be opened, read or written."""
+    """Decode args.file. RunError if nothing is found, or the output cannot be written."""
     form = "csv" if args.csv else "jsonl"
-    given = make_parser(["convert"]).parse_args(["convert", "--to", form, "--", args.file, "-"])
+    given = make_parser(["convert"]).parse_args(["convert", "--to", form, "--", args.file])
+    given.output, given.force = args.output, args.force
     given.command = args.command
     return convert.main(given, open_bytes)

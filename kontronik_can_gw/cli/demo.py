@@ -18,8 +18,8 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = (
-    "A simulated ESC with simulated faults, the gateway, and the monitor, which knows the DBC. "
-    "Exit code: 0 at its end, 2 wrong usage. The same with ports and a bus: simulate, run, monitor."
+    "A simulated ESC with simulated faults, the gateway, and the monitor, which has the DBC. "
+    "With ports and a bus, use simulate, run and monitor. Exit code: 0 at its end, 2 wrong usage."
 )
 
 

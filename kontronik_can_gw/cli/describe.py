@@ -6,7 +6,8 @@ from pathlib import Path
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cli.arguments import OUTPUT, option
 from kontronik_can_gw.cli.common import announced_config, load_all
-from kontronik_can_gw.cli.desk import bus_layout, write_output
+from kontronik_can_gw.cli.desk import bus_layout
+from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
 from kontronik_can_gw.desk.describe.markdown import Table, markdown
@@ -21,17 +22,21 @@ OPTIONS = (
         option("--dbc FILE", "another DBC than the shipped one", type=Path),
     ),
     option("--format", "default: md", choices=("md", "json"), default="md"),
-    OUTPUT,
+    *OUTPUT,
 )
 # fmt: on
 EPILOG = """\
-Messages and signals of the DBC in use, the CANopen nodes with their objects and emergencies, values, error bits and states with
-meaning and remedy. With -c, or where there is a gateway.toml, as that
-configuration sends them. Otherwise, and with --dbc, of the shipped EDS, node-IDs from 1, and that DBC or the shipped one.
+Describes the messages and signals of the DBC in use, the CANopen nodes with
+their objects and emergencies, all values, and error bits and states with
+meaning and remedy. With -c, or if there is a gateway.toml, as that
+configuration sends them. Otherwise, and with --dbc, with the shipped EDS,
+node-IDs from 1, and the given or the shipped DBC.
 
-md is for a repository or wiki, json for programs (its keys only change with "version").
+md is for a repository or wiki, json for programs (its keys only change with
+"version").
 
-exit codes: 0 done, 1 the output cannot be written, 2 wrong usage, configuration, DBC or EDS
+exit codes: 0 done; 1 the output cannot be written; 2 wrong usage,
+configuration, DBC or EDS
 """
 _TITLE = "What the gateway sends and what it means"
 
@@ -44,7 +49,8 @@ def main(args: argparse.Namespace) -> int:
         facts = {table.title.lower().replace(" ", "_"): table.rows for table in tables}
         head = {"format": "kontronik-can-gw description", "version": 2, "program": __version__}
         text = printable_json({**head, **facts}, indent=2, allow_nan=False) + "\n"
-    write_output(args.output, printable(text, keep="\n\t"))
+    inputs = configuration_files(args.config, args.dbc)
+    write_output(args.output, printable(text, keep="\n\t"), inputs, force=args.force)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Shared by commands of the desk: recordings, the layout that ``-c`` or ``--dbc`` names, ``-o``, progress, pseudo terminals."""
+"""Shared by commands of the desk: recordings, the layout that ``-c`` or ``--dbc`` names, progress, pseudo terminals."""
 
 import argparse
 import sys
@@ -7,14 +7,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from kontronik_can_gw.cli.common import announced_config, load_all, say, stopping_on_signals
+from kontronik_can_gw.cli.common import announced_config, load_all, stopping_on_signals
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.desk.recordings.convert import Output
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.stream import Stream
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable
 
 _Block = TypeVar("_Block", bound=Sized)
@@ -51,8 +50,8 @@ def reading(
 ) -> Iterator[Input]:
     """An open recording.
 
-    SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, unless the recording is a stream: they end it, so that its data so far can be
-    used. ``was_ended`` is true afterwards.
+    SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, unless the recording is a stream: they end
+    it, so that its data so far can be used. ``was_ended`` is true afterwards.
     """
     stream: Stream | None = None
 
@@ -69,21 +68,6 @@ def reading(
 def was_ended(recording: Input) -> bool:
     """True if a signal ended the stream that is this recording."""
     return recording.stream is not None and recording.stream.is_ended
-
-
-def write_output(where: str, text: str, encoding: str = "utf-8") -> None:
-    """Write text to a file and say so, or to standard output for ``-``; line ends stay. RunError where it cannot be written."""
-    if where == "-":
-        shown = printable(text, keep="\r\n\t") if sys.stdout.isatty() else text
-        sys.stdout.buffer.write(shown.encode(encoding))
-        return
-    try:
-        with Output(Path(where), what="-o") as out:
-            out.open().write(text.encode(encoding))
-            out.is_whole = True
-    except OSError as error:
-        raise RunError(f"{where}: cannot be written: {error.strerror}. Give another -o.") from None
-    say(f"{where} written")
 
 
 def watched(blocks: Iterable[_Block], name: str, data_on_screen: bool) -> Iterator[_Block]:

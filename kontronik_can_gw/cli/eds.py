@@ -12,7 +12,7 @@ from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.storage import VERIFY
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all
-from kontronik_can_gw.cli.desk import write_output
+from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -23,7 +23,7 @@ _NODE_ID = number_from(1, 127, "node-ID", kind=lambda text: int(text, 0))
 OPTIONS = (
     option("-c --config FILE", "the EDS and the nodes of this configuration (default: those of gateway.toml, else shipped)", type=Path),
     option("--node-id N", "write the DCF of the node with this node-ID: the EDS and its values", type=_NODE_ID),
-    OUTPUT,
+    *OUTPUT,
 )
 # fmt: on
 EPILOG = (
@@ -47,7 +47,8 @@ def main(args: argparse.Namespace) -> int:
     text = setup.eds.data.decode("latin-1")  # keeps all bytes
     if args.node_id is not None:
         text = _dcf(setup, escs, args.node_id, Path(args.output).name)
-    write_output(args.output, text, "latin-1")
+    inputs = configuration_files(path)
+    write_output(args.output, text, inputs, force=args.force, encoding="latin-1")
     return 0
 
 

@@ -1,17 +1,17 @@
 """``init``: writes the commented example configuration."""
 
 import argparse
-import sys
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import option
+from kontronik_can_gw.cli.arguments import FORCE, option
 from kontronik_can_gw.cli.common import say
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.cli.output import output_of, write_output
 
 # fmt: off
 OPTIONS = (
-    option("FILE", "where to (default gateway.toml; - for standard output)", nargs="?", default="gateway.toml"),
-    option("--force", "replace a file that exists"),
+    option("FILE", "file to write (default: gateway.toml), or - for standard output", nargs="?"),
+    option("-o --output FILE", "another way to give FILE"),
+    FORCE,
 )
 # fmt: on
 EPILOG = "Exit code: 0 written, 1 it cannot be written, 2 the file exists, or wrong usage."
@@ -23,17 +23,8 @@ def example() -> str:
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.file == "-":
-        sys.stdout.write(example())
-        return 0
-    try:
-        with Path(args.file).open("w" if args.force else "x", encoding="utf-8") as file:
-            file.write(example())
-    except FileExistsError:
-        raise UserError(
-            f"{args.file}: exists. Give another name, or --force to replace it."
-        ) from None
-    except OSError as error:
-        raise RunError(f"{args.file}: cannot be written: {error.strerror}") from None
-    say(f"{args.file} written. Edit it, then: kontronik-can-gw check -c {args.file}")
+    output = output_of(args, "FILE", "gateway.toml")
+    write_output(output, example(), force=args.force)
+    if output != "-":
+        say(f"Edit it, then: kontronik-can-gw check -c {output}")
     return 0

@@ -59,7 +59,8 @@ while no frames come; "problem" is the reason, if it is known. Values are in the
 units of "units", and null if they are not available.
 
 exit codes: 0 ended by a key or signal, end of a recording, or --once with
-values; 1 no frame came (--once), or something cannot be opened; 2 wrong usage
+values; 1 no frame came (--once), or the bus cannot be opened; 2 wrong usage, or
+the recording cannot be opened
 """
 
 

@@ -48,22 +48,27 @@ OPTIONS = (
 # fmt: on
 _ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}
 EPILOG = """\
-FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run) or a file of plain UART
-bytes. A capture is replayed through the gateway's core with the recorded clock: frames and times equal those of the live
-gateway bit for bit.
+FILE is a capture (.kcap; a folder or a common prefix of file names stands for
+all parts of one run) or a file of plain UART bytes. A capture is replayed
+through the gateway's core with the recorded clock: frames and times equal the
+live gateway's bit for bit.
 
---on can  sends the frames on a CAN bus. The gateway's state in them is set to Replay (GatewayState), since they are old;
-          with --unmarked they are sent exactly as recorded. Refused while a gateway on this machine sends the same messages.
-          Frames that the gateway had received are not sent. A CAN log is sent by canplayer of can-utils.
---on pty  plays an ESC's bytes on a pseudo terminal, one for each ESC, for a gateway to read: prints "esc1 /dev/pts/5".
+--on can  sends the frames on a CAN bus. The gateway's state in them
+          (GatewayState) is set to Replay, because they are old. With
+          --unmarked they are sent exactly as recorded. Refused while a gateway
+          on this machine sends the same messages. Frames that the gateway had
+          received are not sent. canplayer of can-utils sends a CAN log.
+--on pty  plays the bytes of each ESC on a pseudo terminal of its own, for a
+          gateway to read, and prints its name: "esc1 /dev/pts/5".
 
-A log of the frames is made by kontronik-can-gw convert FILE flight.log.
+kontronik-can-gw convert FILE flight.log makes a log of the frames.
 
 examples:
   kontronik-can-gw replay flight.kcap --on can --channel vcan0
   kontronik-can-gw replay flight.kcap --on pty --link /tmp/esc{n} --speed 4
 
-exit codes: 0 done, 1 failed while running, 2 wrong usage, or a file that is no recording
+exit codes: 0 done; 1 failed while running; 2 wrong usage, or FILE cannot
+be opened or is not a recording
 """
 
 

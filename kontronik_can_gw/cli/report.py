@@ -3,11 +3,17 @@
 import argparse
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, LOG_CHANNEL, number_from, option
+from kontronik_can_gw.cli.arguments import FORCE, LAYOUT, LOG_CHANNEL, number_from, option
 from kontronik_can_gw.cli.common import say
-from kontronik_can_gw.cli.desk import given_layout, reading, was_ended, watched, write_output
+from kontronik_can_gw.cli.desk import given_layout, reading, was_ended, watched
+from kontronik_can_gw.cli.output import (
+    check_output,
+    configuration_files,
+    recording_files,
+    write_output,
+)
 from kontronik_can_gw.desk.recordings.inputs import Input
-from kontronik_can_gw.desk.recordings.stream import is_standard_input, name_of
+from kontronik_can_gw.desk.recordings.stream import name_of
 from kontronik_can_gw.desk.report.flight import Flight, needed_columns
 from kontronik_can_gw.desk.report.page import render
 from kontronik_can_gw.errors import RunError, UserError
@@ -19,7 +25,7 @@ _SECONDS = number_from(0, 1e9)
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
     option("-o --output FILE", "page to write, or - for standard output", required=True),
-    option("--force", "replace FILE if it exists"),
+    FORCE,
     LAYOUT,
     LOG_CHANNEL,
     option("--from S", "begin at this time in seconds after the start", type=_SECONDS, dest="start"),
@@ -27,22 +33,25 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = """\
-IN is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
-bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). For a CAN log give the DBC of its frames with -c or --dbc.
-It may be a pipe. Ctrl-C then ends the input, and the page shows the data so far.
+IN is a capture (.kcap; a folder or a common prefix of file names stands for
+all parts of one run), a file of plain UART bytes, or a CAN log (candump, ASC,
+BLF, TRC, MF4). For a CAN log give the DBC of its frames with -c or --dbc. IN
+may be a pipe: Ctrl-C then ends the input, and the page shows the data so far.
 
-The page is one file that needs no network: plots with zoom, the operating states, errors with meaning and remedy, and the
-numbers (energy, charge, extremes with their time, cell voltage sag, quality of the data). Several ESCs share the plots.
-Numbers and events are from every row. Lines are reduced to 20 000 points in a way that keeps every peak and every gap.
-The same recording gives the same page, byte for byte (where the same core plays it). A file that exists is only replaced with --force.
+The page is one file that needs no network: plots with zoom, the operating
+states, errors with meaning and remedy, and the numbers (energy, charge,
+extremes with their times, cell voltage sag, quality of the data). Several ESCs
+share the plots. Numbers and events come from every row. Lines are reduced to
+20 000 points in a way that keeps every peak and every gap. The same recording
+gives the same page, byte for byte, if the same core plays it.
 
 examples:
   kontronik-can-gw report flight.kcap -o flight.html
   kontronik-can-gw report bus.log -c gateway.toml -o bus.html
   kontronik-can-gw report flight.kcap -o part.html --from 60 --until 90
 
-exit codes: 0 done, 1 something cannot be read or written, or has no values; 2 wrong usage, or a file that is not a recording;
-130 stopped by a signal
+exit codes: 0 done; 1 IN has no values, or FILE cannot be written; 2 wrong
+usage, or IN cannot be opened or is not a recording; 130 stopped by a signal
 """
 
 
@@ -51,19 +60,20 @@ def main(args: argparse.Namespace) -> int:
     if args.start is not None and args.end is not None and args.end <= args.start:
         raise UserError(f"--until {args.end:g}: must be greater than --from {args.start:g}")
     source = Path(args.input)
-    _check_target(source, args.output, force=args.force)
+    inputs = [*recording_files(source), *configuration_files(args.config, args.dbc)]
+    check_output(args.output, inputs, force=args.force)
     try:
         with reading(source, given_layout(args)) as recording:
             if args.channel is not None:
                 recording.select_channel(args.channel)
-            _write_page(args, recording)
+            _write_page(args, recording, inputs)
             return _STOPPED if was_ended(recording) else 0
     except KeyboardInterrupt:
         say("stopped: nothing is written")
         return _STOPPED
 
 
-def _write_page(args: argparse.Namespace, recording: Input) -> None:
+def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) -> None:
     """Write the page and report what is damaged or left out. RunError if there is nothing to show."""
     source = name_of(Path(args.input))
     flight = _analysed(recording, args)
@@ -84,29 +94,12 @@ def _write_page(args: argparse.Namespace, recording: Input) -> None:
         wall_ns=recording.wall_ns(flight.origin_ns),
         damage=recording.damage,
     )
-    write_output(args.output, page)
+    write_output(args.output, page, inputs, force=args.force)
     if recording.left_out:
         damage.append(f"{source}: {recording.left_out}")
     damage += [f"{source}: {note}" for note in recording.clock_notes]
     for line in damage:
         say(line, "report")
-
-
-def _check_target(source: Path, output: str, *, force: bool) -> None:
-    """UserError where the page cannot be written, or exists."""
-    if output == "":
-        raise UserError("-o: is empty. Give a file, or - for standard output.")
-    target = Path(output)
-    if is_standard_input(source):
-        source = Path("/dev/stdin")
-    if output == "-" or not target.exists():
-        return
-    if source.exists() and target.samefile(source):
-        raise UserError(f"-o {output}: is the input. Give another file.")
-    if target.is_dir():
-        raise UserError(f"-o {output}: is a folder. Give a file.")
-    if target.is_file() and not force:
-        raise UserError(f"{output}: exists. Give another -o, or --force.")
 
 
 def _analysed(recording: Input, args: argparse.Namespace) -> Flight:

@@ -3,12 +3,17 @@
 import argparse
 import json
 
+from kontronik_can_gw.cli.arguments import OUTPUT
+from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.export import schema
 
-OPTIONS = ()
-EPILOG = "Editors with TOML support (taplo, Even Better TOML) check and complete gateway.toml with it. Exit code: 0."
+OPTIONS = OUTPUT
+EPILOG = (
+    "Editors with TOML support (taplo, Even Better TOML) check and complete gateway.toml with it. "
+    "Exit code: 0 done, 1 it cannot be written, 2 wrong usage."
+)
 
 
-def main(_args: argparse.Namespace) -> int:
-    print(json.dumps(schema(), indent=2))
+def main(args: argparse.Namespace) -> int:
+    write_output(args.output, json.dumps(schema(), indent=2) + "\n", force=args.force)
     return 0

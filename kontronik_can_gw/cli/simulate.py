@@ -4,14 +4,12 @@ import argparse
 import re
 import sys
 from argparse import ArgumentTypeError
-from contextlib import nullcontext
-from pathlib import Path
 from threading import Event
 
-from kontronik_can_gw.cli import discard_output
-from kontronik_can_gw.cli.arguments import number_from, option
+from kontronik_can_gw.cli.arguments import FORCE, number_from, option
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.cli.desk import terminals
+from kontronik_can_gw.cli.output import check_output, writing
 from kontronik_can_gw.desk.pty import run
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.esc.kontronik.simulator import (
@@ -66,12 +64,14 @@ def _error(text: str) -> ErrorWindow:
 OPTIONS = (
     "what ESC",
     option("--esc N", "number of ESCs, 1..1000 (default 1)", type=number_from(1, 1000, "number of ESCs", kind=int), default=1),
-    option("--device", "default: kosmik, in the legacy layout jivepro", choices=tuple(_DEVICES)),
+    option("--device NAME", f"{', '.join(_DEVICES)} (default: kosmik, in the legacy layout jivepro)", choices=tuple(_DEVICES)),
     option("--layout", "default: legacy for jivepro, else v4", choices=("v4", "legacy")),
     option("--seed N", "seed of all that is random (default 0)", type=int, default=0),
     "where to, and how long",
     option("--link PATH", "symbolic link to the pseudo terminal; {n} is the ESC's number, from 1"),
-    option("--out FILE", "write the bytes to FILE (- for standard output) as fast as possible, no pseudo terminal; {n} as for --link"),
+    option("-o --output --out FILE", "write the bytes to FILE (- for standard output) as fast as possible, without a pseudo "
+           "terminal; {n} as for --link"),
+    FORCE,
     option("--seconds TIME", "stop after this time", type=_time_ns),
     "misbehaviour",
     option("--flip-bits SHARE", "share of bits that are flipped, as 0.0001", type=number_from(0, 1, "share, as 0.0001"), default=0.0),
@@ -81,34 +81,37 @@ OPTIONS = (
 )
 # fmt: on
 EPILOG = """\
-Prints a line "esc1 /dev/pts/5" for each ESC on standard output, then sends until SIGINT, SIGTERM or --seconds.
-The same options and seed give the same bytes. Each ESC of several has a seed of its own (N, N+1, ...).
-Whatever a gateway sends to the ESC, an echo included, is reported as an error (exit code 1): a real ESC could take
-it for a command.
+Prints a line "esc1 /dev/pts/5" for each ESC on standard output, then sends
+until SIGINT, SIGTERM or --seconds. The same options and seed give the same
+bytes. With several ESCs, each has a seed of its own (N, N+1, ...). If a gateway
+sends anything to the ESC, even an echo, this is an error (exit code 1): a real
+ESC could take it for a command.
 
 TIME is 5s, 200ms, 2min or a number of seconds.
-Error names are those that decode prints, such as undervoltage or test_short_to_ground.
+Error names are those that decode prints, such as undervoltage or
+test_short_to_ground.
 
 examples:
   kontronik-can-gw simulate --esc 2 --link /tmp/esc{n}
-  kontronik-can-gw simulate --device jivepro --error undervoltage@5s+2s --dropout 2s/10s
-  kontronik-can-gw simulate --seconds 60 --out flight.bytes
+  kontronik-can-gw simulate --error undervoltage@5s+2s --dropout 2s/10s
+  kontronik-can-gw simulate --seconds 60 -o flight.bytes
 
-exit codes: 0 done, 1 failed while running or a gateway transmitted, 2 wrong usage
+exit codes: 0 done; 1 failed while running, or a gateway transmitted; 2 wrong
+usage
 """
 
 
 def main(args: argparse.Namespace) -> int:
     """Simulate. UserError for wrong usage, RunError if a gateway transmitted or a file failed."""
-    for name, path in (("--link", args.link), ("--out", args.out)):
+    for name, path in (("--link", args.link), ("-o", args.output)):
         if path is not None and args.esc > 1 and "{n}" not in path:
             raise UserError(
                 f"{name} {path}: needs {{n}} in the path, for the number of each of the {args.esc} ESCs."
             )
-    if args.out is not None and args.seconds is None:
-        raise UserError(f"--out {args.out}: has no end. Give --seconds.")
-    if args.out is not None and args.link is not None:
-        raise UserError("--link: there is no pseudo terminal with --out. Give one of the two.")
+    if args.output is not None and args.seconds is None:
+        raise UserError(f"-o {args.output}: has no end. Give --seconds.")
+    if args.output is not None and args.link is not None:
+        raise UserError("--link: there is no pseudo terminal with -o. Give one of the two.")
     device = args.device or ("jivepro" if args.layout == "legacy" else "kosmik")
     options = EscOptions(
         device=_DEVICES[device],
@@ -120,34 +123,30 @@ def main(args: argparse.Namespace) -> int:
         SimulatedEsc(options, args.seed + index, options.period_ns * index // args.esc)
         for index in range(args.esc)
     ]
-    if args.out is not None:
-        _to_files(escs, args.out, args.seconds)
+    if args.output is not None:
+        _to_files(escs, args.output, args.seconds, force=args.force)
     else:
         _to_terminals(escs, args.link, args.seconds)
     return 0
 
 
-def _to_files(escs: list[SimulatedEsc], path: str, time_ns: int) -> None:
-    for index, esc in enumerate(escs):
-        name = path.replace("{n}", str(index + 1))
-        try:
-            with nullcontext(sys.stdout.buffer) if path == "-" else Path(name).open("wb") as file:
-                total = frames = 0
-                begin, end = esc.next_ns, esc.next_ns + time_ns
-                while begin < end:  # in steps of a minute, so that a year fits
-                    begin = min(begin + 60 * SECOND_NS, end)
-                    for sent in esc.frames_until(begin - 1):
-                        file.write(sent.wire)
-                        total += len(sent.wire)
-                        frames += 1
-                file.flush()
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            if path == "-":
-                discard_output()
-            raise RunError(f"--out {name}: cannot be written: {error.strerror}.") from None
-        print(f"esc{index + 1}: {frames} frames, {total} bytes to {name}", file=sys.stderr)
+def _to_files(escs: list[SimulatedEsc], output: str, time_ns: int, *, force: bool) -> None:
+    names = [output.replace("{n}", str(number)) for number in range(1, len(escs) + 1)]
+    for name in names:
+        check_output(name, (), force=force)
+    for number, (esc, name) in enumerate(zip(escs, names, strict=True), 1):
+        total = frames = 0
+        with writing(name) as out:
+            file = out.open()
+            begin, end = esc.next_ns, esc.next_ns + time_ns
+            while begin < end:  # in steps of a minute, so that a year fits
+                begin = min(begin + 60 * SECOND_NS, end)
+                for sent in esc.frames_until(begin - 1):
+                    file.write(sent.wire)
+                    total += len(sent.wire)
+                    frames += 1
+            out.is_whole = True
+        print(f"esc{number}: {frames} frames, {total} bytes to {name}", file=sys.stderr)
 
 
 def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | None) -> None:

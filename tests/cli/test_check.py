@@ -95,7 +95,7 @@ def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another
 
 
 @pytest.mark.rights
-@pytest.mark.parametrize(("code", "words"), [(2, "check"), (1, "decode gateway.toml")])
+@pytest.mark.parametrize(("code", "words"), [(2, "check"), (2, "decode gateway.toml")])
 def test_what_may_not_be_read_is_one_line(
     places: tuple[Path, Path], code: int, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

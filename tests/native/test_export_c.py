@@ -62,17 +62,20 @@ def test_the_command_writes_what_a_configuration_sends(
     own = folder / "example_main.c"
     own.write_text("int main(void) { return 0; }\n")
     (folder / "tables.h").write_text(header.replace("rear", "back"))
-    assert main(["export", "c", "-c", str(config), str(folder)]) == 0
+    assert main(["export", "c", "-c", str(config), str(folder)]) == 2
+    assert main(["export", "c", "-c", str(config), "-o", str(folder), "--force"]) == 0
     assert own.read_text().startswith("int main")
     assert (folder / "tables.h").read_text() == header
 
 
-def test_files_of_others_are_never_replaced(
+def test_files_that_exist_are_only_replaced_with_force(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "README.md").write_text("# My firmware\n")
     assert main(["export", "c", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.endswith("README.md: exists. Give another folder.\n")
+    assert capsys.readouterr().err.endswith(
+        "README.md: exists. Give another name, or --force to replace it.\n"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
     assert main(["export", "c", str(tmp_path / "README.md")]) == 1
 

@@ -16,7 +16,7 @@ from kontronik_can_gw.core import PythonCore
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.recordings.stream import Stream, StreamReader
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import MS
@@ -82,7 +82,7 @@ class BytesInput(PlayedInput):
                 while data := file.read1(CHUNK):
                     yield data
         except OSError as error:
-            raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
+            raise UserError(f"{self._path}: cannot be opened: {error.strerror}.") from None
 
     def _open(self) -> BufferedReader:
         return self._path.open("rb") if self.stream is None else StreamReader(self.stream)

@@ -35,7 +35,7 @@ _CAPTURE, _BYTES = "capture", "bytes"
 
 
 def open_input(path: Path, layout: BusLayout | None = None) -> Input:
-    """Open a recording. UserError if it is not a recording, RunError if it cannot be read.
+    """Open a recording. UserError if it is missing, cannot be opened or is not a recording.
 
     ``path``: a file, a named pipe, or ``-`` for standard input. A folder of captures, or the common prefix of their names, stands for
     all parts of one run. ``layout``: of the frames in a CAN log and of those made from plain bytes, by default the shipped DBC of one
@@ -59,7 +59,7 @@ def _open_file(path: Path, layout: BusLayout | None) -> Input:
         with path.open("rb") as file:
             head = file.read(HEAD)
     except OSError as error:
-        raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
+        raise UserError(f"{path}: cannot be opened: {error.strerror}.") from None
     found = _format_of(head, str(path), is_capture=path.suffix == SUFFIX)
     if found == _CAPTURE:
         return CaptureInput([path], layout)
@@ -154,7 +154,7 @@ def _parts(path: Path) -> list[Path] | None:
         every = path.parent.glob(f"*{SUFFIX}") if path.name else ()
         found = sorted(part for part in every if part.name.startswith(path.name))
         if not found:
-            raise RunError(f"{path}: there is no such file.")
+            raise UserError(f"{path}: there is no such file.")
     else:
         return None
     runs = list(dict.fromkeys(p.name.removesuffix(SUFFIX).rpartition("-")[0] for p in found))

@@ -99,7 +99,7 @@ class CanLogInput(Input):
                 else StreamReader(self.stream)
             )
         except OSError as error:
-            raise RunError(f"{self._path}: cannot be opened: {error.strerror}.") from None
+            raise UserError(f"{self._path}: cannot be opened: {error.strerror}.") from None
         self._reader = _reader_of(self._format)(self._file)
         self._clock = LogClock(self._reader, is_live=self.stream is not None)
 

@@ -115,7 +115,11 @@ def open_stream(path: Path) -> Stream | None:
                 f"{name_of(path)}: is a terminal or another device. Send the data through a pipe: COMMAND | kontronik-can-gw …"
             )
         return Stream(os.dup(0), name_of(path))
-    if not path.exists() or path.is_file() or path.is_dir():
+    try:
+        is_stream = path.exists() and not path.is_file() and not path.is_dir()
+    except OSError as error:  # a folder on the way is closed, or the name is too long
+        raise UserError(f"{path}: cannot be opened: {error.strerror}.") from None
+    if not is_stream:
         return None
     if not path.is_fifo():
         raise UserError(
@@ -124,7 +128,7 @@ def open_stream(path: Path) -> Stream | None:
     try:
         return Stream(os.open(path, os.O_RDONLY), str(path))
     except OSError as error:
-        raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
+        raise UserError(f"{path}: cannot be opened: {error.strerror}.") from None
 
 
 def is_standard_input(path: Path) -> bool:

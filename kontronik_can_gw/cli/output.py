@@ -1,0 +1,124 @@
+"""Output files: the one rule of all commands, and writing by it.
+
+1. A file that exists is replaced only with ``--force``.
+2. A file that the command reads is never written over, also not through a link or with ``--force``.
+3. A file takes its name when it is complete. If writing fails or a signal ends it, no part of it stays.
+4. A pipe or a device is written to as it stands. ``-`` is standard output.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from kontronik_can_gw.cli import discard_output, say
+from kontronik_can_gw.cli.common import stopping_on_signals
+from kontronik_can_gw.config.parse import load
+from kontronik_can_gw.desk.recordings.convert import Output
+from kontronik_can_gw.desk.recordings.stream import is_standard_input
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable
+
+
+def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
+    """UserError if a file must not be written. ``inputs`` are the files that the command reads."""
+    if not output.strip():
+        raise UserError("-o: is empty. Give a file, or - for standard output.")
+    if output == "-":
+        return
+    target = Path(output)
+    part = Path(f"{target}.part")  # exists while the file is being written
+    for path in inputs:
+        for written in (target, part):
+            with suppress(OSError):
+                if written.samefile(path):
+                    raise UserError(
+                        f"{output}: would write over the input {path}. Give another name."
+                    )
+    try:
+        is_folder, is_file = target.is_dir(), target.is_file()
+    except OSError as error:  # for example: the name is too long
+        raise RunError(f"{output}: cannot be written: {error.strerror}.") from None
+    if is_folder:
+        raise UserError(f"{output}: is a folder. Give a file.")
+    if is_file and not force:
+        raise UserError(f"{output}: exists. Give another name, or --force to replace it.")
+
+
+def configuration_files(config: Path | None, dbc: Path | None = None) -> list[Path]:
+    """Return the files that are read for ``-c`` and ``--dbc``: with a configuration its DBC and its EDS, too."""
+    found = [] if dbc is None else [dbc]
+    if config is not None:
+        loaded = load(config)
+        found += [config, loaded.dbc_path, loaded.eds_path]
+    return found
+
+
+def recording_files(path: Path) -> list[Path]:
+    """Return the files that a recording may consist of: a file, a folder of parts, or all files that begin so."""
+    if is_standard_input(path):
+        return [Path("/dev/stdin")]
+    with suppress(OSError):  # opening it reports the reason
+        if path.is_file():
+            return [path]
+        folder, beginning = (path, "") if path.is_dir() else (path.parent, path.name)
+        return [each for each in folder.iterdir() if each.name.startswith(beginning)]
+    return []
+
+
+def output_of(args: argparse.Namespace, name: str, default: str | None = None) -> str:
+    """Return the output that ``-o`` or the argument ``name`` gives. UserError for both, or neither without a default."""
+    given = [each for each in (args.output, getattr(args, name.lower())) if each is not None]
+    if len(given) > 1:
+        raise UserError(f"{name} and -o: are two outputs. Give one of them.")
+    if not given and default is None:
+        raise UserError(f"there is no output. Give {name}, or -o {name}.")
+    return str(given[0]) if given else str(default)
+
+
+@contextmanager
+def writing(
+    output: str, *, keeps_part: bool = False, handles_signals: bool = True
+) -> Iterator[Output]:
+    """Write an output. RunError if it cannot be written.
+
+    ``keeps_part``: if writing fails, OUT.part stays. ``handles_signals``: SIGTERM, SIGINT and
+    SIGHUP raise KeyboardInterrupt; otherwise the caller handles them.
+    """
+    out = Output(None if output == "-" else Path(output))
+    out.keeps_part = keeps_part
+    try:
+        with ExitStack() as stack:
+            if handles_signals:
+                stack.enter_context(stopping_on_signals(_interrupt))
+            stack.enter_context(out)
+            yield out
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        where = output
+        if output == "-":
+            where = "standard output"
+            discard_output()  # or what is buffered is tried again at the end
+        kept = f" The data so far are in {out.kept_part}." if out.kept_part else ""
+        raise RunError(f"{where}: cannot be written: {error.strerror}.{kept}") from None
+
+
+def write_output(
+    output: str, text: str, inputs: Iterable[Path] = (), *, force: bool, encoding: str = "utf-8"
+) -> None:
+    """Write text to a file and report that, or to standard output for ``-``. Line ends stay as they are."""
+    check_output(output, inputs, force=force)
+    if output == "-":
+        shown = printable(text, keep="\r\n\t") if sys.stdout.isatty() else text
+        sys.stdout.buffer.write(shown.encode(encoding))
+        return
+    with writing(output) as out:
+        out.open().write(text.encode(encoding))
+        out.is_whole = True
+    say(f"{output} written")
+
+
+def _interrupt() -> None:
+    raise KeyboardInterrupt

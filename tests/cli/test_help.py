@@ -1,0 +1,91 @@
+"""The text of --help, what a mistyped command line is told, and that all descriptions name what the program does."""
+
+import argparse
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command_line import run
+
+from kontronik_can_gw.cli import COMMANDS, make_parser
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """A parser and those of all its commands and actions."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                yield from parsers(sub)
+
+
+@pytest.fixture(autouse=True)
+def columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+
+
+EVERY = list(parsers(make_parser()))
+
+
+@pytest.mark.parametrize("parser", EVERY, ids=lambda parser: parser.prog)
+def test_help_fits_80_columns_and_has_a_description(parser: argparse.ArgumentParser) -> None:
+    text = parser.format_help()
+    assert [line for line in text.splitlines() if len(line) > 80] == []
+    assert parser.description and parser.description.endswith(".")
+    assert not re.search(r"  the same$|^The same as", text, re.MULTILINE), "before its referent"
+
+
+def test_every_command_is_looked_at() -> None:
+    assert {f"kontronik-can-gw {name}" for name in COMMANDS} <= {each.prog for each in EVERY}
+    assert "kontronik-can-gw service install" in {each.prog for each in EVERY}
+
+
+def test_dronecan_is_named_wherever_the_program_is_described() -> None:
+    texts = {
+        "help": make_parser().description or "",
+        "run": COMMANDS["run"],
+        "package": (ROOT / "deb" / "control").read_text().partition("Description:")[2],
+        "manual page": (ROOT / "deb" / "make_deb.py").read_text().partition('"--description", ')[2][:99],
+        "project": re.findall("(?m)^description = .*", (ROOT / "pyproject.toml").read_text())[0],
+    }  # fmt: skip
+    assert [name for name, text in texts.items() if "DroneCAN" not in text] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "usage", "said"),
+    [
+        ("statsu", "", "there is no 'statsu'. Did you mean status?"),
+        ("mointor vcan0", "", "there is no 'mointor'. Did you mean monitor?"),
+        ("frobnicate", "", "there is no 'frobnicate'. Known: demo, run, "),
+        ("run --wiat", " run", "unrecognized arguments: --wiat. Did you mean --wait?"),
+        ("eds --nodeid=3", " eds", "--nodeid=3. Did you mean --node-id?"),
+        ("convert a b c", " convert", "unrecognized arguments: c"),
+        ("service instal", " service", "there is no 'instal'. Did you mean install?"),
+        ("service install --now --rot x", " service install", "Did you mean --root?"),
+        ("describe --format jsn", " describe", "there is no 'jsn'. Did you mean json?"),
+    ],
+)
+def test_a_mistyped_command_line_shows_its_usage_and_what_was_meant(
+    words: str, usage: str, said: str
+) -> None:
+    done = run(*words.split())
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith(f"usage: kontronik-can-gw{usage} [-h] ")
+    assert f"kontronik-can-gw{usage}: error: " in done.err and said in done.err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_unknown_option_shows_the_usage_of_the_command(name: str) -> None:
+    given = {"service": ["install"], "completion": ["bash"], "export": ["c"]}
+    required = {"report": ["x", "-o", "-"], "replay": ["x", "--on", "can"]}
+    needed = given.get(name, []) + required.get(
+        name, ["x"] if name in ("convert", "decode") else []
+    )
+    done = run(name, *needed, "--no-such-option")
+    place = f"{name} install" if name == "service" else name
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith(f"usage: kontronik-can-gw {place} [-h]")
+    assert "unrecognized arguments: --no-such-option" in done.err
