@@ -139,11 +139,13 @@ def json_payload(content: Mapping[str, Any]) -> bytes:
 
 
 def read_json(payload: bytes) -> dict[str, Any]:
-    """The content of a header or information block. ValueError where it is no JSON object."""
+    """Return the content of a header or information block. ValueError, for users, if it is no JSON object."""
     try:
         content = json.loads(payload.decode("utf-8", "surrogatepass"))
     except RecursionError:
         raise ValueError("is nested too deep") from None
+    except ValueError:  # its text would be Python's
+        raise ValueError("is no JSON text in UTF-8") from None
     if not isinstance(content, dict):
         raise ValueError("is no JSON object")
     return content

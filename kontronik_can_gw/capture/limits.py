@@ -12,6 +12,10 @@ MAX_COUNT = 1 << 48
 _MAX_MW_NS = MAX_COUNT * 1_000_000_000
 
 
+class HeaderError(ValueError):
+    """A header that no recorder has written. The text is for users."""
+
+
 def check_time(time_ns: int) -> None:
     """ValueError for a time that no gateway has."""
     if not 0 <= time_ns < END_OF_TIME:
@@ -28,11 +32,11 @@ def check_counters(counters: Sequence[int]) -> None:
 
 
 def whole_number(value: Any, low: int, high: int) -> int:
-    """A number of a header. ValueError if it is none from ``low`` to ``high``."""
+    """Return a number of a header. HeaderError if it is not a whole number in this range."""
     if isinstance(value, str) and len(value) < 20 and value.isdecimal():
         value = int(value)
     if type(value) is not int or not low <= value <= high:
-        raise ValueError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
+        raise HeaderError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
     return value
 
 
@@ -41,7 +45,7 @@ _LIMITS_OF_GATEWAY = {"started_ns": END_OF_TIME - 1, "can_state": 5}
 
 
 def check_state(state: Mapping[str, Any]) -> None:
-    """ValueError for a state (in a header, or a STATE entry) that no gateway has."""
+    """HeaderError for a state (in a header, or a STATE entry) that no gateway has."""
     for esc in state.get("escs", ()):
         for name, high in _LIMITS_OF_ESC.items():
             whole_number(esc[name], 0, high)

@@ -13,14 +13,15 @@ JSON keys of the header (run and recorder add created_ns, run, part, monotonic_n
 """
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
-from kontronik_can_gw.capture.limits import END_OF_TIME, check_state, whole_number
+from kontronik_can_gw.capture.limits import END_OF_TIME, HeaderError, check_state, whole_number
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.prepare import prepare
@@ -39,8 +40,8 @@ if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup
 
 Header = Mapping[str, Any]
-_UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, UserError)
-"""What a header raises that holds anything."""
+_UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
+"""Errors of Python if a part of a header is missing or has another type."""
 _LATEST, _SEEDS = 1 << 62, (1 << 64) - 1
 _DBC_KEYS = {
     f.name: {"e2e_data_ids": "data_ids", "send_type": "send_types"}.get(f.name, f.name)
@@ -49,6 +50,30 @@ _DBC_KEYS = {
 }
 """Keys of [dbc] to their names in a header."""
 _KINDS = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
+
+
+@contextmanager
+def _reading(part: str) -> Iterator[None]:
+    """Turn errors of Python into a HeaderError that names this part of the header."""
+    try:
+        yield
+    except (HeaderError, UserError):
+        raise
+    except KeyError as error:
+        raise HeaderError(f"{part}: {str(error.args[0])[:40]!r} is missing") from None
+    except _UNUSABLE:
+        raise HeaderError(f"{part} is not as a recorder writes it") from None
+
+
+def _file_bytes(text: str, part: str) -> bytes:
+    """Return the bytes of a file that a header holds, one character a byte."""
+    try:
+        return text.encode("latin-1")
+    except UnicodeEncodeError as error:
+        character = text[error.start]
+        raise HeaderError(
+            f"{part}: the text of the file has {character!r}, but each character stands for one byte"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -94,28 +119,31 @@ class CaptureSetup:
 
     @classmethod
     def of(cls, header: Header) -> "CaptureSetup":
-        """Read a capture's header. ValueError with the reason where it is not ours or invalid."""
+        """Read a capture's header. HeaderError with the reason if it is not ours or invalid."""
         if header.get("format") != FORMAT:
-            raise ValueError("the header is not that of a capture")
+            raise HeaderError("the header does not belong to a capture")
         if header.get("version") not in VERSIONS:
-            raise ValueError(
+            raise HeaderError(
                 f"capture version {header.get('version')} is unknown, this program knows versions up to {VERSION}"
             )
         try:
-            _check(header)
-            return cls._of(header)
-        except _UNUSABLE as error:
-            raise ValueError(f"the header cannot be used: {error}") from None
+            with _reading("the header"):
+                _check(header)
+                return cls._of(header)
+        except (HeaderError, UserError) as error:
+            raise HeaderError(f"the header cannot be used: {error}") from None
 
     @classmethod
     def _of(cls, header: Header) -> "CaptureSetup":
         dbc = header["dbc"]
         settings, file = DbcConfig(), None
         if dbc is not None:
-            file = (str(dbc["file"]), dbc["text"].encode("latin-1"))
-            settings = _dbc_settings(dbc)
+            with _reading("dbc"):
+                file = (str(dbc["file"]), _file_bytes(dbc["text"], "dbc"))
+                settings = _dbc_settings(dbc)
         found = header["canopen"]
-        escs = tuple(_esc(esc) for esc in header["escs"])
+        with _reading("escs"):
+            escs = tuple(_esc(esc) for esc in header["escs"])
         return cls(
             escs,
             tuple(map(str, header["ports"])),
@@ -162,12 +190,14 @@ def _canopen(found: Mapping[str, Any]) -> "CanopenSetup":
     from kontronik_can_gw.canopen.nodes import CanopenSetup
     from kontronik_can_gw.canopen.storage import decode
 
-    return CanopenSetup(
-        eds_of(found["eds"]["text"].encode("latin-1"), found["eds"]["file"]),
-        tuple(_node(node) for node in found["nodes"]),
-        tuple(decode(text.encode("ascii")) for text in found["stored"]),
-        tuple(_esc(esc) for esc in found["escs"]),
-    )
+    with _reading("canopen"):
+        eds = eds_of(_file_bytes(found["eds"]["text"], "canopen.eds"), found["eds"]["file"])
+    with _reading("canopen.nodes"):
+        nodes = tuple(_node(node) for node in found["nodes"])
+    with _reading("canopen.stored"):
+        stored = tuple(decode(text.encode("ascii")) for text in found["stored"])
+    with _reading("canopen.escs"):
+        return CanopenSetup(eds, nodes, stored, tuple(_esc(esc) for esc in found["escs"]))
 
 
 def _output_json(given: Given) -> dict[str, Any]:
@@ -177,11 +207,13 @@ def _output_json(given: Given) -> dict[str, Any]:
 def _output(name: str, found: Mapping[str, Any], escs: Sequence[EscSettings]) -> OutputSetup:
     """Settings checked like those of a configuration."""
     if name not in OUTPUTS:
-        raise ValueError(f"{str(name)[:40]!r} is no output that this version knows")
-    table = getattr(parse({name: found["table"], "esc": [{"port": "-"}]}, "the capture"), name)
-    identity, seed = bytes.fromhex(found["identity"]), whole_number(found["seed"], 0, _SEEDS)
-    major, minor = (whole_number(each, 0, 255) for each in found["version"])
-    return setup_of(name, Given(table, identity, (major, minor), seed), escs)
+        raise HeaderError(f"{str(name)[:40]!r} is no output that this version knows")
+    with _reading(f"outputs.{name}"):
+        table = getattr(parse({name: found["table"], "esc": [{"port": "-"}]}, "the capture"), name)
+        identity = bytes.fromhex(found["identity"])
+        seed = whole_number(found["seed"], 0, _SEEDS)
+        major, minor = (whole_number(each, 0, 255) for each in found["version"])
+        return setup_of(name, Given(table, identity, (major, minor), seed), escs)
 
 
 def _dbc_settings(found: Mapping[str, Any]) -> DbcConfig:
@@ -214,12 +246,12 @@ def _esc(found: Mapping[str, Any]) -> EscSettings:
 
 def _text(value: Any, longest: int) -> str:
     if not isinstance(value, str) or len(value) > longest or not value.isprintable():
-        raise ValueError(f"{str(value)[:40]!r} is not a text of at most {longest} characters")
+        raise HeaderError(f"{str(value)[:40]!r} is not a text of at most {longest} characters")
     return value
 
 
 def _check(header: Header) -> None:
-    """Check the parts that readers use unchanged. ValueError for what a recorder never writes."""
+    """Check the parts that readers use unchanged. HeaderError for what a recorder never writes."""
     for name, latest in (
         ("monotonic_ns", END_OF_TIME - 1),
         ("created_ns", END_OF_TIME - 1),
@@ -232,9 +264,9 @@ def _check(header: Header) -> None:
     whole_number(header.get("part", 0), 0, 1 << 32)
     for name, kind in _KINDS.items():
         if not isinstance(header.get(name, kind()), kind):
-            raise ValueError(f"{name} is not as a recorder writes it")
+            raise HeaderError(f"{name} is not as a recorder writes it")
     if not 1 <= len(header["escs"]) <= 1000 or not isinstance(header["configuration"], str):
-        raise ValueError("escs or configuration is not as a recorder writes it")
+        raise HeaderError("escs or configuration is not as a recorder writes it")
     check_state(header.get("state", {}))
 
 

@@ -33,6 +33,8 @@ UNITS = "etc/systemd/system"
 _WANTS = f"{UNITS}/multi-user.target.wants"
 _BOOTED = Path("/run/systemd/system")
 """Exists where systemd runs (sd_booted)."""
+_PATIENCE_S = 120
+"""Maximum time of a tool."""
 _OBSOLETE = (
     f"{UNITS}/{NAME}*.service.d/prometheus.conf",
     f"{UNITS}/{NAME}*@.service.d/instance.conf",
@@ -265,10 +267,12 @@ def _call(*words: str) -> None:
     environment = os.environ | {"LC_ALL": "C.UTF-8"}
     try:
         done = subprocess.run(
-            words, capture_output=True, text=True, errors="replace", timeout=120, stdin=subprocess.DEVNULL, env=environment
+            words, capture_output=True, text=True, errors="replace", timeout=_PATIENCE_S, stdin=subprocess.DEVNULL, env=environment
         )  # fmt: skip
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise RunError(f"`{' '.join(words)}` did not end: {error}") from None
+    except subprocess.TimeoutExpired:
+        raise RunError(f"`{' '.join(words)}` did not end within {_PATIENCE_S} s") from None
+    except OSError as error:
+        raise RunError(f"`{' '.join(words)}` cannot be started: {error.strerror}") from None
     if done.returncode:
         raise RunError(
             f"`{' '.join(words)}` failed: {' '.join((done.stderr or done.stdout).split())}"

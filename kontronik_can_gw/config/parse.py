@@ -43,8 +43,10 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        # besides TOMLDecodeError: numbers of 5000 digits, 1000 nested brackets
-        raise UserError(f"{path}: is not valid TOML: {error}") from None
+        reason = "a number in it is too long, or it is nested too deep"
+        if isinstance(error, tomllib.TOMLDecodeError):
+            reason = str(error)
+        raise UserError(f"{path}: is not valid TOML: {reason}") from None
     return _config(tables, str(path))
 
 

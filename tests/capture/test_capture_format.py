@@ -7,6 +7,7 @@ import copy
 import itertools
 import json
 import random
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -34,6 +35,7 @@ from kontronik_can_gw.capture.format import (
     read_frame,
     read_numbers,
 )
+from kontronik_can_gw.capture.setup import CaptureSetup, HeaderError
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
@@ -228,6 +230,65 @@ def test_wrong_header_values(
         document = changed(header, place, value)
         path.write_bytes(block(b"H", 0, json.dumps(document).encode()) + data)
         read_all(path)
+
+
+PYTHON = re.compile(
+    r"codec can't|' object|NoneType|subscript|invalid literal|unhashable|has no attribute|must be|"
+    r"unpack|argument|fromhex|\bint\(|\bstr\b|\bdict\b|indices|Expecting|not iterable|expected"
+)
+"""Words of Python's own errors."""
+
+
+def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]) -> None:
+    combinations = list(itertools.product(places(header), (*VALUES, GONE)))
+    random.Random(7).shuffle(combinations)
+    refused = []
+    for place, value in combinations[:250]:
+        if not place:
+            continue
+        try:
+            CaptureSetup.of(changed(header, place, value))
+        except HeaderError as error:
+            refused.append((place, value, str(error)))
+    assert [each for each in refused if PYTHON.search(each[2])] == []
+    assert len(refused) > 50
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        (("dbc", "text"), "Größe 5 €", "dbc: the text of the file has '€', but each character"),
+        (("canopen", "eds", "text"), "€", "canopen.eds: the text of the file has '€'"),
+        (("canopen", "stored"), ["€"], "canopen.stored is not as a recorder writes it"),
+        (("dbc", "text"), GONE, "dbc: 'text' is missing"),
+        (("escs", 0, "gear"), 5, "escs is not as a recorder writes it"),
+        (("canopen", "nodes", 0, "serial"), GONE, "canopen.nodes: 'serial' is missing"),
+        (("ports",), 7, "ports is not as a recorder writes it"),
+    ],
+)
+def test_a_refused_header_names_its_part(
+    header: dict[str, Any], place: tuple[Any, ...], value: Any, said: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.kcap"
+    path.write_bytes(block(b"H", 0, json_payload(changed(header, place, value))))
+    with pytest.raises(UserError) as refused:
+        open_input(path)
+    assert refused.value.problems[0].startswith(f"{path}: the header cannot be used: {said}")
+
+
+def test_a_block_that_is_no_json_is_described_without_python(
+    header: dict[str, Any], bench: Bench, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.kcap"
+    head = block(b"H", 0, json_payload(header))
+    data = block(b"D", 2, data_payload(bench.entries[:40]))
+    for wrong in (b"{", b"\xff\xff", b"[" * 100_000, b"7"):
+        path.write_bytes(head + block(b"I", 1, wrong) + data)
+        with open_input(path) as found:
+            list(found.frames())
+            (damage,) = [line for line in found.damage if " is " in line]
+            assert "JSON" in damage or "nested too deep" in damage
+            assert not PYTHON.search(damage)
 
 
 def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:

@@ -130,3 +130,28 @@ def test_the_load_is_shown_as_it_is_usually_and_at_worst(tmp_path: Path) -> None
     )
     assert worst.startswith("  at worst  ") and f"{found['worst_bus_load']:.1%}" in worst
     assert len(worst) <= 80
+
+
+@pytest.mark.parametrize("text", [f"x = {'9' * 5000}", f"x = {'[' * 5000}"])
+def test_toml_beyond_the_limits_of_python_is_described_in_words_for_users(
+    text: str, tmp_path: Path
+) -> None:
+    said = refused(2, "check", written(tmp_path / "g.toml", text))
+    assert said.endswith("is not valid TOML: a number in it is too long, or it is nested too deep")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "the password cannot be read: No such file or directory"),
+        (b"\xff", "the password is no text in UTF-8"),
+    ],
+)
+def test_a_password_file_is_refused_in_words_for_users(
+    content: bytes | None, said: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        written(tmp_path / "password", content)
+    table = '[mqtt]\nbroker = "localhost"\nusername = "boat"\npassword_file = "password"\n'
+    file = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n{table}{LEAST}')
+    assert refused(1, "mqtt", "-c", file) == f"{tmp_path}/password: {said}"

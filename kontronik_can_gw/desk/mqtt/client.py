@@ -33,8 +33,10 @@ def password(file: str) -> str:
     """The password in the first line of a file. OSError with the remedy where there is none."""
     try:
         line = Path(file).read_text(encoding="utf-8").partition("\n")[0].rstrip("\r")
-    except (OSError, UnicodeDecodeError) as error:
-        raise OSError(f"{file}: the password cannot be read: {error}") from None
+    except OSError as error:
+        raise OSError(f"{file}: the password cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise OSError(f"{file}: the password is no text in UTF-8") from None
     if not line:
         raise OSError(f"{file}: has no password on its first line")
     return line
@@ -43,7 +45,7 @@ def password(file: str) -> str:
 class _Client(paho.Client):
     """paho's client, whose thread outlives the errors that paho raises for malformed packets."""
 
-    on_malformed: Callable[[Exception], None]
+    on_malformed: Callable[[], None]
 
     def loop_forever(
         self, timeout: float = 1.0, retry_first_connection: bool = False
@@ -52,8 +54,8 @@ class _Client(paho.Client):
         while True:
             try:
                 return super().loop_forever(timeout, retry_first_connection)
-            except Exception as error:
-                self.on_malformed(error)
+            except Exception:
+                self.on_malformed()
                 if (sock := self.socket()) is not None:
                     with contextlib.suppress(OSError):
                         sock.close()  # paho's loop notices it, and connects again
@@ -175,8 +177,8 @@ class MqttClient:
         self._ended.clear()
         self.problem = ""
 
-    def _malformed(self, error: Exception) -> None:
-        self.problem = f"its answer is not MQTT: {error!r}"
+    def _malformed(self) -> None:
+        self.problem = "its answer is not MQTT. Is this the port of an MQTT broker?"
 
     def _not_connected(self, *_: object) -> None:
         error = sys.exc_info()[1]

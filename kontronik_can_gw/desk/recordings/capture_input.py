@@ -18,6 +18,7 @@ from kontronik_can_gw.capture.format import (
     read_json,
     read_numbers,
 )
+from kontronik_can_gw.capture.limits import HeaderError
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
@@ -54,7 +55,11 @@ class CaptureInput(PlayedInput):
             found = setup.database()
             setup.gateway(NO_MESSAGES if found is None else found[1], 0)
         except Exception as error:  # a header may hold anything
-            problems = error.problems if isinstance(error, UserError) else [str(error)]
+            problems = ["the header cannot be used: it is not as a recorder writes it"]
+            if isinstance(error, UserError):
+                problems = list(error.problems)
+            elif isinstance(error, HeaderError):
+                problems = [str(error)]
             raise UserError(*(f"{first}: {problem[:400]}" for problem in problems)) from None
         name = str(first)
         if len(self._paths) > 1:
