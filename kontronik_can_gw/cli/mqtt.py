@@ -73,8 +73,8 @@ def main(args: argparse.Namespace) -> int:
         topics = Topics(settings.topic, settings.gateway or host_name())
         try:
             client = MqttClient(settings, f"kontronik-can-gw-{topics.gateway}", topics.of("online"))
-        except OSError as error:
-            raise RunError(str(error)) from None
+        except OSError as error:  # a file of [mqtt]
+            raise UserError(str(error)) from None
         can = can_config(bus, args.interface, args.channel)
         with Bus(bus, can, patient=Notifier().present) as source:
             publisher = Publisher(bus, topics, settings)

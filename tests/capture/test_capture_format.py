@@ -291,6 +291,20 @@ def test_a_block_that_is_no_json_is_described_without_python(
             assert not PYTHON.search(damage)
 
 
+@pytest.mark.parametrize("part", ["x", [], None])
+def test_a_later_part_without_a_number_is_damage(
+    header: dict[str, Any], bench: Bench, tmp_path: Path, part: Any
+) -> None:
+    data = block(b"D", 1, data_payload(bench.entries[:40]))
+    for number, value in enumerate((0, part), 1):
+        document = header | {"run": "a", "part": value}
+        path = tmp_path / f"a-{number}.kcap"
+        path.write_bytes(block(b"H", 0, json_payload(document)) + data)
+    with open_input(tmp_path) as found:
+        list(found.frames())
+        assert any("has a part that is no number" in line for line in found.damage)
+
+
 def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
     rng = random.Random(4)

@@ -154,4 +154,21 @@ def test_a_password_file_is_refused_in_words_for_users(
         written(tmp_path / "password", content)
     table = '[mqtt]\nbroker = "localhost"\nusername = "boat"\npassword_file = "password"\n'
     file = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n{table}{LEAST}')
-    assert refused(1, "mqtt", "-c", file) == f"{tmp_path}/password: {said}"
+    assert refused(2, "mqtt", "-c", file) == f"{tmp_path}/password: {said}"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(None, "cannot be read: No such file or directory"), (b"x", "cannot be used for TLS")],
+)
+def test_a_certificate_is_refused_in_words_for_users(
+    content: bytes | None, said: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        written(tmp_path / "ca.pem", content)
+    table = '[mqtt]\nbroker = "localhost"\ntls = true\nca_file = "ca.pem"\n'
+    file = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n{table}{LEAST}')
+    expected = (
+        f"{tmp_path}/ca.pem: {said}. Certificates must be in PEM form, keys without passphrase."
+    )
+    assert refused(2, "mqtt", "-c", file) == expected

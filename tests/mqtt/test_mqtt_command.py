@@ -23,8 +23,8 @@ def configuration(folder: Path, mqtt: str) -> Path:
         ("", ["flight.kcap"], 2, "Type kontronik-can-gw replay flight.kcap --on can"),
         (HERE + "ca_file = 'x'\n", [], 2, "mqtt.ca_file: means nothing without mqtt.tls"),
         (HERE + "password_file = 'x'\n", [], 2, "mqtt.password_file: means nothing without mqtt.username"),
-        (HERE + "username = 'x'\npassword_file = 'empty'\n", [], 1, "has no password on its first line"),
-        (HERE + "tls = true\nca_file = 'empty'\n", [], 1, "empty: [X509: NO_CERTIFICATE"),
+        (HERE + "username = 'x'\npassword_file = 'empty'\n", [], 2, "has no password on its first line"),
+        (HERE + "tls = true\nca_file = 'empty'\n", [], 2, "empty: cannot be used for TLS. Certificates must be in PEM form"),
         (HERE, ["--interface", "socketcan", "--channel", "no0"], 1, "no0"),
     ],
 )  # fmt: skip

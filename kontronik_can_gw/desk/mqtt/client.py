@@ -8,6 +8,7 @@ import contextlib
 import logging
 import random
 import socket
+import ssl
 import sys
 import threading
 import time
@@ -94,7 +95,9 @@ class MqttClient:
                 # a key with a passphrase would ask for it on the terminal
                 client.tls_set(*files, keyfile_password="")
             except (OSError, ValueError) as error:
-                why = getattr(error, "strerror", None) or error
+                why = "cannot be used for TLS"  # the text of a library's error is of no use
+                if isinstance(error, OSError) and not isinstance(error, ssl.SSLError):
+                    why = f"cannot be read: {error.strerror}"
                 raise OSError(
                     f"{', '.join(filter(None, files))}: {why}. Certificates must be in PEM form, keys without passphrase."
                 ) from None

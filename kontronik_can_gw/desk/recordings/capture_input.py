@@ -282,7 +282,10 @@ class CaptureInput(PlayedInput):
             )
         if (clock := _clock_of(header)) is not None:
             self._offsets.append(clock)
-        missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
+        number, first = header.get("part", part), self.header.get("part", 0)
+        if type(number) is not int:
+            raise ValueError("has a part that is no number")
+        missing = number - int(first) - part
         if missing > 0:
             self.damage.append(
                 f"{path.name}: {missing} parts of the run in front of it are not given"
