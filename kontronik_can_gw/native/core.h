@@ -160,48 +160,100 @@ typedef struct {
     kcg_found found[KCG_FOUND];
 } kcg;
 
-/* What kcg_init needs: the structures, then what is aligned less. */
+/* Bytes that kcg_init needs: the structures, then whatever needs less alignment. `messages` counts slots too. */
 #define KCG_SIZE(messages, escs, pages, words) \
     (sizeof(kcg) + (escs) * (sizeof(kcg_esc) + 1) + (messages) * (sizeof(kcg_sending) + 2 * sizeof(uint16_t)) + (pages) + (words) * sizeof(uint64_t))
+
+#if !KCG_SOURCE
+/* KCG_DATA and KCG_FOUND change structures, so all files of a program must agree on them. The linker checks it: it does not find the
+   function under another file's name. */
+#define KCG_NAMED_(name, data, found) name##_with_KCG_DATA_##data##_KCG_FOUND_##found
+#define KCG_NAMED(name, data, found) KCG_NAMED_(name, data, found)
+#define kcg_init KCG_NAMED(kcg_init, KCG_DATA, KCG_FOUND)
+#define kcg_take KCG_NAMED(kcg_take, KCG_DATA, KCG_FOUND)
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* Preconditions of every function that is given a kcg:
+   1. kcg_init has returned it, and the memory, the plan and its tables are still there.
+   2. Calls are made in one context, never in an interrupt while another call runs.
+   3. `now` is in nanoseconds, 0 <= now < 2^61, and is never earlier than in a call before.
+   4. `esc` is the number of an ESC of the plan, from 0 on.
+   Nothing is checked. Functions that return an event must be followed by kcg_next_event until it returns -1 before any other call,
+   unless `mask` is 0, as it is at first: then they return -1, except that kcg_receive can still return KCG_AGAIN if the owner set a mask. */
+
+/* Bytes of memory for a plan, as KCG_SIZE. The plan is complete. */
 size_t kcg_size(const kcg_plan *plan);
-/* memory: kcg_size bytes, aligned for int64_t. */
+/* memory: kcg_size bytes, aligned for int64_t, that only the core writes until it is not used any more. settings: one of each ESC, with
+   timeout > 0, poles >= 1 and gear parts >= 1; they are copied. Returns `memory`. May be called again to begin anew. */
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now);
-/* Each returns an event to be followed, ESC << 8 | events of `mask`, or -1 (always, as long as `mask` is 0 as at first); then
-   kcg_next_event until that returns -1. Where kcg_receive returns KCG_AGAIN besides, what has expired is to be followed first, and it
-   is called again with the same bytes. */
+
+/* An event is ESC << 8 | events of `mask`; -1: there is none. */
 enum { KCG_AGAIN = 1 << 30 };
+/* Bytes of an ESC, 0 to 4096 of them, read at `now`. At `since` (0 <= since <= now) none of them had arrived yet: set it to the last time
+   at which the receive buffer was known to be empty. If KCG_AGAIN is returned besides an event, follow the event and call again with
+   the same bytes. Other ESCs that are due by then are expired first. */
 int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since);
+/* Drops values that have become too old. kcg_receive and kcg_advance do it themselves. */
 int kcg_expire(kcg *g, int64_t now);
+/* Lets time pass: time-outs and cycles. To be called at kcg_next_deadline at the latest; a late call skips missed cycles, an early one
+   does nothing. */
 int kcg_advance(kcg *g, int64_t now);
+/* The port of an ESC cannot be used any more (is_open 0): its values are not available at once; or it can again (1). May be repeated. */
 int kcg_port(kcg *g, int esc, int is_open, int64_t now);
+/* The next event of the last call, or -1. */
 int kcg_next_event(kcg *g);
+/* When kcg_advance has something to do; KCG_NEVER for never. Ask again after any other call. */
 int64_t kcg_next_deadline(kcg *g);
+/* Other settings of an ESC from now on, with the limits of kcg_init; they are copied. */
 void kcg_apply(kcg *g, int esc, const kcg_settings *settings);
+/* The owner has written `gateway`: messages with these values are sent. each_second 1: only those without a cycle, once a second. */
 void kcg_gateway_changed(kcg *g, int each_second, int64_t now);
+/* Sends all messages without a cycle once more: after the start, and after frames were lost (bus-off). */
 void kcg_repeat(kcg *g, int64_t now);
+/* Sends the gateway's own messages a last time; then take until kcg_take returns 0. There is no way back but kcg_init. */
 void kcg_stop(kcg *g, int64_t now);
-/* Frames of what is pending, in their order, `max` (with transfers 3 or more) at most; they stay pending until kcg_sent says how many of
-   them were taken: of a transfer of which some were not, the rest is not sent. */
+/* Packs pending frames, in the order in which they are to be sent. Returns how many, at most `max` (1 or more; with transfers 3 or more);
+   0 if nothing is pending. They stay pending until kcg_sent, which must be the next call, with the same `now`. */
 uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
+/* The first `count` frames of the last kcg_take were sent. The others stay pending and are packed again; of a transfer of which only a
+   part was sent, the rest is dropped. */
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
-/* Slots (twin: slots.py): messages of one page, ESC and 8 bytes (of a transfer 16, with KCG_DATA 64), with KCG_SLOTS, that their owner starts
-   and stops; `cycle` runs from frame to frame. The owner may write a slot's rows of `message`, `signal` and `piece` whenever it is stopped; while it is started, all but the
-   signals, and then calls kcg_slot_changed. */
+#if KCG_SLOTS
+/* Slots (twin: slots.py): messages of one page, one ESC and at most 8 bytes (a transfer: 16, with KCG_DATA 64) that their owner starts and
+   stops; `cycle` runs from frame to frame. `slot` is a number from 0 on, less than kcg_plan.slots. The owner may write the rows of
+   `message`, `signal` and `piece` of a stopped slot at any time; of a started one all but the signals, followed by kcg_slot_changed. */
 void kcg_slot_start(kcg *g, uint32_t slot, int64_t now);
 void kcg_slot_changed(kcg *g, uint32_t slot, int64_t now);
+/* A stopped slot may be stopped again. */
 void kcg_slot_stop(kcg *g, uint32_t slot);
+/* Its content has changed without an event of the ESC. Does nothing while it is stopped. */
 void kcg_slot_news(kcg *g, uint32_t slot, int64_t now);
+/* Sends it whatever its minimum distance is. Does nothing while it is stopped. */
 void kcg_slot_send(kcg *g, uint32_t slot, int64_t now);
+/* Whether its content has changed since its last frame; how many frames were sent. */
 int kcg_slot_is_news(const kcg *g, uint32_t slot);
 int kcg_slot_is_pending(const kcg *g, uint32_t slot);
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
-/* The stream of an ESC has ended: what is held is decided. Frames in it are in g->found, and not taken. */
+#endif
+/* The stream of an ESC has ended: held bytes are decided. Frames in them are in g->found and are not taken. */
 void kcg_end(kcg *g, int esc);
-/* The steps of a value and what they are divided by, x * over / by; 0 where it is not available. */
+/* A value in steps is x * over / by. Returns 0 if it is not available. The signal is a row of the plan, or one that refers to it. */
 int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over);
+/* A counter of an ESC: KCG_N_... */
 uint64_t kcg_count(const kcg_esc *e, int what);
+/* CRC-32 of `size` bytes, continued from `crc` (0 at first). With KCG_SLICES only after kcg_init. */
 uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
+#if KCG_SOURCE
 /* For a caller that cannot see structures: 0 KCG_SOURCE, then the sizes of signal, message, settings, plan, ESC and frame. */
 uint32_t kcg_sizes(uint32_t what);
 const char *kcg_wire(void); /* the fields of live data and of info on the wire, as codes of Python's struct */
+#endif
+
+#ifdef __cplusplus
+}
+#endif
 #endif

@@ -95,8 +95,14 @@ def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSe
         f"enum {{ {', '.join([*places, 'KCG_ESCS'])} }};\n",
         "/* Bytes for kcg_init. */",
         f"#define KCG_MEMORY KCG_SIZE(KCG_MESSAGES, KCG_ESCS, {tables.pages}, {len(tables.constants)})\n",
+        "#ifdef __cplusplus",
+        'extern "C" {',
+        "#endif",
         "extern const kcg_plan kcg_tables;",
         "extern const kcg_settings kcg_esc_settings[KCG_ESCS];",
+        "#ifdef __cplusplus",
+        "}",
+        "#endif",
         "#endif\n",
     )
     return "\n".join(parts)

@@ -53,6 +53,49 @@ def test_it_sends_the_same_on_a_cortex_m4(cases: list[tuple[Case, str]]) -> None
         assert case.output(*QEMU, str(program)) == text
 
 
+def deepest(graph: str) -> int:
+    """The most stack that a function and all that it calls take, in bytes, from GCC's -fcallgraph-info=su."""
+    own = {
+        name: int(size)
+        for name, size in re.findall(
+            r'node: \{ title: "([^"]+)" label: "[^"]*\\n(\d+) bytes', graph
+        )
+    }
+    calls: dict[str, set[str]] = {}
+    for source, target in re.findall(
+        r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"', graph
+    ):
+        calls.setdefault(source, set()).add(target)
+
+    def needed(name: str, above: tuple[str, ...]) -> int:
+        assert name not in above, f"recursion: {name}"
+        further = [needed(each, (*above, name)) for each in calls.get(name, ())]
+        return own.get(name, 0) + max(further, default=0)
+
+    return max(needed(name, ()) for name in own)
+
+
+@pytest.mark.parametrize(
+    ("options", "limit"),
+    [(("-DKCG_LEGACY=0",), 576), (("-DKCG_DATA=64", "-DKCG_PAGED=1", "-DKCG_E2E=1"), 704)],
+)
+def test_how_much_stack_of_a_cortex_m4_it_needs(
+    tmp_path: Path, options: tuple[str, ...], limit: int
+) -> None:
+    """Of the core alone; the compiler's division and memcpy take less than 64 bytes more."""
+    bus = layout_of_dbc(FIVE)
+    case = Case(tmp_path, 1, bus.layout, bus.escs)
+    flags = (*CORTEX_M4, "-fstack-usage", "-fcallgraph-info=su", *options)
+    case.output("arm-none-eabi-gcc", "-std=c99", *STRICT, *flags, "-c", "core.c", "example_main.c")
+    core, example = (
+        deepest((tmp_path / f"{name}.ci").read_text()) for name in ("core", "example_main")
+    )
+    print(
+        f"Cortex-M4 {' '.join(options)}: stack of the core {core}, of the example without it {example}"
+    )
+    assert 100 < core <= limit
+
+
 INTEGERS = {"__aeabi_ldivmod", "__aeabi_uldivmod"}
 MEMORY = {"memcpy", "memset", "memmove", "memchr", "memcmp"}
 
@@ -62,7 +105,7 @@ MEMORY = {"memcpy", "memset", "memmove", "memchr", "memcmp"}
     [
         (FIVE, ("-DKCG_DATA=64", "-DKCG_PAGED=1", "-DKCG_E2E=1"), 8 * KB, None),
         (FIVE, ("-DKCG_LEGACY=0",), 7 * KB, 2 * KB),
-        (shipped("dbc/kontronik_esc.dbc"), (), 7 * KB, None),
+        (shipped("dbc/kontronik_esc.dbc"), (), 7 * KB + 64, None),
     ],
 )
 def test_how_much_of_a_cortex_m4_it_needs(

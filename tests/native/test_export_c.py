@@ -1,17 +1,21 @@
 """What `export c` writes compiles by itself, without a warning, and sends what the core in Python sends."""
 
 import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from built import COMPILERS, there
+from built import COMPILERS, STRICT, there
 from firmware import Case
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.native.export_c import exported
 
 
@@ -89,7 +93,10 @@ def test_what_the_core_cannot_express_is_refused(
         ' SG_ LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] "" Car\n'
     )
     assert main(["export", "c", "--dbc", str(dbc), str(tmp_path / "out")]) == 2
-    assert "not in the core in C: M.LinkState: add" in capsys.readouterr().err
+    assert (
+        "not in the core in C: M.LinkState: factor 0.00592884289493769 leaves 64 bits. Factor"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -101,3 +108,130 @@ def test_names_end_no_comment_and_are_never_the_same() -> None:
     assert "KCG_ESC_a__b, KCG_ESC_a__b_2, KCG_ESC___, KCG_ESC_COUNT_2," in files["tables.h"]
     assert "Messages of ___.dbc:" in files["tables.h"]
     assert all(text.isascii() for text in files.values())
+
+
+_FROM_CPP = """
+#include "core.h"
+#include "tables.h"
+static int64_t memory[(KCG_MEMORY + 7) / 8];
+int main()
+{
+    kcg *core = kcg_init(memory, &kcg_tables, kcg_esc_settings, 5);
+    kcg_frame frames[4];
+    kcg_repeat(core, 5);
+    return kcg_next_deadline(core) < 5 || kcg_take(core, 5, frames, 4) > 4 || kcg_size(&kcg_tables) != KCG_MEMORY;
+}
+"""
+
+
+@pytest.fixture
+def shipped_case(tmp_path: Path) -> Case:
+    bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    return Case(tmp_path, 1, bus.layout, bus.escs)
+
+
+def test_it_links_with_a_program_in_cpp(shipped_case: Case) -> None:
+    case = shipped_case
+    (case.folder / "main.cpp").write_text(_FROM_CPP)
+    case.output(there("gcc"), "-std=c99", "-c", "core.c", "tables.c")
+    case.output(there("g++"), "-Wall", "-Werror", "-o", "cpp", "main.cpp", "core.o", "tables.o")
+    assert case.output("./cpp") == ""
+
+
+@pytest.mark.parametrize("option", ["-DKCG_DATA=64", "-DKCG_FOUND=3"])
+def test_files_that_differ_in_a_structure_do_not_link(shipped_case: Case, option: str) -> None:
+    """The program would write beyond memory that the other file has reserved."""
+    case, gcc = shipped_case, there("gcc")
+    case.output(gcc, "-std=c99", option, "-c", "core.c")
+    words = [gcc, "-std=c99", "-o", "differs", "core.o", "tables.c", "example_main.c"]
+    done = subprocess.run(words, cwd=case.folder, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    for name in ("kcg_init", "kcg_take"):
+        assert re.search(
+            rf"undefined reference to .{name}_with_KCG_DATA_8_KCG_FOUND_2", done.stderr
+        )
+    case.output(*words[:2], option, "-o", "same", "core.o", "tables.c", "example_main.c")
+
+
+@pytest.mark.parametrize(("option", "count"), [("-DKCG_SLOTS=0", 0), ("-DKCG_SLOTS=1", 7)])
+def test_what_is_declared_is_defined(shipped_case: Case, option: str, count: int) -> None:
+    """Every function of core.h that the preprocessor leaves is defined in core.c, and the slots only with KCG_SLOTS."""
+    case, gcc = shipped_case, there("gcc")
+    header = case.output(gcc, "-std=c99", option, "-E", "-P", "core.h")
+    declared = set(re.findall(r"(kcg_\w+)\([^;{}]*\);", header))
+    case.output(gcc, "-std=c99", option, "-c", "core.c")
+    defined = set(re.findall(r" T (\w+)", case.output("nm", "core.o")))
+    assert declared == defined
+    assert sum("slot" in name for name in declared) == count
+
+
+_FAULTS = """
+#define main unused_main
+#include "example_main.c"
+#undef main
+static void feed(const uint8_t *data, size_t size, int ms)
+{
+    for (size_t k = 0; k < size; k++)
+        byte_in(0, data[k]);
+    for (; ms; ms--, simulated += MS)
+        turn();
+}
+static void say(const char *text)
+{
+    printf("%s %lld %lld\\n", text, (long long)core->esc[0].link, (long long)core->gateway[KCG_BUS_OFF_COUNT]);
+}
+int main(void)
+{
+    static const uint8_t live[] = {LIVE};
+    start();
+    feed(live, sizeof live, 50);
+    say("ok");
+    uart_failed(0, 1);
+    feed(live, sizeof live, 50);
+    say("lost");
+    uart_failed(0, 0);
+    feed(live, 0, 10);
+    say("back");
+    feed(live, sizeof live, 50);
+    say("again");
+    bus_state(BUS_OFF);
+    feed(live, sizeof live, 200);
+    say("off");
+    bus_state(ERROR_ACTIVE);
+    feed(live, sizeof live, 1);
+    say("on");
+    return 0;
+}
+"""
+OK, LOST, PORT_ERROR = LinkState.OK, LinkState.LOST, LinkState.PORT_ERROR
+
+
+def test_the_example_survives_a_failed_uart_and_bus_off(shipped_case: Case) -> None:
+    case, live = shipped_case, encode(LiveData(battery_voltage=2400), WireLayout.V4)
+    text = _FAULTS.replace("LIVE", ", ".join(map(str, live)))
+    (case.folder / "faults.c").write_text(text)
+    case.output(there("gcc"), "-std=c99", *STRICT, "-o", "faults", "core.c", "tables.c", "faults.c")
+    blocks, states, frames = {}, {}, []
+    for line in case.output("./faults").splitlines():
+        if line.startswith("("):
+            frames.append(line.split()[2].partition("#")[0])
+        else:
+            name, link, count = line.split()
+            blocks[name], states[name] = frames, (int(link), int(count))
+            frames = []
+    assert states == {
+        "ok": (OK, 0),
+        "lost": (PORT_ERROR, 0),
+        "back": (LOST, 0),
+        "again": (OK, 0),
+        "off": (OK, 1),
+        "on": (OK, 1),
+    }
+    assert blocks["off"] == [], "nothing is sent in bus-off"
+    without_cycle = {
+        f"{m.can_id:03X}"
+        for m in layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout.messages
+        if not m.cycle_ns
+    }
+    assert set(blocks["on"]) >= without_cycle, "all are sent once more"
+    assert len(set(blocks["on"])) == len(blocks["on"])

@@ -3,17 +3,21 @@
 
        cc -std=c99 -O2 -o example core.c tables.c example_main.c && ./example uart.bin
 
-   On a board only the three hooks at its end are others. */
+   On a board only the hooks at its end are others, and its interrupts call byte_in, uart_failed and bus_state. */
 #include "core.h"
 #include "tables.h"
 
 #include <stdio.h>
 #include <stdlib.h>
 
-enum { RING = 128, FRAMES = 4, RUNNING = 1, ERROR_ACTIVE = 1 }; /* RING: 11 ms of one UART */
+enum { RING = 128, FRAMES = 4, RUNNING = 1 }; /* RING: 11 ms of one UART */
+enum { ERROR_ACTIVE = 1, ERROR_WARNING, ERROR_PASSIVE, BUS_OFF }; /* states of the CAN controller */
 
 static struct { uint8_t byte[RING]; volatile uint8_t in, out; } ring[KCG_ESCS];
 static int64_t memory[(KCG_MEMORY + 7) / 8], empty_at[KCG_ESCS];
+static volatile uint8_t uart_is_lost[KCG_ESCS]; /* a UART cannot be used */
+static volatile uint8_t bus = ERROR_ACTIVE;
+static uint8_t uart_was_lost[KCG_ESCS];
 static kcg *core;
 
 static int64_t clock_ns(void);
@@ -27,6 +31,20 @@ static void byte_in(int esc, uint8_t byte)
         ring[esc].byte[in] = byte;
         ring[esc].in = next;
     }
+}
+
+/* Errors of a UART: for its interrupt. Parity, framing and noise errors need nothing: a damaged frame fails its CRC. After an overrun, or a
+   failure of DMA, clear the flag and start the reception again. If that is not possible, the port is lost until it is. */
+static void uart_failed(int esc, int is_lost)
+{
+    uart_is_lost[esc] = (uint8_t)is_lost;
+}
+
+/* The CAN controller has another state: for its interrupt. A controller that does not leave bus-off by itself is restarted there, after
+   a pause of 100 ms or more. */
+static void bus_state(uint8_t state)
+{
+    bus = state;
 }
 
 static void start(void)
@@ -56,11 +74,41 @@ static void send(int64_t now)
     core->gateway[KCG_SENT_FRAMES] += all;
 }
 
+/* Tell the core about lost and returned UARTs. */
+static void follow_uarts(int64_t now)
+{
+    for (int esc = 0; esc < KCG_ESCS; esc++) {
+        uint8_t is_lost = uart_is_lost[esc];
+        if (is_lost == uart_was_lost[esc])
+            continue;
+        uart_was_lost[esc] = is_lost;
+        if (is_lost)
+            ring[esc].out = ring[esc].in; /* the rest is of no use */
+        kcg_port(core, esc, !is_lost, now);
+    }
+}
+
+/* Tell the core about the controller's state. What was in a mailbox at bus-off is lost, so that all is sent once more afterwards. */
+static void follow_bus(int64_t now)
+{
+    uint8_t state = bus;
+    int64_t before = core->gateway[KCG_CAN_STATE];
+    if (state == before)
+        return;
+    core->gateway[KCG_CAN_STATE] = state;
+    core->gateway[KCG_BUS_OFF_COUNT] += state == BUS_OFF;
+    kcg_gateway_changed(core, 0, now);
+    if (before == BUS_OFF)
+        kcg_repeat(core, now);
+}
+
 /* One turn of the main loop: at least every few milliseconds, or when an interrupt was there, or at kcg_next_deadline. */
 static void turn(void)
 {
     uint8_t data[RING];
     int64_t now = clock_ns(); /* first: what comes later is of the next turn */
+    follow_uarts(now);
+    follow_bus(now);
     for (int esc = 0; esc < KCG_ESCS; esc++) {
         uint8_t in = ring[esc].in, out = ring[esc].out;
         size_t size = 0;
@@ -72,10 +120,11 @@ static void turn(void)
         empty_at[esc] = now;
     }
     kcg_advance(core, now);
-    send(now);
+    if (bus != BUS_OFF)
+        send(now); /* otherwise frames stay pending, and the values of then are sent */
 }
 
-/* --- the three hooks, of a PC ---------------------------------------------------------------------------------------- */
+/* --- the hooks, of a PC ---------------------------------------------------------------------------------------- */
 
 #define MS INT64_C(1000000)
 
@@ -115,6 +164,9 @@ int main(int argc, char **argv)
         }
     }
     start();
+    for (int esc = 0; esc < KCG_ESCS; esc++)
+        uart_failed(esc, 0);
+    bus_state(ERROR_ACTIVE);
     for (; simulated <= end; simulated += MS) {
         for (int esc = 0; esc < KCG_ESCS; esc++)
             for (; line[esc] && due[esc] <= simulated; due[esc] += KCG_BYTE_NS) {
