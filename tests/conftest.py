@@ -85,18 +85,19 @@ OF_TERMINALS = ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE")
 
 
 def clear_environment(patch: pytest.MonkeyPatch) -> None:
-    """Removes variables that change how the gateway runs or prints, and sets UTC as local time."""
+    """Removes variables that change how the gateway runs or prints. Sets UTC and the usual umask."""
     for name in (*OF_SYSTEMD, *OF_TERMINALS):
         patch.delenv(name, raising=False)
     patch.setenv("TZ", "UTC")
     time.tzset()
+    os.umask(0o022)
 
 
 @pytest.fixture(autouse=True, scope="session")
 def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Makes the tests independent of how this machine is set up.
 
-    - No variables that change how the gateway runs or prints, and UTC as the local time.
+    - No variables that change how the gateway runs or prints, UTC as local time, umask 022.
     - A machine id: containers and fresh roots have none, and the configuration warns about that.
     - No configuration in /etc: an installed gateway has one.
     - A runtime folder of their own, for this process and its children. A user without a session

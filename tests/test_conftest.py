@@ -60,9 +60,10 @@ def test_make_test_goes_on_after_a_hangup_only_under_nohup(ignored: bool, code: 
 
 def test_the_environment_of_a_service_and_a_time_zone_do_not_reach_tests() -> None:
     script = (
+        "import os; os.umask(0o077); "
         "import conftest, os, pytest, time; conftest.clear_environment(pytest.MonkeyPatch()); "
         "print({'NOTIFY_SOCKET', 'STATE_DIRECTORY', 'COLUMNS'} & os.environ.keys(), "
-        "time.localtime(0).tm_hour)"
+        "time.localtime(0).tm_hour, os.umask(0))"
     )
     outside = {"NOTIFY_SOCKET": "/x", "STATE_DIRECTORY": "/x", "COLUMNS": "9", "TZ": "Asia/Tokyo"}
     done = subprocess.run(
@@ -73,7 +74,7 @@ def test_the_environment_of_a_service_and_a_time_zone_do_not_reach_tests() -> No
         text=True,
         check=False,
     )
-    assert done.stdout == "set() 0\n", done.stderr
+    assert done.stdout == "set() 0 18\n", done.stderr
     assert not {"NOTIFY_SOCKET", "STATE_DIRECTORY", "COLUMNS"} & os.environ.keys()
     assert os.environ["TZ"] == "UTC"
 

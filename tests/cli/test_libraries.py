@@ -58,7 +58,7 @@ def test_the_debian_package_names_an_installation_from_a_clone(
 
 def test_nothing_names_an_index_on_which_the_package_is_not() -> None:
     """The package is on no index: an extra of it can only be installed from a clone."""
-    places = [*PROJECT.glob("*.md"), *(PROJECT / "kontronik_can_gw").rglob("*.py")]
+    places = [PROJECT / "README.md", *(PROJECT / "kontronik_can_gw").rglob("*.py")]
     for folder in ("docs", "examples"):
         places += [path for path in (PROJECT / folder).rglob("*") if path.is_file()]
     for path in places:
