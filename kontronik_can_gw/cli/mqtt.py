@@ -21,7 +21,7 @@ from kontronik_can_gw.config.kinds import BROKER
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.mqtt.messages import Publisher, Topics
 from kontronik_can_gw.desk.sources import Bus, can_config
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.systemd import Notifier
 

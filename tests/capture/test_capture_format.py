@@ -35,7 +35,8 @@ from kontronik_can_gw.capture.format import (
     read_frame,
     read_numbers,
 )
-from kontronik_can_gw.capture.setup import CaptureSetup, HeaderError
+from kontronik_can_gw.capture.limits import HeaderError
+from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
