@@ -81,7 +81,7 @@ def test_size_and_access(bench: Bench, entry: Entry) -> None:
 
 LIMITED = [entry for entry in shipped_eds().entries if "w" in entry.access]
 # further rules than limits, tested by dialogues
-RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x1F80, 0x2102}
+RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x1F80, 0x2101, 0x2102}
 
 
 @pytest.mark.parametrize("entry", LIMITED, ids=of)
