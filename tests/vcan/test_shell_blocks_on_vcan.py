@@ -1,5 +1,6 @@
 """Shell blocks of README, docs and examples that need a CAN interface do what they say: values are on vcan0."""
 
+import csv
 import shutil
 from pathlib import Path
 
@@ -62,3 +63,15 @@ def test_a_block_can_be_typed_as_it_stands(
     folder = tmp_path / "f"
     shutil.copytree(files, folder, symlinks=True)
     run_block(block, folder, before(block.text), "unshare", "--net", "--mount")
+    if block.place.startswith("README.md:"):
+        assert_voltages(folder / "try" / "values.csv")
+
+
+def assert_voltages(table: Path) -> None:
+    """README's block for newcomers ends with a table that has the voltages of the simulated ESC."""
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    (column,) = (name for name in rows[0] if name.partition(" ")[0] == "battery_voltage")
+    voltages = [float(row[column]) for row in rows if row[column]]
+    assert len(voltages) > 10
+    assert 20 < min(voltages) <= max(voltages) < 26
