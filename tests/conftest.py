@@ -17,7 +17,9 @@ use_defaults_in_children()
 
 # India's local time, without a data base of zones: on a machine whose local time is UTC no test
 # would notice that the two are exchanged.
-os.environ["TZ"] = "IST-5:30"
+LOCAL_ZONE = "IST-5:30"
+"""Local time of all tests. It is not UTC, so that a test sees if the two are exchanged."""
+os.environ["TZ"] = LOCAL_ZONE
 time.tzset()
 
 if not os.environ.get("KCG_VCAN"):
@@ -85,10 +87,10 @@ OF_TERMINALS = ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE")
 
 
 def clear_environment(patch: pytest.MonkeyPatch) -> None:
-    """Removes variables that change how the gateway runs or prints. Sets UTC and the usual umask."""
+    """Removes variables that change how the gateway runs or prints. Sets one zone and the usual umask."""
     for name in (*OF_SYSTEMD, *OF_TERMINALS):
         patch.delenv(name, raising=False)
-    patch.setenv("TZ", "UTC")
+    patch.setenv("TZ", LOCAL_ZONE)
     time.tzset()
     os.umask(0o022)
 
@@ -97,7 +99,7 @@ def clear_environment(patch: pytest.MonkeyPatch) -> None:
 def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Makes the tests independent of how this machine is set up.
 
-    - No variables that change how the gateway runs or prints, UTC as local time, umask 022.
+    - No variables that change how the gateway runs or prints, one zone as local time, umask 022.
     - A machine id: containers and fresh roots have none, and the configuration warns about that.
     - No configuration in /etc: an installed gateway has one.
     - A runtime folder of their own, for this process and its children. A user without a session

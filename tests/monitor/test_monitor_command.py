@@ -248,7 +248,7 @@ def test_a_name_is_an_interface_or_a_recording(
     done = run("monitor", name, "--once", *words)
     if channel is None:
         assert opened == []
-        assert done.code == (1 if name == "missing.log" else 0)
+        assert done.code == (2 if name == "missing.log" else 0)
     else:
         assert (opened, done.code) == ([channel], 1)
 

@@ -13,13 +13,10 @@ import time
 from pathlib import Path
 
 import pytest
-from capture_bench import START, Bench, capture_file, made
-from command_line import refused, run
+from command_line import refused
 from recordings import candump_log, dump_bytes
 
-from kontronik_can_gw.capture.format import Entry, Kind, numbers_data
 from kontronik_can_gw.cli.desk import watched
-from kontronik_can_gw.esc.telemetry import SECOND
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
@@ -109,22 +106,3 @@ def test_a_long_conversion_counts_what_is_done_on_a_terminal(
         assert [*watched(blocks, "flight.kcap to csv:", data_on_screen=False)] == blocks
         shown = re.search(r"flight\.kcap to csv: \D*3\b", screen.getvalue())
         assert shown if on_terminal else not screen.getvalue()
-
-
-@pytest.mark.parametrize(("step_s", "told"), [(3600, "+3600.000"), (-5, "-5.000"), (0, "")])
-def test_a_clock_that_was_set_in_a_capture_is_told_with_the_step(
-    tmp_path: Path, step_s: int, told: str
-) -> None:
-    """A log has one clock, which goes on as it began."""
-    bench = Bench(*made(1)).live(1, 2)
-    middle = len(bench.entries) // 2
-    at = bench.entries[middle].time_ns
-    begun = 1_700_000_000 * SECOND - START
-    wall = numbers_data(begun + at + step_s * SECOND)
-    bench.entries.insert(middle, Entry(at, Kind.CLOCK, 0, wall, 0, None))
-    source = tmp_path / "a.kcap"
-    source.write_bytes(capture_file(bench.setup, bench.entries))
-    said = run("convert", source, tmp_path / "a.log").err
-    assert ("the clock was set" in said) == bool(told)
-    if told:
-        assert f"; the clock was set by {told} s in it, the log goes on as it began" in said

@@ -318,7 +318,12 @@ def test_frames_that_the_controller_or_the_kernel_lost_are_noted_once(
 @pytest.fixture
 def opened(fake: FakeSocket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSocket:
     """The socket that ``open_socketcan`` gets. In tmp_path is /sys/class/net."""
-    monkeypatch.setattr(socket, "socket", lambda *_: fake)
+    real = socket.socket
+
+    def make(family: int, *rest: int) -> Any:
+        return fake if family == socket.AF_CAN else real(family, *rest)
+
+    monkeypatch.setattr(socket, "socket", make)
     monkeypatch.setattr(socketcan_port, "Path", lambda _, *parts: tmp_path.joinpath(*parts))
     (tmp_path / "lo").mkdir()
     (tmp_path / "can0").mkdir()
@@ -333,7 +338,7 @@ def test_an_interface_is_opened_with_error_frames_and_can_fd_if_asked(
     socketcan_port.open_socketcan(CanConfig()).close()
     assert opened.options[socketcan_port._CAN_RAW_ERR_FILTER] == 0x1FFFFFFF
     assert socket.CAN_RAW_FD_FRAMES not in opened.options
-    with pytest.raises(RunError, match="does not do CAN FD"):
+    with pytest.raises(RunError, match="CAN FD is not switched on"):
         socketcan_port.open_socketcan(CanConfig(fd=True))
     (tmp_path / "can0" / "mtu").write_text("72\n")
     socketcan_port.open_socketcan(CanConfig(fd=True)).close()
