@@ -61,7 +61,7 @@ make_venv() {
         elif can_root; then
             apt_update
             say "$package"
-            as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 \
+            as_root env DEBIAN_FRONTEND=noninteractive DEBCONF_NOWARNINGS=yes apt-get -qq -o DPkg::Lock::Timeout=120 \
                 install -y --no-install-recommends "$package" </dev/null >/dev/null ||
                 die "cannot install $package"
         else
@@ -120,7 +120,7 @@ install_vcan() {
     extra=linux-modules-extra-$(uname -r) # Ubuntu has vcan in there
     if can_root && apt_update && apt-cache show "$extra" >/dev/null 2>&1; then
         say "$extra (vcan)"
-        as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 \
+        as_root env DEBIAN_FRONTEND=noninteractive DEBCONF_NOWARNINGS=yes apt-get -qq -o DPkg::Lock::Timeout=120 \
             install -y --no-install-recommends "$extra" </dev/null >/dev/null || say "failed; going on"
         has_vcan && return
     fi
@@ -146,7 +146,7 @@ install_programs() {
     apt_update
     say "$why:$wanted"
     for package in $wanted; do
-        as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 \
+        as_root env DEBIAN_FRONTEND=noninteractive DEBCONF_NOWARNINGS=yes apt-get -qq -o DPkg::Lock::Timeout=120 \
             install -y --no-install-recommends "$package" </dev/null >/dev/null || say "$package: failed; going on"
     done
 }

@@ -22,7 +22,7 @@ for part in "$@"; do
     esac
 done
 
-apt() { $sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 "$@" </dev/null; }
+apt() { $sudo env DEBIAN_FRONTEND=noninteractive DEBCONF_NOWARNINGS=yes apt-get -qq -o DPkg::Lock::Timeout=120 "$@" </dev/null; }
 
 # Quiet, but the whole log when it fails.
 install() {
