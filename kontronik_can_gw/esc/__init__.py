@@ -1,1 +1,1 @@
-"""What every ESC has: its state, the values it supplies, a simulated one; the protocols it speaks in folders of their own."""
+"""ESCs: the seam of a protocol, the state of one ESC, published values. One folder a protocol."""

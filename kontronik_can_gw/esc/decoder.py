@@ -1,7 +1,8 @@
-"""The seam of an ESC protocol: a stateful decoder from bytes to readings, and tables that say what the readings hold.
+"""The seam of an ESC protocol: a decoder from bytes to readings, and tables that describe readings.
 
-A protocol is one ``EscProtocol`` in the tuple of protocols.py. Nothing outside its folder knows its frames, fields or error bits: all
-others take names, steps, texts and codes from these tables. Standard library only, no I/O, no clock.
+A protocol is one ``EscProtocol``, listed in protocols.py. Its frames, fields and error bits are
+private to its folder. All other code reads names, steps, texts and codes from these tables.
+Standard library only, no I/O, no clock.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,35 +13,41 @@ from typing import Any, NamedTuple, Protocol, Self
 
 SECOND_NS = 1_000_000_000
 Data = Any
-"""The fields of a reading as whole steps: a Sequence[int], of a type that is the protocol's own."""
+"""The fields of a reading in steps: a Sequence[int] whose type is private to the protocol."""
 
 
 @dataclass(eq=False)
 class FrameForm:
-    """A form of a protocol's frames. ``layout_number``: of the frame layout, 1 ... as listed in EscProtocol.layouts."""
+    """One form of a protocol's frames."""
 
     length: int
     """In bytes."""
     is_info: bool = False
-    """True for a frame with information of the device, False for one with live data."""
+    """True for a frame about the device, False for a frame with live data."""
     layout_number: int = 1
+    """Position of the frame layout in EscProtocol.layouts, counted from 1."""
 
 
 class Reading(NamedTuple):
-    """An accepted frame: its form, the stream position of its first byte, its fields as whole steps."""
+    """An accepted frame."""
 
     form: FrameForm
     offset: int
+    """Position of the frame's first byte in the stream."""
     data: Data
+    """The fields in steps."""
 
     @property
-    def suspect(self) -> bool:
-        """True where data outside the frame's checksum is impossible."""
+    def is_suspect(self) -> bool:
+        """True if data that the frame's checksum does not cover has an impossible value."""
         return False
 
 
 class Counters(Protocol):
-    """What one stream held; all numbers only grow. ``dropped_bytes`` are certain to belong to no frame."""
+    """Counts of one stream. They never decrease.
+
+    ``dropped_bytes`` counts only bytes that are certainly not part of a frame.
+    """
 
     @property
     def bytes(self) -> int: ...
@@ -55,14 +62,20 @@ class Counters(Protocol):
     def copy(self) -> Self: ...
 
     def as_dict(self) -> dict[str, int]:
-        """All counters by name, those above among them."""
+        """Return all counters by name, including the five above."""
 
     def diagnosis(self, since: Self | None = None) -> str | None:
-        """Why no frame has come (since an earlier state), in words; None where one has."""
+        """Explain in words why no frame was received since the earlier state ``since``.
+
+        Without ``since``, since the start of the stream. None if a frame was received.
+        """
 
 
 class Decoder(Protocol):
-    """Finds the frames of one byte stream, however it is cut. Never raises: what is no frame is counted and dropped."""
+    """Finds the frames of one byte stream, however it is cut into chunks.
+
+    No method raises. Bytes that are not part of a frame are counted and dropped.
+    """
 
     @property
     def counters(self) -> Any:
@@ -70,17 +83,24 @@ class Decoder(Protocol):
 
     @property
     def pending(self) -> int:
-        """How many bytes are held, undecided."""
+        """Number of bytes held because they may be part of a frame that is still incomplete."""
 
     def feed(self, data: bytes, now: int = 0) -> Sequence[Reading]:
-        """The next bytes, read at ``now`` (ns; for protocols without a header, which synchronise on the gap): what is certain by then."""
+        """Take the next bytes and return the readings that are now certain, in stream order.
+
+        ``now`` is the time of the read in ns. Protocols whose frames have no header use it to find
+        the gap between two frames.
+        """
 
     def flush(self) -> Sequence[Reading]:
-        """The stream ended or was interrupted: what is left of it; ready for a new start."""
+        """End the stream: return the readings in the pending bytes and drop the rest.
+
+        The next call of ``feed`` starts a new stream. The counters continue.
+        """
 
 
 class Severity(Enum):
-    """Class of an error bit: an error, a warning, or a mere status that is no alarm."""
+    """Class of an error bit. A status is not an alarm."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -88,19 +108,22 @@ class Severity(Enum):
 
 
 class ErrorBit(IntEnum):
-    """The bits of an error word; a protocol derives one for each of its words.
+    """The bits of an error word. A protocol derives a class from this for each of its words.
 
-    A member is written ``NAME = (bit, severity, meaning, remedy, code, is_summary, is_normal)``; the last three may be left out.
-    ``remedy``: what a person should do. ``code``: of a CANopen emergency, None for one of the manufacturer's. ``is_summary``: set with
-    any other bit of its severity, which explains it. ``is_normal``: set in normal operation, nothing to show.
+    A member is written ``NAME = (bit, severity, meaning, remedy, code, is_summary, is_normal)``.
+    The last three may be left out.
     """
 
     severity: Severity
     meaning: str
     remedy: str
+    """Instruction for the user."""
     code: int | None
+    """CANopen emergency error code. None: a manufacturer-specific code is used."""
     is_summary: bool
+    """True if the bit is set whenever another bit of its severity is set. That bit has the details."""
     is_normal: bool
+    """True if the bit is set in normal operation, so that displays leave it out."""
 
     def __new__(
         cls,
@@ -124,12 +147,15 @@ class ErrorBit(IntEnum):
 
     @property
     def text(self) -> str:
-        """The name as decode prints it and DBC signals bind to it."""
+        """The name in tables, and the name to which DBC signals bind."""
         return self.name.lower()
 
 
 def bit_texts(word: int, names: type[ErrorBit] | Sequence[ErrorBit]) -> list[str]:
-    """Names of the bits set in a 32-bit error word, lowest first; a bit without a name is ``bit24`` and the like."""
+    """Return the names of the bits that are set in a 32-bit error word, lowest bit first.
+
+    A bit without a name is called ``bit24`` or similar.
+    """
     if not word:
         return []
     known = {int(bit): bit.text for bit in names}
@@ -137,79 +163,92 @@ def bit_texts(word: int, names: type[ErrorBit] | Sequence[ErrorBit]) -> list[str
 
 
 class State(NamedTuple):
-    """An operating state.
-
-    ``meaning``: its name in words. ``remedy``: what a person should do. ``kind``: ``idle``, ``start``, ``run``, ``brake`` or ``fault``.
-    ``phase``: what it is shown alike with, in words.
-    """
+    """An operating state of the ESC."""
 
     text: str
+    """Name in value tables."""
     meaning: str
+    """The name in words."""
     remedy: str
+    """Instruction for the user."""
     kind: str | None = None
+    """``idle``, ``start``, ``run``, ``brake`` or ``fault``. None if unknown."""
     phase: str = ""
+    """Label of the group of states that a report draws alike."""
 
 
 class Field(NamedTuple):
-    """A value that readings supply, as ``data[word] >> shift & mask``; ``per_unit`` steps make one ``unit``.
-
-    ``low``..``high``: possible values in steps, a signal that cannot hold them is checked. ``not_on``: numbers of the devices that do not
-    supply it. ``names``: of an enumeration.
-    """
+    """A value that readings supply: ``data[word] >> shift & mask``."""
 
     name: str
     unit: str
     word: int
+    """Index in the reading's data."""
     low: int
+    """Smallest possible value in steps. A DBC signal that cannot hold low..high gets a note."""
     high: int
+    """Greatest possible value in steps."""
     per_unit: int = 1
+    """Steps that make one ``unit``."""
     is_info: bool = False
     shift: int = 0
     mask: int = -1
     not_on: frozenset[int] = frozenset()
+    """Numbers of the devices that do not supply the value."""
     names: Mapping[int, str] = {}
+    """Names of an enumeration's numbers."""
 
     def of(self, data: Sequence[int]) -> int:
-        """The value in a reading, in steps."""
+        """Return the value in a reading's data, in steps."""
         return data[self.word] >> self.shift & self.mask
 
 
 @dataclass(frozen=True, eq=False)
 class EscProtocol:
-    """An ESC protocol: how its line is set, its decoder, and what its readings hold.
+    """An ESC protocol: the settings of its line, its decoder, and tables that describe its readings.
 
-    Fields with a meaning of their own, by name: ``electrical_speed``, ``battery_voltage``, ``battery_current`` (live, whole words; run time
-    and energy come of them), ``operating_state_raw``, ``operating_errors``, ``selftest_errors``, ``cell_count``, ``device_raw``,
-    ``variant``, ``firmware_main``, ``firmware_sub``. Any may be missing.
+    These field names have a fixed meaning; each may be missing:
+
+    - ``electrical_speed``, ``battery_voltage`` and ``battery_current`` are whole words of live data.
+      Run time and energy are computed from them.
+    - ``operating_state_raw`` and ``operating_errors`` are in live data.
+    - ``device_raw``, ``variant``, ``firmware_main``, ``firmware_sub``, ``cell_count`` and
+      ``selftest_errors`` are in info data.
+
+    Arguments named ``data`` are the data of a live or an info reading, or None if there is none.
     """
 
     name: str
-    """As a configuration has it."""
+    """Name in configuration files."""
     make: Callable[[], Decoder]
-    """A decoder at the start of a stream."""
+    """Creates a decoder at the start of a stream."""
     fields: tuple[Field, ...]
     maker: str = "unknown"
-    """Who makes the ESCs, as people write it."""
+    """Manufacturer of the ESCs, for display."""
     baud_rate: int = 115_200
     even_parity: bool = False
-    """With 8 data bits and 1 stop bit."""
+    """The line always has 8 data bits and 1 stop bit."""
     layouts: tuple[str, ...] = ("1",)
-    """Names of the frame layouts, from number 1 on."""
+    """Names of the frame layouts, beginning with number 1."""
     errors: Mapping[str, Sequence[ErrorBit]] = field(default_factory=dict)
-    """Name of an error word to its bits."""
+    """Maps the name of an error word to its bits."""
     states: Mapping[int, State] = field(default_factory=dict)
     backward_states: frozenset[int] = frozenset()
     """Values of ``operating_state_raw`` in which the motor turns backward."""
     devices: Mapping[int, str] = field(default_factory=dict)
+    """Maps the number of a device to its name."""
     peak_current_of: Mapping[int, str] = field(default_factory=dict)
-    """Number of a device to whose peak current it reports: ``motor`` or ``battery``."""
+    """Maps the number of a device to the origin of its peak current: ``motor`` or ``battery``."""
     wire: tuple[tuple[str, type[tuple[int, ...]]], ...] | None = None
-    """struct codes, as they are sent, and type of live data and of information; None where the core in C does not decode it."""
+    """struct codes in wire order, and data type, of live data and then of info data.
+
+    None if the C core cannot decode the protocol.
+    """
 
     @cached_property
     def by_name(self) -> Mapping[str, Field]:
         """The fields by name."""
-        return {found.name: found for found in self.fields}
+        return {each.name: each for each in self.fields}
 
     @cached_property
     def bits(self) -> Mapping[str, ErrorBit]:
@@ -218,48 +257,67 @@ class EscProtocol:
 
     @cached_property
     def byte_ns(self) -> int:
-        """Wire time of a byte, ns."""
-        return (11 if self.even_parity else 10) * SECOND_NS // self.baud_rate
+        """Time of one byte on the wire in ns."""
+        bits = 11 if self.even_parity else 10
+        return bits * SECOND_NS // self.baud_rate
 
     @cached_property
     def line(self) -> str:
-        """The line's settings as people write them."""
-        return f"{self.baud_rate} {'8E1' if self.even_parity else '8N1'}"
+        """The line's settings, for example "115200 8E1"."""
+        parity = "E" if self.even_parity else "N"
+        return f"{self.baud_rate} 8{parity}1"
 
     def value(self, name: str, data: Data | None) -> int | None:
-        """A field of a reading, in steps; None without a reading, and where the protocol does not supply it."""
+        """Return a field in steps. None without data, or if the protocol does not supply it."""
         found = self.by_name.get(name)
-        return None if found is None or data is None else found.of(data)
+        if found is None or data is None:
+            return None
+        return found.of(data)
 
     def state_text(self, data: Data | None) -> str | None:
-        """The operating state of live data: its name, the number of one without."""
+        """Return the operating state's name, or its number as text if it has no name."""
         number = self.value("operating_state_raw", data)
         if number is None:
             return None
-        return self.states[number].text if number in self.states else str(number)
+        state = self.states.get(number)
+        return str(number) if state is None else state.text
 
     def device_name(self, data: Data | None) -> str | None:
-        """The name of the device of information; None where it is not known, and for one without a name."""
+        """Return the device's name. None if the device is unknown or has no name."""
         number = self.value("device_raw", data)
-        return None if number is None else self.devices.get(number)
+        if number is None:
+            return None
+        return self.devices.get(number)
 
     def device_text(self, data: Data | None) -> str | None:
-        """The device of information: its name, the number of one without."""
+        """Return the device's name, or its number as text if it has no name."""
         number = self.value("device_raw", data)
-        return None if number is None else self.devices.get(number, str(number))
+        if number is None:
+            return None
+        return self.devices.get(number, str(number))
 
     def firmware_text(self, data: Data | None) -> str | None:
-        """Main and sub version of the firmware, as "1.14"."""
-        main, sub = self.value("firmware_main", data), self.value("firmware_sub", data)
+        """Return main and sub version of the firmware, for example "1.14"."""
+        main = self.value("firmware_main", data)
+        sub = self.value("firmware_sub", data)
         if main is None:
             return None
-        return str(main) if sub is None else f"{main}.{sub}"
+        if sub is None:
+            return str(main)
+        return f"{main}.{sub}"
 
     def peak_current_text(self, data: Data | None) -> str | None:
-        """Whose peak current the device reports (a held maximum): ``motor``, ``battery``, or None where unknown."""
+        """Return the origin of the device's peak current, ``motor`` or ``battery``.
+
+        The peak current is a held maximum. None if its origin is unknown.
+        """
         number = self.value("device_raw", data)
-        return None if number is None else self.peak_current_of.get(number)
+        if number is None:
+            return None
+        return self.peak_current_of.get(number)
 
     def layout_text(self, layout: int) -> str | None:
-        """The name of a frame layout; None for 0, unknown."""
-        return self.layouts[layout - 1] if layout else None
+        """Return the name of a frame layout. None for 0, which means unknown."""
+        if layout == 0:
+            return None
+        return self.layouts[layout - 1]

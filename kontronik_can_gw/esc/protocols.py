@@ -1,14 +1,20 @@
-"""The ESC protocols that the gateway can decode. Another one is a folder beside ``kontronik`` and a line here."""
+"""The ESC protocols that the gateway can decode.
+
+To add one, create a folder beside ``kontronik`` and add its ``EscProtocol`` to the tuple here.
+"""
 
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 
 PROTOCOLS: tuple[EscProtocol, ...] = (KONTRONIK,)
-"""The first is that of an ESC whose configuration names none."""
+"""All protocols. The first is used for an ESC whose configuration does not name one."""
 
 
 def protocol_named(name: str | None) -> EscProtocol:
-    """The protocol of this name; None, as in files of 0.5.0: the first. ValueError where there is none."""
+    """Return the protocol with this name, or raise ValueError if it is unknown.
+
+    None returns the first protocol: captures of version 0.5.0 do not name one.
+    """
     if name is None:
         return PROTOCOLS[0]
     for protocol in PROTOCOLS:
@@ -20,10 +26,13 @@ def protocol_named(name: str | None) -> EscProtocol:
 
 
 def protocol_names() -> tuple[str, ...]:
-    """Names of all protocols."""
+    """Return the names of all protocols."""
     return tuple(protocol.name for protocol in PROTOCOLS)
 
 
 def device_names() -> tuple[str, ...]:
-    """Names of all devices of all protocols."""
-    return tuple(dict.fromkeys(text for each in PROTOCOLS for text in each.devices.values()))
+    """Return the device names of all protocols, each once."""
+    names: dict[str, None] = {}
+    for protocol in PROTOCOLS:
+        names |= dict.fromkeys(protocol.devices.values())
+    return tuple(names)

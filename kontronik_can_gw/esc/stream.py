@@ -1,10 +1,15 @@
-"""One ESC's stream in plain Python: bytes and time in, its state and events out.
+"""One ESC's stream in plain Python: takes bytes and time, keeps the ESC's state, returns events.
 
-Arrival. No byte of a read came before ``since``, and on the wire one byte follows another: byte k of a read (1 ...) came at
-``since`` + (k - 1) byte times at the earliest. Time-outs count from there (the bound): nothing outlives its time-out, however late
-it is read. Ages, energy and run time count from the time of the read, less the bytes that came after the frame, unless that is
-more than the link's usual interval after the bound: then from the bound, too. So an age shown is never smaller than the truth by more than
-one interval. An adapter that bundles bytes adds what it holds them back for (1 ms; 16 ms where that cannot be set).
+Arrival times. ``since`` of a read is a time at which none of its bytes had arrived yet, and bytes
+follow one another on the wire. So byte k of a read (1, 2, ...) arrived no earlier than ``since``
+plus k - 1 byte times. This time is called the bound.
+
+1. Time-outs count from the bound. So no value outlives its time-out, however late it is read.
+2. Ages, energy and run time count from the time of the read, minus the wire time of the bytes after
+   the frame. If that is later than the bound by more than the link's usual interval between frames,
+   they count from the bound, too. So the age shown is at most one interval below the true age.
+
+An adapter that bundles bytes delays them further: by 1 ms, or by 16 ms if that cannot be set.
 """
 
 import math
@@ -24,37 +29,46 @@ from kontronik_can_gw.esc.telemetry import (
     LinkState,
 )
 
-_DEGRADED_DROPPED_SHARE = 10  # one byte dropped in ten received
-# An enumeration's members are slow to look up.
-_NEVER_SEEN, _OK, _DEGRADED = LinkState.NEVER_SEEN, LinkState.OK, LinkState.DEGRADED
+_DEGRADED_BYTES_PER_DROPPED = 10
+"""A link is degraded if more than one byte in this many is dropped."""
+# Members of an enumeration are slow to look up.
+_NEVER_SEEN = LinkState.NEVER_SEEN
+_OK = LinkState.OK
+_DEGRADED = LinkState.DEGRADED
 
 
 class EscStream(EscTelemetry):
-    """One ESC's stream and what is known from it."""
+    """The byte stream of one ESC and the state computed from it."""
 
     def __init__(self, settings: EscSettings, now: int) -> None:
         self.protocol = protocol_named(settings.protocol)
         self.decoder: Decoder = self.protocol.make()
         fields = self.protocol.by_name
         words = {name: field.word for name, field in fields.items()}
-        self._errors_at = words.get("operating_errors")
-        self._speed_at = words.get("electrical_speed")
-        parts = [fields[name] for name in ("battery_voltage", "battery_current") if name in fields]
-        self._power_at = [part.word for part in parts] if len(parts) == 2 else None
-        self._per_watt = math.prod(part.per_unit for part in parts)
+        self._errors_word = words.get("operating_errors")
+        self._speed_word = words.get("electrical_speed")
+        factors = [
+            fields[name] for name in ("battery_voltage", "battery_current") if name in fields
+        ]
+        self._power_words: list[int] | None = None
+        if len(factors) == 2:
+            self._power_words = [factor.word for factor in factors]
+        self._steps_per_watt = math.prod(factor.per_unit for factor in factors)
         self.apply(settings)
         self.base: Counters = self.counters.copy()
         self._arrivals: deque[tuple[int, int]] = deque()
-        """(stream position after a chunk, the bound of its last byte) while bytes are pending."""
-        self._interval_ns = 0  # between live frames, as usual; 0: not known
+        """For each chunk with pending bytes: the stream position after it, its last byte's bound."""
+        self._interval_ns = 0
+        """Usual interval between live frames. 0: unknown."""
         self._window_ns = now
+        """Start of the current window of rate and quality."""
         self._window_counters = self.base
 
     @property
     def counters(self) -> Counters:
-        """Counters of the whole stream so far."""
-        found: Counters = self.decoder.counters
-        return found
+        """Counters of the whole stream. The decoder goes on changing this object."""
+        counters: Counters = self.decoder.counters
+        return counters
 
     def frozen(self) -> Self:
         twin = copy(self)
@@ -65,14 +79,18 @@ class EscStream(EscTelemetry):
 
     def apply(self, settings: EscSettings) -> None:
         super().apply(settings)
-        self.cells = settings.cell_count or self.protocol.value("cell_count", self.info) or 0
+        self._update_cells()
 
     def receive_each(self, data: bytes, now: int, since: int) -> Iterator[int]:
-        """Take bytes that were read at ``now`` and came after ``since``; the events of each frame in turn: iterate to the end.
+        """Take bytes read at ``now``, of which none had arrived at ``since``.
 
-        What is too old by ``now`` was expired before (``expire``). An unfinished frame older than the time-out is given up first.
+        Yields the events of each frame, while the state is the state after that frame. Iterate to
+        the end, otherwise the rest of the frames is lost. Call ``expire`` first: this method does
+        not drop values that are too old by ``now``. A pending part of a frame is given up if it is
+        older than the time-out.
         """
-        decoder, arrivals = self.decoder, self._arrivals
+        decoder = self.decoder
+        arrivals = self._arrivals
         byte_ns = self.protocol.byte_ns
         timeout = self.settings.timeout_ns
         if arrivals and now - arrivals[0][1] > timeout:
@@ -89,39 +107,45 @@ class EscStream(EscTelemetry):
                 arrivals.popleft()
         elif arrivals:
             arrivals.clear()
-        shown = now if now - bound <= self._interval_ns else bound
+        shown = bound
+        if now - bound <= self._interval_ns:
+            shown = now
         for reading in readings:
             form, offset, _ = reading
-            after = (end - offset - form.length) * byte_ns
-            if now - bound + after > (INFO_TIMEOUT_NS if form.is_info else timeout):
-                # the bytes after it in the same read make it old already
+            after_ns = (end - offset - form.length) * byte_ns
+            if now - bound + after_ns > (INFO_TIMEOUT_NS if form.is_info else timeout):
+                # More bytes followed it in the same read than its time-out permits.
                 self.late_frames += 1
             else:
-                yield self.accept(reading, shown - after, bound - after)
+                yield self.accept(reading, shown - after_ns, bound - after_ns)
         if self.link is _NEVER_SEEN:
             yield self._set_link(LinkState.SEARCHING)
 
     def port_opened(self) -> int:
-        """The port is open (again)."""
+        """Note that the port was opened, for the first time or again. Returns the events."""
         if self.link is not LinkState.PORT_ERROR:
             return Event.NONE
         return self._set_link(LinkState.NEVER_SEEN if self.live_ns is None else LinkState.LOST)
 
     def port_lost(self) -> int:
-        """The port is gone: what was pending is dropped, nothing is fresh any more."""
+        """Note that the port was lost: drops pending bytes and all fresh data. Returns the events."""
         self.decoder.flush()
         self._arrivals.clear()
         return self._lose(LinkState.PORT_ERROR)
 
     def advance(self, now: int) -> int:
-        """Let time pass: expire what is old, close the one-second window of rate and quality."""
+        """Let time pass: drop expired data, and update rate and link quality once a second.
+
+        Returns the events. A call before ``next_deadline`` changes nothing. After a late call the
+        rate is computed over the longer time.
+        """
         events = self.expire(now)
         if now - self._window_ns >= SECOND:
             events |= self._close_window(now)
         return events
 
     def expire(self, now: int) -> int:
-        """What is too old by ``now`` is not available any more."""
+        """Drop live and info data that is too old at ``now``. Returns the events."""
         events = Event.NONE
         if self.live is not None and now - self.live_bound_ns > self.settings.timeout_ns:
             self.losses += 1
@@ -132,7 +156,7 @@ class EscStream(EscTelemetry):
         return events
 
     def next_deadline(self) -> int:
-        """When ``advance`` has something to do."""
+        """Return the time of the next call of ``advance`` that can change anything."""
         deadline = self._window_ns + SECOND
         if self.live is not None:
             deadline = min(deadline, self.live_bound_ns + self.settings.timeout_ns + 1)
@@ -141,31 +165,42 @@ class EscStream(EscTelemetry):
         return deadline
 
     def accept(self, reading: Reading, when: int, bound: int) -> int:
-        """Take a reading that came at ``when``, at ``bound`` at the earliest (see Arrival); its events."""
+        """Take a reading and return the events.
+
+        ``when`` is its arrival as ages count it, ``bound`` its earliest possible arrival.
+        """
         form, _, data = reading
         events = Event.NONE
         if form.layout_number != self.layout:
             self.layout = form.layout_number
             self._forget_device()
-            self.last_live = self.last_info = self.device = None  # of another device
+            # The old data is from another device.
+            self.last_live = None
+            self.last_info = None
             self.last_info_ns = None
+            self.device = None
             events = Event.INFO | Event.LINK
         if form.is_info:
             return events | self._accept_info(data, when, bound)
-        if reading.suspect:
+        if reading.is_suspect:
             self.suspect_frames += 1
-        if (before := self.live_ns) is not None:
+        live = self.live
+        before = self.live_ns
+        if before is not None:
+            # Neither time moves backwards.
             if when < before:
                 when = before
             if bound < self.live_bound_ns:
                 bound = self.live_bound_ns
-            if self.live is not None:
-                self._draw(self.live, when - before)
-        at, live = self._errors_at, self.live
-        if at is not None and (live is None or live[at] != data[at]):
+            if live is not None:
+                self._integrate(live, when - before)
+        errors_word = self._errors_word
+        if errors_word is not None and (live is None or live[errors_word] != data[errors_word]):
             events |= Event.STATE
-        self.live = self.last_live = data
-        self.live_ns, self.live_bound_ns = when, bound
+        self.live = data
+        self.last_live = data
+        self.live_ns = when
+        self.live_bound_ns = bound
         if self.link is not _OK and self.link is not _DEGRADED:
             events |= self._set_link(_OK)
             self.frame_rate = None
@@ -174,35 +209,46 @@ class EscStream(EscTelemetry):
             self._window_counters = self.counters.copy()
         return events | Event.LIVE
 
-    def _draw(self, live: Data, ns: int) -> None:
-        """Between two readings the power, and whether the motor turns, are those of the first. Regeneration does not count."""
-        if self._power_at is not None:
-            voltage, current = self._power_at
-            power = live[voltage] * live[current]
+    def _integrate(self, live: Data, ns: int) -> None:
+        """Add the energy and run time of the ``ns`` that follow the live data ``live``.
+
+        Its power, and whether its speed is 0, count until the next live data. Regeneration does not
+        reduce the energy.
+        """
+        if self._power_words is not None:
+            voltage_word, current_word = self._power_words
+            power = live[voltage_word] * live[current_word]
             if power > 0:
-                self.energy_mw_ns += power * ns * 1000 // self._per_watt
-        if self._speed_at is not None and live[self._speed_at]:
+                self.energy_mw_ns += power * ns * 1000 // self._steps_per_watt
+        if self._speed_word is not None and live[self._speed_word]:
             self.run_time_ns += ns
 
     def _accept_info(self, data: Data, when: int, bound: int) -> int:
-        value, old = self.protocol.value, self.info
-        another = old is not None and any(
-            value(name, data) != value(name, old) for name in ("device_raw", "variant")
-        )
-        self.info = self.last_info = data
-        self.last_info_ns, self.info_bound_ns = when, bound
-        self.cells = self.settings.cell_count or value("cell_count", data) or 0
-        self.device = value("device_raw", data)
-        if another:
+        old = self.info
+        self.info = data
+        self.last_info = data
+        self.last_info_ns = when
+        self.info_bound_ns = bound
+        self._update_cells()
+        self.device = self.protocol.value("device_raw", data)
+        if old is None:
+            return Event.INFO | Event.STATE
+        value = self.protocol.value
+        if any(value(name, data) != value(name, old) for name in ("device_raw", "variant")):
             return Event.INFO | Event.LINK | Event.STATE
-        return Event.INFO | Event.STATE if old is None else Event.INFO
+        return Event.INFO
+
+    def _update_cells(self) -> None:
+        """Use the configured number of cells, or else the number in fresh info data."""
+        self.cells = self.settings.cell_count or self.protocol.value("cell_count", self.info) or 0
 
     def _forget_device(self) -> None:
         self.info = None
         self.info_bound_ns = None
-        self.cells = self.settings.cell_count
+        self._update_cells()
 
     def _lose(self, state: LinkState) -> int:
+        """Drop all fresh data and set the link to ``state``. Returns the events."""
         events = self._set_link(state)
         if self.live is not None:
             self.live = None
@@ -220,18 +266,24 @@ class EscStream(EscTelemetry):
         return Event.LINK
 
     def _close_window(self, now: int) -> int:
-        old, new = self._window_counters, self.counters
-        frames = new.live - old.live
-        length = now - self._window_ns
-        self.frame_rate = (20 * SECOND * frames + length) // (2 * length) if self.up else 0
-        self._interval_ns = length // frames if self.up and frames else 0
-        dropped, received = new.dropped_bytes - old.dropped_bytes, new.bytes - old.bytes
-        bad = (
-            new.crc_errors - old.crc_errors >= self.settings.crc_error_threshold
-            or dropped * _DEGRADED_DROPPED_SHARE > received
-        )
+        """Compute rate, interval and link quality since the last call. Returns the events."""
+        old = self._window_counters
+        new = self.counters
+        window_ns = now - self._window_ns
         self._window_ns = now
         self._window_counters = new.copy()
-        if self.up:
-            return Event.SECOND | self._set_link(LinkState.DEGRADED if bad else LinkState.OK)
-        return Event.SECOND
+        self.frame_rate = 0
+        self._interval_ns = 0
+        if not self.up:
+            return Event.SECOND
+        frames = new.live - old.live
+        self.frame_rate = (20 * SECOND * frames + window_ns) // (2 * window_ns)
+        if frames:
+            self._interval_ns = window_ns // frames
+        crc_errors = new.crc_errors - old.crc_errors
+        dropped = new.dropped_bytes - old.dropped_bytes
+        received = new.bytes - old.bytes
+        has_crc_errors = crc_errors >= self.settings.crc_error_threshold
+        has_gaps = dropped * _DEGRADED_BYTES_PER_DROPPED > received
+        is_degraded = has_crc_errors or has_gaps
+        return Event.SECOND | self._set_link(_DEGRADED if is_degraded else _OK)

@@ -1,7 +1,7 @@
-"""The state of one ESC: newest data, derived values, freshness, link. What makes it of bytes and time is in stream.py, or in C.
+"""The state of one ESC: newest data, derived values, freshness, link.
 
-``now`` is integer nanoseconds of one monotonic clock. What this object shows as ``live`` or ``info`` is fresh; what is not fresh,
-or not known of the device now on the line, is None.
+stream.py, or its twin in C, computes this state from bytes and time. ``now`` is a whole number of
+nanoseconds of one monotonic clock.
 """
 
 from dataclasses import dataclass
@@ -15,103 +15,131 @@ from kontronik_can_gw.esc.protocols import PROTOCOLS
 MS = 1_000_000
 SECOND = 1000 * MS
 INFO_TIMEOUT_NS = 10 * SECOND
-"""Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
+"""Info data older than this is not available.
+
+An ESC sends an info frame every second, or every five seconds if it sends at 20 Hz.
+"""
 
 
 class LinkState(IntEnum):
     """State of one UART."""
 
     NEVER_SEEN = 0
+    """There was no live frame yet, and no byte since the port was opened."""
     SEARCHING = 1
+    """Bytes were received, but no live frame."""
     OK = 2
     DEGRADED = 3
+    """Live data is fresh, but too many bytes or frames are bad."""
     LOST = 4
+    """Live data is older than the time-out."""
     PORT_ERROR = 5
+    """The serial port is not open."""
 
 
 class Event:
-    """What a call changed: bits of a plain int, because an IntFlag would be a third of the cost of a frame."""
+    """Bits that report the changes made by a call.
+
+    They are plain integers because an IntFlag would take a third of the time of a frame.
+    """
 
     NONE = 0
     LIVE = 1
     INFO = 2
     LINK = 4
     SECOND = 8
-    """A second is over: counters and rates are as new as they are to be had."""
+    """A second has passed: counters and rates were updated."""
     STATE = 16
-    """The operating errors or the device are others than in the live data or information before, or there was none."""
+    """The operating errors or the device changed, or became known."""
     ALL = 31
 
 
 @dataclass(frozen=True)
 class EscSettings:
-    """What a person knows of one ESC and its drive train.
-
-    ``gear``: motor revolutions per output revolution. ``cell_count`` 0: as the ESC reports. ``timeout_ns`` (20 ms to 60 s):
-    live data older than this is not available. ``crc_error_threshold``: CRC errors in a second that make a link DEGRADED.
-    """
+    """The user's settings of one ESC and its drive train."""
 
     name: str = "esc"
     pole_pairs: int = 1
     gear: Fraction = Fraction(1)
+    """Revolutions of the motor per revolution of the output shaft."""
     cell_count: int = 0
+    """0: the number that the ESC reports is used."""
     timeout_ns: int = 250 * MS
+    """Live data older than this is not available. 20 ms to 60 s."""
     crc_error_threshold: int = 5
+    """A link with this many CRC errors within a second is DEGRADED."""
     protocol: str = PROTOCOLS[0].name
     """Name of the ESC's protocol."""
 
 
 class EscTelemetry:
-    """What is known of one ESC, for all that read it: the packers, nodes, the status document.
-
-    ``live``, ``info`` (data of a reading, None where not available), ``link``, ``layout`` (0 unknown, else as the protocol lists them),
-    ``cells`` (0 unknown), ``pole_pairs``, ``output_divisor`` / ``gear_denominator`` (pole pairs x gear), ``frame_rate`` (live frames of
-    the last full second in 0.1 Hz, None before it), ``losses``, ``energy_mw_ns`` (drawn from the battery),
-    ``run_time_ns`` (the motor turned), ``live_ns`` and ``last_info_ns`` (time of the newest live and
-    info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and ``info_bound_ns`` are the earliest that
-    byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or not, of the layout now on the line,
-    ``device`` is the number in the latter; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
-    """
+    """The state of one ESC, as packers, nodes and the status document read it."""
 
     protocol: EscProtocol
     settings: EscSettings
     live: Data | None = None
+    """Newest live data. None unless it is fresh."""
     info: Data | None = None
+    """Newest info data of the device now on the line. None unless it is fresh."""
     last_live: Data | None = None
+    """Newest live data, fresh or not, in the layout now on the line."""
     last_info: Data | None = None
+    """Newest info data, fresh or not, in the layout now on the line."""
     device: int | None = None
+    """Number of the device in ``last_info``."""
     link: LinkState = LinkState.NEVER_SEEN
     layout: int = 0
+    """Number of the frame layout, counted from 1 as in EscProtocol.layouts. 0: unknown."""
     cells: int
+    """Number of battery cells. 0: unknown."""
     pole_pairs: int
     output_divisor: int
+    """Pole pairs times the numerator of the gear."""
     gear_denominator: int
     frame_rate: int | None = 0
+    """Live frames in the last full second, in 0.1 Hz. 0 without fresh live data.
+
+    None in the first second after the link came up.
+    """
     losses: int = 0
+    """Times that live data became too old."""
     suspect_frames: int = 0
+    """Live frames with an impossible value outside their checksum."""
     late_frames: int = 0
+    """Frames that were already older than their time-out when they were complete."""
     energy_mw_ns: int = 0
+    """Energy drawn from the battery. Recovered energy is not subtracted."""
     run_time_ns: int = 0
+    """Time during which the motor turned."""
     live_ns: int | None = None
+    """Arrival of the newest live frame's last byte, from which ages are computed.
+
+    None before the first live frame.
+    """
     last_info_ns: int | None = None
+    """The same time of the newest info frame."""
     live_bound_ns: int = 0
+    """Earliest possible arrival of the newest live frame's last byte. Time-outs count from it."""
     info_bound_ns: int | None = None
+    """The same time of the newest info frame. None unless ``info`` is fresh."""
     line_errors: int = 0
+    """Parity, framing and overrun errors. The owner of the port writes this number."""
     base: Counters
+    """Counters when statistics were last reset."""
     base_losses: int = 0
     base_line_errors: int = 0
 
     @property
     def counters(self) -> Counters:
-        """Counters of the whole stream so far."""
+        """Counters of the whole stream. Do not change them."""
         raise NotImplementedError
 
     def frozen(self) -> Self:
-        """What is known now, as a copy that nobody changes: any thread may read it."""
+        """Return a copy that never changes, so that any thread may read it."""
         raise NotImplementedError
 
     def apply(self, settings: EscSettings) -> None:
-        """Other settings from now on."""
+        """Replace the settings."""
         self.settings = settings
         self.pole_pairs = settings.pole_pairs
         self.output_divisor = settings.pole_pairs * settings.gear.numerator
@@ -119,26 +147,41 @@ class EscTelemetry:
 
     @property
     def up(self) -> bool:
-        """True while live telemetry is fresh."""
+        """True while live data is fresh."""
         return self.live is not None
 
     def supplies(self, not_on: frozenset[int], raw: int) -> bool:
-        """False for a value that the device (the last known one) does not have, and at 0 as long as the device is not known."""
-        device = self.device
-        return (self.info is not None or raw != 0) and (device is None or device not in not_on)
+        """Return False if the value ``raw`` must be shown as not available.
+
+        That is the case if the last known device is in ``not_on``, the devices that do not supply
+        the value. It is also the case for 0 without fresh info data, because the device might be
+        one of them.
+        """
+        if self.info is None and raw == 0:
+            return False
+        return self.device is None or self.device not in not_on
 
     @property
     def last_cells(self) -> int:
-        """Number of cells, 0: unknown. While telemetry is lost that of the last value."""
+        """Number of battery cells. 0: unknown.
+
+        While telemetry is lost, the number in the last info data is used.
+        """
         if self.cells or self.live is not None or self.last_info is None:
             return self.cells
         return self.protocol.value("cell_count", self.last_info) or 0
 
     def age_ms(self, now: int) -> int | None:
-        """Age of the newest live frame, None before the first."""
-        return None if self.live_ns is None else max(0, now - self.live_ns) // MS
+        """Return the age of the newest live frame. None before the first."""
+        if self.live_ns is None:
+            return None
+        return max(0, now - self.live_ns) // MS
 
     def reset_statistics(self) -> None:
-        """Let the counters that are shown relative to ``base`` begin anew; the stream's own go on."""
+        """Count from 0 again where counters are shown relative to ``base``.
+
+        The stream's own counters continue.
+        """
         self.base = self.counters.copy()
-        self.base_losses, self.base_line_errors = self.losses, self.line_errors
+        self.base_losses = self.losses
+        self.base_line_errors = self.line_errors

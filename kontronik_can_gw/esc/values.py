@@ -1,8 +1,8 @@
-"""Every value that can be published: name, unit, when it is available, how it comes about.
+"""Every value that can be published: name, unit, availability, and how it is computed.
 
-DBC signals and CANopen objects bind to these by name. A value is a whole number of steps divided by a divisor of the ESC (pole
-pairs, gear, cells), which may change at run time: physical = steps / ``per_unit`` / divisor. ``steps`` and ``physical`` read any
-of them.
+DBC signals and CANopen objects bind to these by name. A value is a whole number of steps divided by
+a divisor of the ESC (pole pairs, gear, cells), which may change at run time:
+physical value = steps / ``per_unit`` / divisor. ``steps`` and ``physical`` read any value.
 """
 
 import operator
@@ -22,32 +22,36 @@ MWS_PER_WH = 3_600_000
 
 
 class Group(Enum):
-    """When a value is available: with fresh live data, with info of the present device, or always."""
+    """When a value is available."""
 
     LIVE = "live"
+    """With fresh live data."""
     INFO = "info"
+    """With fresh info data of the present device."""
     LINK = "link"
+    """Always, for each ESC."""
     GATEWAY = "gateway"
+    """Always, once for the gateway."""
 
 
 class Kind(Enum):
-    """How a value comes about."""
+    """How a value is computed."""
 
     WIRE = "a field of the reading"
     BITS = "some bits of a field"
-    PRODUCT = "two fields multiplied"
-    INTEGRAL = "summed over time"
+    PRODUCT = "the product of two fields"
+    INTEGRAL = "a sum over time"
     RUN_TIME = "time in a state"
     COUNT = "a counter"
     AGE = "time since an event"
-    RATE = "events a second"
+    RATE = "events per second"
     STATE = "a state of the link"
-    GATEWAY = "of the gateway itself"
-    OBJECT = "as only an object of a CANopen node shows it"
+    GATEWAY = "a value of the gateway itself"
+    OBJECT = "shown only by an object of a CANopen node"
 
 
 class Divisor(Enum):
-    """What the steps of a value are divided by."""
+    """The number by which a value's steps are divided."""
 
     ONE = "1"
     POLE_PAIRS = "pole pairs"
@@ -56,15 +60,18 @@ class Divisor(Enum):
 
 
 Read = Callable[[EscTelemetry, GatewayStatus, int], int | None]
-"""ESC, gateway and time to steps; None: not available. A value of the gateway must not use the ESC."""
+"""Maps ESC, gateway and time to steps, or None if not available.
+
+The function of a gateway value must not use the ESC.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A publishable value.
+    """A value that can be published.
 
-    Steps of WIRE, BITS and PRODUCT come from the fields ``words`` (indices) of the live or info reading; all others are ``read``.
-    ``low``..``high`` in steps (None: no limit); ``names`` for an enumeration.
+    The kinds WIRE, BITS and PRODUCT are computed from the words of a live or info reading. The other
+    kinds have a function ``read``.
     """
 
     name: str
@@ -72,43 +79,52 @@ class Value:
     group: Group
     kind: Kind
     words: tuple[int, ...] = ()
+    """Indices in the reading: one for WIRE and BITS, two for PRODUCT."""
     shift: int = 0
     mask: int = -1
-    """BITS: ``field >> shift & mask``."""
+    """For BITS, the steps are ``word >> shift & mask``."""
     read: Read | None = None
     per_unit: int = 1
-    """Steps to one ``unit``."""
+    """Number of steps that make one ``unit``."""
     divisor: Divisor = Divisor.ONE
     low: int | None = None
+    """Smallest possible steps. None: unknown."""
     high: int | None = None
+    """Greatest possible steps. None: unknown."""
     names: Mapping[int, str] = field(default_factory=dict)
+    """Names of an enumeration's numbers."""
     not_on: frozenset[int] = frozenset()
     """Devices that do not supply the value."""
     optional: bool = False
-    """It may be not available although its group is."""
+    """True if it may be not available although its group is available."""
     rolls: bool = False
-    """A counter that starts again at 0 after the greatest value the signal can hold."""
+    """True for a counter that restarts at 0 after the greatest value that the signal can hold."""
     last: bool = False
-    """The last known info is taken, fresh or not."""
+    """True if the last known info data is used even if it is no longer fresh."""
     pace: Group | None = None
-    """What the value changes with, where that is not its group."""
+    """The group with which the value changes. None: its own group."""
     negative_in: tuple[int, frozenset[int]] | None = None
-    """WIRE: a word of the live reading, and its values for which the steps are negative."""
+    """WIRE: index of a word of the live reading, and its values for which the steps are negative."""
     supplied: bool = True
-    """False where the ESC's protocol does not have it: it is never available."""
+    """False if the ESC's protocol does not have the value. It is then never available."""
 
     @property
     def bit(self) -> int | None:
-        """Number of the bit of a flag in its word; None for any other value."""
-        return self.shift if self.kind is Kind.BITS and self.mask == 1 else None
+        """Position of a flag in its word. None for any other value."""
+        if self.kind is Kind.BITS and self.mask == 1:
+            return self.shift
+        return None
 
 
-_ONE, _POLE_PAIRS, _OUTPUT = Divisor.ONE, Divisor.POLE_PAIRS, Divisor.OUTPUT
-_PRODUCT = Kind.PRODUCT  # an enumeration's members are slow to look up
+# Members of an enumeration are slow to look up.
+_ONE = Divisor.ONE
+_POLE_PAIRS = Divisor.POLE_PAIRS
+_OUTPUT = Divisor.OUTPUT
+_PRODUCT = Kind.PRODUCT
 
 
 def steps(value: Value, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int | None:
-    """The value now, in steps before the divisor; None: not available."""
+    """Return the value at ``now`` in steps, not divided yet. None if not available."""
     if value.read is not None:
         return value.read(esc, gateway, now)
     if value.group is Group.LIVE:
@@ -117,22 +133,28 @@ def steps(value: Value, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> 
 
 
 def steps_of(value: Value, esc: EscTelemetry, reading: Sequence[int] | None) -> int | None:
-    """The value in a live or info reading of the ESC, in steps before the divisor; None: not available."""
+    """Return the value in a live or info reading in steps, not divided yet.
+
+    None without a reading, if the ESC's device does not supply the value, or if the value is not
+    computed from readings.
+    """
     if reading is None or not value.words:
         return None
-    found = reading[value.words[0]]
+    word = reading[value.words[0]]
     if value.kind is _PRODUCT:
-        return found * reading[value.words[1]]
-    found = found >> value.shift & value.mask
+        return word * reading[value.words[1]]
+    count = word >> value.shift & value.mask
     if value.negative_in is not None:
-        word, negative = value.negative_in
-        if reading[word] in negative:
-            found = -found
-    return found if not value.not_on or esc.supplies(value.not_on, found) else None
+        state_word, negative_states = value.negative_in
+        if reading[state_word] in negative_states:
+            count = -count
+    if value.not_on and not esc.supplies(value.not_on, count):
+        return None
+    return count
 
 
 def divisor(value: Value, esc: EscTelemetry) -> tuple[int, int] | None:
-    """Numerator and denominator of what the value's steps are divided by; None where it is not known."""
+    """Return numerator and denominator of the value's divisor. None if it is unknown."""
     if value.divisor is _ONE:
         return 1, 1
     if value.divisor is _POLE_PAIRS:
@@ -143,163 +165,226 @@ def divisor(value: Value, esc: EscTelemetry) -> tuple[int, int] | None:
     return (cells, 1) if cells else None
 
 
-def scaled(value: Value, esc: EscTelemetry, found: int | None, slope: Fraction) -> int | None:
-    """Steps x ``slope`` / divisor as a whole number, rounded once, halves up; None: not available."""
+def scaled(value: Value, esc: EscTelemetry, count: int | None, slope: Fraction) -> int | None:
+    """Return ``count`` steps x ``slope`` / divisor, rounded once to a whole number, halves up.
+
+    None if the steps or the divisor are not available.
+    """
     parts = divisor(value, esc)
-    if found is None or parts is None:
+    if count is None or parts is None:
         return None
-    numerator = found * slope.numerator * parts[1]
+    numerator = count * slope.numerator * parts[1]
     denominator = slope.denominator * parts[0]
     return (2 * numerator + denominator) // (2 * denominator)
 
 
-def physical(value: Value, esc: EscTelemetry, found: int | None) -> float | None:
-    """Steps in ``unit``: whole where one step is a unit, else a float of six decimals; None: not available."""
+def physical(value: Value, esc: EscTelemetry, count: int | None) -> float | None:
+    """Return ``count`` steps in the value's ``unit``.
+
+    The result is an integer if one step is one unit, else a float rounded to six decimals. None if
+    the steps or the divisor are not available.
+    """
     parts = divisor(value, esc)
-    if found is None or parts is None:
+    if count is None or parts is None:
         return None
     if value.per_unit == 1 and value.divisor is _ONE:
-        return found
-    return round(found * parts[1] / (value.per_unit * parts[0]), 6)
+        return count
+    return round(count * parts[1] / (value.per_unit * parts[0]), 6)
 
 
-def _supplied(protocol: EscProtocol, group: Group) -> Iterator[Value]:
-    """The values of live data or of information, then the flags of their error words."""
-    fields = [f for f in protocol.fields if f.is_info is (group is Group.INFO)]
-    for found in fields:
+def _field_values(protocol: EscProtocol, group: Group) -> Iterator[Value]:
+    """Yield the fields of live or info data, then the flags of their error words."""
+    fields = [each for each in protocol.fields if each.is_info is (group is Group.INFO)]
+    for each in fields:
         yield Value(
-            *(found.name, found.unit, group, Kind.WIRE if found.mask == -1 else Kind.BITS),
-            *((found.word,), found.shift, found.mask),
-            per_unit=found.per_unit,
-            low=found.low,
-            high=found.high,
-            names=found.names,
-            not_on=found.not_on,
-            optional=bool(found.not_on),
+            name=each.name,
+            unit=each.unit,
+            group=group,
+            kind=Kind.WIRE if each.mask == -1 else Kind.BITS,
+            words=(each.word,),
+            shift=each.shift,
+            mask=each.mask,
+            per_unit=each.per_unit,
+            low=each.low,
+            high=each.high,
+            names=each.names,
+            not_on=each.not_on,
+            optional=bool(each.not_on),
         )
-    for found in fields:
-        for bit in protocol.errors.get(found.name, ()):
-            name = (bit.text, "", group, Kind.BITS)
-            yield Value(*name, (found.word,), int(bit), 1, low=0, high=1)
+    for each in fields:
+        for bit in protocol.errors.get(each.name, ()):
+            yield Value(
+                name=bit.text,
+                unit="",
+                group=group,
+                kind=Kind.BITS,
+                words=(each.word,),
+                shift=int(bit),
+                mask=1,
+                low=0,
+                high=1,
+            )
 
 
-def _derived(live: Mapping[str, Value]) -> Iterator[Value]:
-    """Values that are made of those of live data; what a protocol does not supply leaves them out."""
-    speed, voltage = live.get("electrical_speed"), live.get("battery_voltage")
+def _derived_values(live: Mapping[str, Value]) -> Iterator[Value]:
+    """Yield the values computed from live data, if the protocol supplies the fields they need."""
+    speed = live.get("electrical_speed")
+    voltage = live.get("battery_voltage")
     current = live.get("battery_current")
     if speed is not None:
         yield replace(speed, name="motor_speed", unit="1/min", divisor=Divisor.POLE_PAIRS)
         yield replace(speed, name="output_speed", unit="1/min", divisor=Divisor.OUTPUT)
     if voltage is not None and current is not None:
-        ends = [(value.low or 0, value.high or 0) for value in (voltage, current)]
-        products = [u * i for u in ends[0] for i in ends[1]]
+        voltages = (voltage.low or 0, voltage.high or 0)
+        currents = (current.low or 0, current.high or 0)
+        products = [u * i for u in voltages for i in currents]
         yield Value(
-            *("battery_power", "W", Group.LIVE, Kind.PRODUCT, voltage.words + current.words),
+            name="battery_power",
+            unit="W",
+            group=Group.LIVE,
+            kind=Kind.PRODUCT,
+            words=voltage.words + current.words,
             per_unit=voltage.per_unit * current.per_unit,
             low=min(products),
             high=max(products),
         )
     if voltage is not None:
-        open_ended: dict[str, Any] = {"low": None, "high": None, "optional": True}
-        yield replace(voltage, name="mean_cell_voltage", divisor=Divisor.CELLS, **open_ended)
+        yield replace(
+            voltage,
+            name="mean_cell_voltage",
+            divisor=Divisor.CELLS,
+            low=None,
+            high=None,
+            optional=True,
+        )
 
 
-def _of_esc(attribute: str) -> Read:
-    found = operator.attrgetter(attribute)
-    return lambda esc, _gateway, _now: found(esc)
+def _reader_of(attribute: str) -> Read:
+    """Return a function that reads an attribute of the ESC."""
+    get = operator.attrgetter(attribute)
+    return lambda esc, _gateway, _now: get(esc)
 
 
 _LINK: tuple[tuple[str, str, Kind, Read, int], ...] = (
     ("energy_used", "Wh", Kind.INTEGRAL, lambda esc, _gw, _now: esc.energy_mw_ns // SECOND, MWS_PER_WH),
-    ("motor_run_time", "s", Kind.RUN_TIME, _of_esc("run_time_ns"), SECOND),
-    ("link_state", "", Kind.STATE, _of_esc("link"), 1),
-    ("layout", "", Kind.STATE, _of_esc("layout"), 1),
+    ("motor_run_time", "s", Kind.RUN_TIME, _reader_of("run_time_ns"), SECOND),
+    ("link_state", "", Kind.STATE, _reader_of("link"), 1),
+    ("layout", "", Kind.STATE, _reader_of("layout"), 1),
     ("data_age", "ms", Kind.AGE, lambda esc, _gw, now: esc.age_ms(now), 1),
-    ("frame_rate", "Hz", Kind.RATE, _of_esc("frame_rate"), 10),
-    ("losses", "", Kind.COUNT, _of_esc("losses"), 1),
-    ("crc_errors", "", Kind.COUNT, _of_esc("counters.crc_errors"), 1),
-    ("dropped_bytes", "", Kind.COUNT, _of_esc("counters.dropped_bytes"), 1),
-    ("live_frames", "", Kind.COUNT, _of_esc("counters.live"), 1),
-    ("info_frames", "", Kind.COUNT, _of_esc("counters.info"), 1),
-    ("received_bytes", "", Kind.COUNT, _of_esc("counters.bytes"), 1),
-    ("suspect_frames", "", Kind.COUNT, _of_esc("suspect_frames"), 1),
+    ("frame_rate", "Hz", Kind.RATE, _reader_of("frame_rate"), 10),
+    ("losses", "", Kind.COUNT, _reader_of("losses"), 1),
+    ("crc_errors", "", Kind.COUNT, _reader_of("counters.crc_errors"), 1),
+    ("dropped_bytes", "", Kind.COUNT, _reader_of("counters.dropped_bytes"), 1),
+    ("live_frames", "", Kind.COUNT, _reader_of("counters.live"), 1),
+    ("info_frames", "", Kind.COUNT, _reader_of("counters.info"), 1),
+    ("received_bytes", "", Kind.COUNT, _reader_of("counters.bytes"), 1),
+    ("suspect_frames", "", Kind.COUNT, _reader_of("suspect_frames"), 1),
 )  # fmt: skip
-"""Name, unit, kind, steps, steps to a unit."""
-_NEEDED = {"energy_used": {"battery_voltage", "battery_current"}}
-_NEEDED |= {"motor_run_time": {"electrical_speed"}}
+"""Name, unit, kind, function that reads the steps, steps that make one unit."""
+_NEEDED_FIELDS = {
+    "energy_used": {"battery_voltage", "battery_current"},
+    "motor_run_time": {"electrical_speed"},
+}
+"""Fields that a protocol must have so that its ESCs supply a value of the link."""
 
 
 def _pascal(text: str) -> str:
     return "".join(part[:1].upper() + part[1:].lower() for part in text.split("_"))
 
 
-def _link(protocol: EscProtocol) -> Iterator[Value]:
-    layouts = {n: _pascal(text) for n, text in enumerate(("unknown", *protocol.layouts))}
-    named = {"link_state": {int(s): _pascal(s.name) for s in LinkState}, "layout": layouts}
+def _link_values(protocol: EscProtocol) -> Iterator[Value]:
+    layouts = ("unknown", *protocol.layouts)
+    names_of = {
+        "link_state": {int(state): _pascal(state.name) for state in LinkState},
+        "layout": {number: _pascal(text) for number, text in enumerate(layouts)},
+    }
     for name, unit, kind, read, per_unit in _LINK:
-        if _NEEDED.get(name, set()) <= protocol.by_name.keys():
-            yield Value(
-                *(name, unit, Group.LINK, kind),
-                read=read,
-                per_unit=per_unit,
-                low=0,
-                high=max(named[name]) if name in named else None,
-                names=named.get(name, {}),
-                optional=kind in (Kind.AGE, Kind.RATE),
-                rolls=kind is Kind.COUNT,
-                pace=Group.LIVE if kind in (Kind.INTEGRAL, Kind.RUN_TIME) else None,
-            )
+        if not _NEEDED_FIELDS.get(name, set()) <= protocol.by_name.keys():
+            continue
+        names = names_of.get(name, {})
+        yield Value(
+            name=name,
+            unit=unit,
+            group=Group.LINK,
+            kind=kind,
+            read=read,
+            per_unit=per_unit,
+            low=0,
+            high=max(names) if names else None,
+            names=names,
+            optional=kind in (Kind.AGE, Kind.RATE),
+            rolls=kind is Kind.COUNT,
+            pace=Group.LIVE if kind in (Kind.INTEGRAL, Kind.RUN_TIME) else None,
+        )
 
 
-def _of_gateway(name: str, **more: Any) -> Value:
-    found = operator.attrgetter(name.removeprefix("gateway_"))
-    of: dict[str, Any] = {"unit": "", "read": lambda _esc, gateway, _now: found(gateway)}
-    return Value(name, group=Group.GATEWAY, kind=Kind.GATEWAY, low=0, **of | more)
+def _gateway_value(name: str, unit: str = "", read: Read | None = None, **more: Any) -> Value:
+    """Make a value of the gateway. By default it reads the attribute of GatewayStatus ``name``."""
+    if read is None:
+        get = operator.attrgetter(name.removeprefix("gateway_"))
+        read = lambda _esc, gateway, _now: get(gateway)  # noqa: E731
+    return Value(name, unit, Group.GATEWAY, Kind.GATEWAY, read=read, low=0, **more)
 
 
-def _gateway() -> Iterator[Value]:
+def _make_gateway_values() -> Iterator[Value]:
     for name, states in (("gateway_state", GatewayState), ("can_state", CanState)):
-        yield _of_gateway(name, names={int(state): _pascal(state.name) for state in states})
-    yield _of_gateway("esc_count")
-    yield _of_gateway("escs_ok")
+        names = {int(state): _pascal(state.name) for state in states}
+        yield _gateway_value(name, names=names)
+    yield _gateway_value("esc_count")
+    yield _gateway_value("escs_ok")
     uptime: Read = lambda _esc, gateway, now: (now - gateway.started_ns) // MS  # noqa: E731
-    yield _of_gateway("uptime", unit="s", per_unit=1000, read=uptime)
+    yield _gateway_value("uptime", unit="s", per_unit=1000, read=uptime)
     for name in (
-        *("sent_frames", "replaced_frames", "send_failures"),
-        *("received_frames", "bus_off_count", "dropped_frames", "id_conflicts"),
+        "sent_frames",
+        "replaced_frames",
+        "send_failures",
+        "received_frames",
+        "bus_off_count",
+        "dropped_frames",
+        "id_conflicts",
     ):
-        yield _of_gateway(name, rolls=True)
+        yield _gateway_value(name, rolls=True)
 
 
-_GATEWAY_VALUES = tuple(_gateway())  # the same for all protocols
+_GATEWAY_VALUES = tuple(_make_gateway_values())
+"""The same for all protocols."""
 
 
-def _listed(protocol: EscProtocol) -> Iterator[Value]:
-    live = {value.name: value for value in _supplied(protocol, Group.LIVE)}
+def _own_values(protocol: EscProtocol) -> Iterator[Value]:
+    """Yield the values that an ESC of this protocol supplies, and the gateway's."""
+    live = {value.name: value for value in _field_values(protocol, Group.LIVE)}
     yield from live.values()
-    yield from _supplied(protocol, Group.INFO)
-    yield from _derived(live)
-    yield from _link(protocol)
+    yield from _field_values(protocol, Group.INFO)
+    yield from _derived_values(live)
+    yield from _link_values(protocol)
     yield from _GATEWAY_VALUES
 
 
 def _all_values(protocols: Sequence[EscProtocol]) -> Mapping[str, Value]:
-    """By name, as the first protocol that has it supplies it; in the order of the first, then what others have besides."""
-    found: dict[str, Value] = {}
+    """Return the values of all protocols by name.
+
+    A value of several protocols is the first protocol's. The first protocol's values are listed
+    first, then the values that only the others have.
+    """
+    values: dict[str, Value] = {}
     for protocol in protocols:
-        for value in _listed(protocol):
-            found.setdefault(value.name, value)
-    return found
+        for value in _own_values(protocol):
+            values.setdefault(value.name, value)
+    return values
 
 
 VALUES = _all_values(PROTOCOLS)
-"""Every value of one ESC and of the gateway by name."""
+"""Every value of an ESC and of the gateway by name."""
 
 
 @cache
 def values_of(protocol: EscProtocol) -> Mapping[str, Value]:
-    """Every value of VALUES by name, as an ESC of this protocol supplies it; others are never available."""
-    own = {value.name: value for value in _listed(protocol)}
+    """Return every value of VALUES by name, as an ESC of this protocol supplies it.
+
+    Values that the protocol does not have are included; they are never available. Raises ValueError
+    if the protocol gives a value a unit that differs from VALUES.
+    """
+    own = {value.name: value for value in _own_values(protocol)}
     for name, value in own.items():
         if name in VALUES and value.unit != VALUES[name].unit:
             raise ValueError(f"ESC protocol {protocol.name}: {name} is in {VALUES[name].unit}")
@@ -316,10 +401,18 @@ def with_direction(protocol: EscProtocol, speed: Value) -> Value:
 
 
 def values_of_esc(settings: EscSettings) -> Mapping[str, Value]:
-    """Every value by name, as this ESC supplies it."""
+    """Return every value by name, as this ESC supplies it."""
     return values_of(protocol_named(settings.protocol))
 
 
 def _missing(value: Value) -> Value:
-    never: dict[str, Any] = {"words": (), "read": lambda _esc, _gateway, _now: None}
-    return replace(value, **never, low=None, high=None, optional=True, supplied=False)
+    """Return the value as it is for an ESC whose protocol does not have it."""
+    return replace(
+        value,
+        words=(),
+        read=lambda _esc, _gateway, _now: None,
+        low=None,
+        high=None,
+        optional=True,
+        supplied=False,
+    )

@@ -109,8 +109,8 @@ def test_an_altered_unprotected_byte_is_delivered_and_suspect_where_no_such_stat
         found = frame_in(frame[:offset] + bytes((value,)) + frame[offset + 1 :])
         expected = value - 256 if name == "max_bec_temperature" and value > 127 else value
         assert found.data == RECORDED[frame]._replace(**{name: expected})
-        assert found.suspect == (name == "operating_state" and value > 26)
-    assert not frame_in(encode(LiveData(operating_state=255), Layout.V4)).suspect
+        assert found.is_suspect == (name == "operating_state" and value > 26)
+    assert not frame_in(encode(LiveData(operating_state=255), Layout.V4)).is_suspect
 
 
 def test_a_field_has_the_type_unit_and_step_of_the_sheet_and_the_device_that_lacks_it() -> None:

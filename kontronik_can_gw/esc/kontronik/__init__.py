@@ -1,1 +1,1 @@
-"""KONTRONIK telemetry as it is on the wire: fields, states, codec, deframer. Standard library only, no I/O, no clock."""
+"""KONTRONIK telemetry on the wire: fields, states, codec, deframer. No I/O, no clock."""

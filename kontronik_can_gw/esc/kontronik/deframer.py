@@ -41,7 +41,7 @@ class Frame(Reading):
         return self.form.layout
 
     @property
-    def suspect(self) -> bool:
+    def is_suspect(self) -> bool:
         """True where the bytes outside a legacy live frame's CRC are impossible (operating state above 26)."""
         data: Any = self.data
         return self.form is _LEGACY_LIVE and data.operating_state > LARGEST_STATE
