@@ -121,7 +121,7 @@ class ErrorBit(IntEnum):
     code: int | None
     """CANopen emergency error code. None: a manufacturer-specific code is used."""
     is_summary: bool
-    """True if the bit is set whenever another bit of its severity is set. That bit has the details."""
+    """True if the bit only reports that another bit of its severity is set."""
     is_normal: bool
     """True if the bit is set in normal operation, so that displays leave it out."""
 
@@ -177,6 +177,10 @@ class State(NamedTuple):
     """Label of the group of states that a report draws alike."""
 
 
+NO_NAMES: Mapping[int, str] = {}
+"""Names of a field that is not an enumeration."""
+
+
 class Field(NamedTuple):
     """A value that readings supply: ``data[word] >> shift & mask``."""
 
@@ -195,7 +199,7 @@ class Field(NamedTuple):
     mask: int = -1
     not_on: frozenset[int] = frozenset()
     """Numbers of the devices that do not supply the value."""
-    names: Mapping[int, str] = {}
+    names: Mapping[int, str] = NO_NAMES
     """Names of an enumeration's numbers."""
 
     def of(self, data: Sequence[int]) -> int:
@@ -205,12 +209,12 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EscProtocol:
-    """An ESC protocol: the settings of its line, its decoder, and tables that describe its readings.
+    """An ESC protocol: line settings, decoder, and tables that describe readings.
 
     These field names have a fixed meaning; each may be missing:
 
-    - ``electrical_speed``, ``battery_voltage`` and ``battery_current`` are whole words of live data.
-      Run time and energy are computed from them.
+    - ``electrical_speed``, ``battery_voltage`` and ``battery_current`` are whole words of live
+      data. Run time and energy are computed from them.
     - ``operating_state_raw`` and ``operating_errors`` are in live data.
     - ``device_raw``, ``variant``, ``firmware_main``, ``firmware_sub``, ``cell_count`` and
       ``selftest_errors`` are in info data.

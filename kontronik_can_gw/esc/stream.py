@@ -57,7 +57,7 @@ class EscStream(EscTelemetry):
         self.apply(settings)
         self.base: Counters = self.counters.copy()
         self._arrivals: deque[tuple[int, int]] = deque()
-        """For each chunk with pending bytes: the stream position after it, its last byte's bound."""
+        """Stream position after each chunk with pending bytes, and the bound of its last byte."""
         self._interval_ns = 0
         """Usual interval between live frames. 0: unknown."""
         self._window_ns = now
@@ -66,7 +66,7 @@ class EscStream(EscTelemetry):
 
     @property
     def counters(self) -> Counters:
-        """Counters of the whole stream. The decoder goes on changing this object."""
+        """Counters of the whole stream. The decoder keeps changing this object."""
         counters: Counters = self.decoder.counters
         return counters
 
@@ -82,12 +82,12 @@ class EscStream(EscTelemetry):
         self._update_cells()
 
     def receive_each(self, data: bytes, now: int, since: int) -> Iterator[int]:
-        """Take bytes read at ``now``, of which none had arrived at ``since``.
+        """Take bytes that were read at ``now`` and all arrived after ``since``.
 
-        Yields the events of each frame, while the state is the state after that frame. Iterate to
-        the end, otherwise the rest of the frames is lost. Call ``expire`` first: this method does
-        not drop values that are too old by ``now``. A pending part of a frame is given up if it is
-        older than the time-out.
+        Yields the events of one frame after another; meanwhile the state is the state after that
+        frame. Iterate to the end, otherwise the remaining frames are lost. Call ``expire`` first:
+        this method does not drop values that are too old at ``now``. A pending part of a frame is
+        given up if it is older than the time-out.
         """
         decoder = self.decoder
         arrivals = self._arrivals
@@ -122,13 +122,13 @@ class EscStream(EscTelemetry):
             yield self._set_link(LinkState.SEARCHING)
 
     def port_opened(self) -> int:
-        """Note that the port was opened, for the first time or again. Returns the events."""
+        """Note that the port was opened, for the first time or again. Return the events."""
         if self.link is not LinkState.PORT_ERROR:
             return Event.NONE
         return self._set_link(LinkState.NEVER_SEEN if self.live_ns is None else LinkState.LOST)
 
     def port_lost(self) -> int:
-        """Note that the port was lost: drops pending bytes and all fresh data. Returns the events."""
+        """Note that the port was lost: drop pending bytes and all fresh data. Return the events."""
         self.decoder.flush()
         self._arrivals.clear()
         return self._lose(LinkState.PORT_ERROR)
@@ -145,7 +145,7 @@ class EscStream(EscTelemetry):
         return events
 
     def expire(self, now: int) -> int:
-        """Drop live and info data that is too old at ``now``. Returns the events."""
+        """Drop live and info data that is too old at ``now``. Return the events."""
         events = Event.NONE
         if self.live is not None and now - self.live_bound_ns > self.settings.timeout_ns:
             self.losses += 1
@@ -210,10 +210,9 @@ class EscStream(EscTelemetry):
         return events | Event.LIVE
 
     def _integrate(self, live: Data, ns: int) -> None:
-        """Add the energy and run time of the ``ns`` that follow the live data ``live``.
+        """Add the energy and run time of the ``ns`` after the reading ``live``.
 
-        Its power, and whether its speed is 0, count until the next live data. Regeneration does not
-        reduce the energy.
+        Its power and speed count until the next reading. Regeneration does not reduce the energy.
         """
         if self._power_words is not None:
             voltage_word, current_word = self._power_words
@@ -248,7 +247,7 @@ class EscStream(EscTelemetry):
         self._update_cells()
 
     def _lose(self, state: LinkState) -> int:
-        """Drop all fresh data and set the link to ``state``. Returns the events."""
+        """Drop all fresh data and set the link to ``state``. Return the events."""
         events = self._set_link(state)
         if self.live is not None:
             self.live = None
@@ -266,7 +265,7 @@ class EscStream(EscTelemetry):
         return Event.LINK
 
     def _close_window(self, now: int) -> int:
-        """Compute rate, interval and link quality since the last call. Returns the events."""
+        """Compute rate, interval and link quality since the last call. Return the events."""
         old = self._window_counters
         new = self.counters
         window_ns = now - self._window_ns

@@ -51,7 +51,7 @@ class Kind(Enum):
 
 
 class Divisor(Enum):
-    """The number by which a value's steps are divided."""
+    """The divisor of a value's steps."""
 
     ONE = "1"
     POLE_PAIRS = "pole pairs"
@@ -70,8 +70,8 @@ The function of a gateway value must not use the ESC.
 class Value:
     """A value that can be published.
 
-    The kinds WIRE, BITS and PRODUCT are computed from the words of a live or info reading. The other
-    kinds have a function ``read``.
+    The kinds WIRE, BITS and PRODUCT are computed from the words of a live or info reading. The
+    other kinds have a function ``read``.
     """
 
     name: str
@@ -100,9 +100,9 @@ class Value:
     rolls: bool = False
     """True for a counter that restarts at 0 after the greatest value that the signal can hold."""
     last: bool = False
-    """True if the last known info data is used even if it is no longer fresh."""
+    """True if the last known info data is used even if it is not fresh."""
     pace: Group | None = None
-    """The group with which the value changes. None: its own group."""
+    """The group whose data changes the value. None: its own group."""
     negative_in: tuple[int, frozenset[int]] | None = None
     """WIRE: index of a word of the live reading, and its values for which the steps are negative."""
     supplied: bool = True

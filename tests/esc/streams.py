@@ -21,7 +21,7 @@ def form_of(row: FormRow) -> Form:
 
 def decoded(form: Form, buffer: bytes, at: int = 0) -> Data:
     """The fields of a frame of this form; nothing is checked."""
-    return form.data_type(*form.fields_of(buffer, at))
+    return form.data_type(*form.unpack_fields(buffer, at))
 
 
 def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: random.Random) -> bytes:

@@ -1,12 +1,14 @@
-"""Frame bytes <-> data, in both layouts.
+"""Converts between the bytes of a frame and its data, in both layouts.
 
-    V4      live  KODL  16 fields  2 reserved  CRC over 0..35 at 36      40 bytes
-    V4      info  KODI  18 fields  3 reserved  CRC over 0..39 at 40      44 bytes
-    legacy  live  KODL  16 fields              CRC over 0..31 at 34      38 bytes
-    legacy  info  KODI  18 fields              CRC over 0..35 at 37      41 bytes
+    layout  kind  header  fields  reserved  CRC at  CRC covers  length
+    V4      live  KODL        16         2      36       0..35      40
+    V4      info  KODI        18         3      40       0..39      44
+    legacy  live  KODL        16         0      34       0..31      38
+    legacy  info  KODI        18         0      37       0..35      41
 
-The CRC is the standard CRC-32 (zlib.crc32), little-endian, over the largest multiple of four bytes in front of it: so in the
-legacy layout the last field or two (live: operating state, timing; info: maximum BEC temperature) are not protected.
+The CRC is the standard CRC-32 (zlib.crc32), sent little-endian. It covers the largest multiple of
+four bytes that fits before it. So in the legacy layout it does not protect the last fields:
+operating state and timing of a live frame, maximum BEC temperature of an info frame.
 """
 
 import struct
@@ -18,14 +20,14 @@ from kontronik_can_gw.esc.kontronik.fields import Data, DataType, InfoData, Live
 
 
 class Layout(Enum):
-    """Which of the two layouts."""
+    """The two layouts of frames. Every device uses one of them for all its frames."""
 
     V4 = "v4"
     LEGACY = "legacy"
 
 
 class Form(FrameForm):
-    """One of the four frame forms: its length, what its CRC covers, and how its body is packed."""
+    """One of the four frame forms: its header, length, CRC and packing."""
 
     def __init__(self, is_info: bool, layout: Layout) -> None:
         self.layout = layout
@@ -33,35 +35,54 @@ class Form(FrameForm):
         self.header = b"KODI" if is_info else b"KODL"
         self.data_type: DataType = InfoData if is_info else LiveData
         body = body_format(self.data_type)
-        reserved = 0 if layout is Layout.LEGACY else -struct.calcsize(f"<4s{body}") % 4
+        reserved = 0
+        if layout is Layout.V4:
+            reserved = -struct.calcsize(f"<4s{body}") % 4
         self._struct = struct.Struct(f"<4s{body}{reserved}xI")
-        super().__init__(self._struct.size, is_info, list(Layout).index(layout) + 1)
-        self.crc_at = self.length - 4
-        self.covered = self.crc_at // 4 * 4
-        self.crc_goes_on_over = slice(0, self.covered)
-        """What its CRC covers; of the longer of two forms: beyond what that of the shorter covers."""
-        self.crc_of = struct.Struct(f"<{self.crc_at}xI").unpack_from
-        self.fields_of = struct.Struct(f"<4x{body}").unpack_from
+        length = self._struct.size
+        layout_number = list(Layout).index(layout) + 1
+        super().__init__(length, is_info, layout_number)
+        crc_at = length - 4
+        self.covered = crc_at // 4 * 4
+        """Number of bytes that the CRC covers."""
+        self.crc_part = slice(0, self.covered)
+        """Bytes to add to the running CRC when the forms of a header are tried in turn."""
+        self.unpack_crc = struct.Struct(f"<{crc_at}xI").unpack_from
+        self.unpack_fields = struct.Struct(f"<4x{body}").unpack_from
 
     def encode(self, data: Data) -> bytes:
-        """The frame with reserved bytes 0 and its CRC. struct.error where a value does not fit its wire type."""
+        """Return the frame, with its CRC and with reserved bytes set to 0.
+
+        Raises struct.error if a value does not fit its wire type.
+        """
         frame = self._struct.pack(self.header, *data, 0)
-        return frame[:-4] + crc32(frame[: self.covered]).to_bytes(4, "little")
+        crc = crc32(frame[: self.covered])
+        return frame[:-4] + crc.to_bytes(4, "little")
 
 
-FORMS = tuple(Form(info, layout) for info in (False, True) for layout in (Layout.LEGACY, Layout.V4))
-"""All four; of one kind the shorter first, which is also the order in which they are tried."""
+FORMS = (
+    Form(is_info=False, layout=Layout.LEGACY),
+    Form(is_info=False, layout=Layout.V4),
+    Form(is_info=True, layout=Layout.LEGACY),
+    Form(is_info=True, layout=Layout.V4),
+)
+"""All four forms, in the order in which they are tried: the shorter one of a kind first."""
 
 FORMS_BY_HEADER = {
     header: tuple(form for form in FORMS if form.header == header)
     for header in sorted({form.header for form in FORMS})
 }
 for _shorter, _longer in FORMS_BY_HEADER.values():
-    _longer.crc_goes_on_over = slice(_shorter.covered, _longer.covered)
+    _longer.crc_part = slice(_shorter.covered, _longer.covered)
 MAX_LENGTH = max(form.length for form in FORMS)
 
 
 def encode(data: Data, layout: Layout) -> bytes:
-    """The frame bytes of a LiveData or InfoData in the given layout. struct.error where a value does not fit its wire type."""
-    of = type(data), layout
-    return next(form for form in FORMS if (form.data_type, form.layout) == of).encode(data)
+    """Return the frame with this data in the given layout.
+
+    Raises struct.error if a value does not fit its wire type.
+    """
+    for form in FORMS:
+        if form.layout is layout and form.data_type is type(data):
+            return form.encode(data)
+    raise TypeError(f"{type(data).__name__} is neither LiveData nor InfoData")

@@ -1,9 +1,13 @@
-"""Byte stream -> frames.
+"""Finds the frames in a stream of bytes.
 
-Contract: the frames emitted are exactly those a brute-force search finds in the whole stream (earliest start first, no overlap,
-one of the four forms by header, length and CRC; the shorter where two match), however the stream is cut into chunks. A frame
-comes out with its last byte unless an earlier, still undecided header forbids it. ``feed`` and ``flush`` never raise; garbage
-is counted and dropped. At most 43 bytes are held; work is linear in the bytes fed.
+1. The result is exactly the frames that a brute-force search finds in the whole stream, however the
+   stream is cut into chunks. The search begins at the earliest position and finds no overlapping
+   frames. Header, length and CRC must match one of the four forms. If two forms match, the shorter
+   one is used.
+2. A frame is returned as soon as its last byte is fed, unless an earlier header may still begin a
+   frame that overlaps it.
+3. ``feed`` and ``flush`` never raise. Bytes that are not part of a frame are counted and dropped.
+4. At most 43 bytes are held. The work is linear in the number of bytes.
 """
 
 from dataclasses import dataclass, fields
@@ -25,12 +29,15 @@ from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 _new = tuple.__new__
 _LEGACY_LIVE = next(form for form in FORMS if form.name == "live_legacy")
 _PREFIX = b"KOD"
-# A line that is read at a far higher rate than it is sent shows its bits as long runs: zeros, then ones.
 _LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
+"""Bytes whose bits are sent as zeros followed by ones.
+
+They are received if the line's baud rate is much lower than ours.
+"""
 
 
 class Frame(Reading):
-    """A reading with the names of this protocol."""
+    """A reading of this protocol."""
 
     __slots__ = ()
     form: Form
@@ -42,14 +49,20 @@ class Frame(Reading):
 
     @property
     def is_suspect(self) -> bool:
-        """True where the bytes outside a legacy live frame's CRC are impossible (operating state above 26)."""
+        """True for a legacy live frame with an impossible operating state, above 26.
+
+        The CRC of these frames does not cover the state.
+        """
         data: Any = self.data
         return self.form is _LEGACY_LIVE and data.operating_state > LARGEST_STATE
 
 
 @dataclass(slots=True)
 class Counters:
-    """What one stream held. Every byte fed is in a frame, dropped for one reason, or still pending."""
+    """Counts of one stream.
+
+    Every byte fed is part of a frame, counted as dropped under one reason, or still pending.
+    """
 
     bytes: int = 0
     live_v4: int = 0
@@ -57,23 +70,23 @@ class Counters:
     info_v4: int = 0
     info_legacy: int = 0
     headers: int = 0
-    """KODL or KODI seen, good frames included."""
+    """Times that KODL or KODI was found, also at the start of a good frame."""
     crc_errors: int = 0
-    """KODL or KODI followed by enough bytes, of which no CRC fits."""
+    """Headers that were followed by enough bytes, but by no matching CRC."""
     unknown_kinds: int = 0
-    """KOD followed by a letter other than L and I."""
+    """Times that KOD was followed by a letter other than L and I."""
     dropped_noise: int = 0
-    """Bytes that belong to no header."""
+    """Bytes dropped outside headers and rejected frames."""
     dropped_crc: int = 0
-    """Bytes after a header whose CRC failed, up to where its frame would have ended."""
+    """Bytes dropped from a header without a matching CRC to the end of its longer form."""
     dropped_unknown_kind: int = 0
-    """The KOD of frames of unknown kind."""
+    """Bytes of KOD that were followed by a letter other than L and I."""
     dropped_incomplete: int = 0
-    """Bytes after a header when the stream ended."""
+    """Bytes after a header that were too few for a frame when the stream ended."""
     long_run_bytes: int = 0
-    """Dropped bytes that look like a slower line read too fast (9600 baud of an old JIVE)."""
+    """Dropped bytes that suggest a lower baud rate, for example the 9600 baud of an old JIVE."""
     longer_crcs: int = 0
-    """Rejected live frames of 38 bytes whose CRC covers 34 bytes: no ESC is known to send them."""
+    """Rejected live frames of 38 bytes whose CRC covers 34 bytes. No ESC is known to send them."""
 
     @property
     def live(self) -> int:
@@ -94,20 +107,23 @@ class Counters:
 
     @property
     def pending(self) -> int:
-        """Bytes that are not decided yet; four or more begin with KODL or KODI."""
+        """Number of undecided bytes. If there are four or more, they begin with KODL or KODI."""
         in_frames: int = sum(form.length * getattr(self, form.name) for form in FORMS)
         return self.bytes - self.dropped_bytes - in_frames
 
     def as_dict(self) -> dict[str, int]:
-        """All counters and totals by name."""
-        sums = {"live": self.live, "info": self.info, "dropped_bytes": self.dropped_bytes}
-        return sums | dict(zip(_NAMES, _all_of(self), strict=True))
+        """Return all counters and totals by name."""
+        totals = {"live": self.live, "info": self.info, "dropped_bytes": self.dropped_bytes}
+        return totals | dict(zip(_NAMES, _get_all(self), strict=True))
 
     def copy(self) -> "Counters":
-        return Counters(*_all_of(self))
+        return Counters(*_get_all(self))
 
     def diagnosis(self, since: "Counters | None" = None) -> str | None:
-        """What is wrong with a line from which no frame comes, in words; None while frames come."""
+        """Explain in words why no frame was received since the earlier state ``since``.
+
+        Without ``since``, since the start of the stream. None if a frame was received.
+        """
         old = since or Counters()
         if self.live + self.info > old.live + old.info:
             return None
@@ -132,7 +148,7 @@ class Counters:
 
 
 _NAMES = tuple(f.name for f in fields(Counters))
-_all_of = attrgetter(*_NAMES)
+_get_all = attrgetter(*_NAMES)
 
 
 def has_longer_crc(frame: bytes) -> bool:
@@ -142,49 +158,62 @@ def has_longer_crc(frame: bytes) -> bool:
 
 
 class Deframer:
-    """Finds the frames in one byte stream. Holds no mode: the layout is found from the CRC of each frame."""
+    """Finds the frames in one byte stream. The CRC of each frame decides its layout."""
 
-    __slots__ = ("_base", "_blame", "_blame_until", "_held", "_need", "counters")
+    __slots__ = ("_base", "_held", "_needed", "_rejected_for", "_rejected_until", "counters")
 
     def __init__(self) -> None:
         self.counters = Counters()
         self._held = b""
-        self._base = 0  # stream position of _held[0]
-        self._need = 1  # how many more bytes before anything can be decided
-        self._blame = "dropped_crc"  # why bytes before _blame_until are dropped
-        self._blame_until = 0
+        """The undecided bytes."""
+        self._base = 0
+        """Stream position of the first held byte."""
+        self._needed = 1
+        """Number of further bytes that are needed before anything can be decided."""
+        self._rejected_for = "dropped_crc"
+        """The counter for bytes dropped before ``_rejected_until``."""
+        self._rejected_until = 0
+        """Stream position at which the last rejected frame would have ended."""
 
     @property
     def pending(self) -> int:
-        """How many bytes are held, undecided: 0..43."""
+        """Number of undecided bytes, 0 to 43."""
         return len(self._held)
 
     def feed(self, data: bytes, now: int = 0) -> list[Frame]:  # noqa: ARG002  frames have headers
-        """Take the next bytes; return the frames that are now certain, in stream order."""
+        """Take the next bytes and return the frames that are now certain, in stream order."""
         size = len(data)
         self.counters.bytes += size
-        if size < self._need:
+        if size < self._needed:
             self._held += data
-            self._need -= size
+            self._needed -= size
             return []
         return self._scan(self._held + data, False)
 
     def flush(self) -> list[Frame]:
-        """The stream ended or was interrupted: search what is pending, drop the rest, be ready for a new start."""
+        """End the stream: return the frames in the pending bytes and drop the rest.
+
+        The next call of ``feed`` starts a new stream. The counters continue.
+        """
         frames = self._scan(self._held, True)
-        self._blame_until = self._base
+        self._rejected_until = self._base
         return frames
 
-    def _scan(self, buffer: bytes, ended: bool) -> list[Frame]:
+    def _scan(self, buffer: bytes, has_ended: bool) -> list[Frame]:
+        """Return the frames in ``buffer`` and hold its undecided end.
+
+        If the stream has ended, nothing is held.
+        """
         frames: list[Frame] = []
         counters = self.counters
         size = len(buffer)
-        at = missing = 0
+        at = 0
+        missing = 0
         while at < size:
             frame = buffer[at : at + MAX_LENGTH]
             forms = FORMS_BY_HEADER.get(frame[:4])
             if forms is None:
-                start = self._skip(buffer, at, ended)
+                start = self._skip(buffer, at, has_ended)
                 if start == at:
                     break
                 at = start
@@ -195,12 +224,13 @@ class Deframer:
                 if end > size:
                     missing = end - size
                     break
-                crc = crc32(frame[form.crc_goes_on_over], crc)
-                if crc == form.crc_of(frame)[0]:
+                crc = crc32(frame[form.crc_part], crc)
+                if crc == form.unpack_crc(frame)[0]:
                     setattr(counters, form.name, getattr(counters, form.name) + 1)
-                    data = _new(form.data_type, form.fields_of(frame))
+                    data = _new(form.data_type, form.unpack_fields(frame))
                     frames.append(_new(Frame, (form, self._base + at, data)))
-                    at, self._blame_until = end, 0
+                    at = end
+                    self._rejected_until = 0
                     break
             else:
                 counters.crc_errors += 1
@@ -209,45 +239,65 @@ class Deframer:
                 self._reject(buffer, at, form.length, "dropped_crc")
                 at += 4
             if missing:
-                if not ended:
+                if not has_ended:
                     break
                 missing = 0
                 self._reject(buffer, at, size - at, "dropped_incomplete")
                 at += 4
         counters.headers += len(frames)
         self._held = buffer[at:]
-        self._need = missing or 1
+        self._needed = missing or 1
         self._base += at
         return frames
 
-    def _skip(self, buffer: bytes, at: int, ended: bool) -> int:
-        """Drop what belongs to no header of a known kind; return where one may begin, ``at`` where that is not decided yet."""
-        start, size = buffer.find(_PREFIX, at), len(buffer)
+    def _skip(self, buffer: bytes, at: int, has_ended: bool) -> int:
+        """Drop bytes that are not part of a known header and return the next position to try.
+
+        Returns ``at`` if the bytes there may be the beginning of a header.
+        """
+        size = len(buffer)
+        start = buffer.find(_PREFIX, at)
         if start < 0:
-            tail = b"" if ended else buffer[max(at, size - 2) :]
-            start = size - (2 if tail == b"KO" else 1 if tail.endswith(b"K") else 0)
+            start = size
+            if not has_ended:
+                start -= _length_of_partial_prefix(buffer[max(at, size - 2) :])
         if start > at:
             self._drop(buffer, at, start)
         elif size - at >= 4:
             self.counters.unknown_kinds += 1
             start += 3
             self._drop(buffer, at, start, "dropped_unknown_kind")
-        elif ended:
+        elif has_ended:
             start = size
             self._drop(buffer, at, start, "dropped_incomplete")
         return start
 
     def _reject(self, buffer: bytes, at: int, length: int, reason: str) -> None:
-        """Drop a header (no frame can begin inside it) and blame ``reason`` for what is dropped up to ``length`` from its start."""
+        """Drop a header, in which no other frame can begin.
+
+        ``length`` bytes from its start are counted under ``reason`` if they are dropped, too.
+        """
         self.counters.headers += 1
-        self._blame, self._blame_until = reason, max(self._blame_until, self._base + at + length)
+        self._rejected_for = reason
+        self._rejected_until = max(self._rejected_until, self._base + at + length)
         self._drop(buffer, at, at + 4)
 
     def _drop(self, buffer: bytes, begin: int, end: int, reason: str = "dropped_noise") -> None:
+        """Count dropped bytes: the part of a rejected frame under its reason, the rest as given."""
         counters = self.counters
         dropped = buffer[begin:end]
-        counters.long_run_bytes += len(dropped) - len(dropped.translate(None, _LONG_RUNS))
-        blamed = min(max(self._blame_until - self._base - begin, 0), end - begin)
-        if blamed:
-            setattr(counters, self._blame, getattr(counters, self._blame) + blamed)
-        setattr(counters, reason, getattr(counters, reason) + end - begin - blamed)
+        size = end - begin
+        counters.long_run_bytes += size - len(dropped.translate(None, _LONG_RUNS))
+        rejected = min(max(self._rejected_until - self._base - begin, 0), size)
+        if rejected:
+            setattr(counters, self._rejected_for, getattr(counters, self._rejected_for) + rejected)
+        setattr(counters, reason, getattr(counters, reason) + size - rejected)
+
+
+def _length_of_partial_prefix(tail: bytes) -> int:
+    """Return how many of the last bytes may be the beginning of a header: 0, 1 or 2."""
+    if tail == _PREFIX[:2]:
+        return 2
+    if tail.endswith(_PREFIX[:1]):
+        return 1
+    return 0

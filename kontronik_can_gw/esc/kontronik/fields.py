@@ -1,7 +1,7 @@
-"""One typed line per row of the sheet. Wire order, type, step, unit and absence are defined here and nowhere else.
+"""One typed line for each row of the sheet: wire order, type, step, unit, absence.
 
-LiveData and InfoData hold raw wire integers. Nothing is clipped: every value that fits the wire type is passed on, also beyond the range
-that the sheet states.
+LiveData and InfoData hold integers as they are on the wire. Nothing is clipped: a value that fits
+the wire type is passed on even if it is outside the range in the sheet.
 """
 
 import struct
@@ -11,24 +11,24 @@ from kontronik_can_gw.esc.kontronik.states import Device
 
 
 class Row(NamedTuple):
-    """A row of the sheet.
-
-    ``wire`` is the struct code, ``per_unit`` how many steps make one ``unit``.
-    """
+    """A row of the sheet."""
 
     wire: str
+    """struct code of the wire type."""
     unit: str
     per_unit: int = 1
+    """Number of steps that make one ``unit``."""
     not_on: frozenset[Device] = frozenset()
     """Devices that do not supply this value."""
 
     @property
     def type_range(self) -> tuple[int, int]:
-        """Smallest and largest raw value of the wire type."""
+        """Smallest and greatest value of the wire type."""
         bits = struct.calcsize("<" + self.wire) * 8
-        return (
-            (-(1 << bits - 1), (1 << bits - 1) - 1) if self.wire.islower() else (0, (1 << bits) - 1)
-        )
+        is_signed = self.wire.islower()
+        if is_signed:
+            return -(1 << bits - 1), (1 << bits - 1) - 1
+        return 0, (1 << bits) - 1
 
 
 _NOT_JIVEPRO = frozenset({Device.JIVEPRO})
@@ -72,7 +72,10 @@ class LiveData(NamedTuple):
 
 
 class InfoData(NamedTuple):
-    """Info frame, offsets 4 to 36, in wire order. The extremes are logged since the ESC's own start of logging."""
+    """Info frame, offsets 4 to 36, in wire order.
+
+    The extremes are counted from a time that the ESC chooses.
+    """
 
     device_and_variant: Pair = 0
     firmware_word: Pair = 0
@@ -95,31 +98,31 @@ class InfoData(NamedTuple):
 
 
 Data = LiveData | InfoData
-
-
 DataType = type[LiveData] | type[InfoData]
 
 
 def _rows(data: DataType) -> dict[str, Row]:
     hints = get_type_hints(data, include_extras=True)
-    return {
-        name: next(a for a in get_args(hints[name]) if isinstance(a, Row)) for name in data._fields
-    }
+    found = {}
+    for name in data._fields:
+        _, row = get_args(hints[name])
+        found[name] = row
+    return found
 
 
 _ROWS: dict[DataType, dict[str, Row]] = {LiveData: _rows(LiveData), InfoData: _rows(InfoData)}
 
 
 def rows(data: DataType) -> dict[str, Row]:
-    """Field name to Row of LiveData or InfoData, in wire order."""
+    """Return the rows of LiveData or InfoData by field name, in wire order."""
     return _ROWS[data]
 
 
 def device_and_variant(device: int, variant: int) -> int:
-    """The info frame's first word: device 0..63 in the high six bits, variant 0..1023 in the low ten."""
+    """Return the info frame's first word: device 0..63 above ten bits for variant 0..1023."""
     return device << 10 | variant
 
 
 def body_format(data: DataType) -> str:
-    """struct codes of the fields, without byte order, header, reserved bytes and CRC."""
+    """Return the struct codes of the fields, without byte order, header, reserved bytes and CRC."""
     return "".join(row.wire for row in rows(data).values())

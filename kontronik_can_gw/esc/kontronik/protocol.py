@@ -1,6 +1,8 @@
-"""The KONTRONIK protocol for the gateway: the tables of fields.py and states.py in the form of an EscProtocol."""
+"""The KONTRONIK protocol as an EscProtocol, made from the tables in fields.py and states.py."""
 
-from kontronik_can_gw.esc.decoder import EscProtocol, Field
+from collections.abc import Mapping
+
+from kontronik_can_gw.esc.decoder import NO_NAMES, EscProtocol, Field
 from kontronik_can_gw.esc.kontronik.deframer import Deframer
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, body_format, rows
 from kontronik_can_gw.esc.kontronik.states import (
@@ -11,40 +13,71 @@ from kontronik_can_gw.esc.kontronik.states import (
 )
 
 _STATES = {int(state): state.about for state in OperatingState}
+_STATE_NAMES = {number: state.text for number, state in _STATES.items()}
 _DEVICES = {int(device): device.text for device in Device}
-_PARTS = ("operating_state", "device_and_variant", "firmware_word")
-"""Rows of the sheet that are several values, or have names."""
+_PEAK_CURRENTS = {
+    int(device): device.peak_current_of for device in Device if device.peak_current_of is not None
+}
+_SPLIT_ROWS = ("operating_state", "device_and_variant", "firmware_word")
+"""Rows of the sheet that are published as several fields. These are listed in KONTRONIK."""
 
 
-def _wire(data: DataType) -> list[Field]:
+def _whole_fields(data: DataType) -> list[Field]:
+    """Return a field for each row that is published as one value."""
     found = []
     for word, (name, row) in enumerate(rows(data).items()):
-        if name not in _PARTS:
-            of = (name, row.unit, word, *row.type_range, row.per_unit, data is InfoData)
-            found.append(Field(*of, not_on=row.not_on))
+        if name in _SPLIT_ROWS:
+            continue
+        low, high = row.type_range
+        field = Field(
+            name=name,
+            unit=row.unit,
+            word=word,
+            low=low,
+            high=high,
+            per_unit=row.per_unit,
+            is_info=data is InfoData,
+            not_on=row.not_on,
+        )
+        found.append(field)
     return found
 
 
-def _bits(name: str, row: str, shift: int, mask: int, names: dict[int, str] | None = None) -> Field:
-    word = InfoData._fields.index(row)
-    return Field(name, "", word, 0, mask, 1, True, shift, mask, names=names or {})
+def _state_field(name: str, names: Mapping[int, str] = NO_NAMES) -> Field:
+    word = LiveData._fields.index("operating_state")
+    return Field(name, unit="", word=word, low=0, high=255, names=names)
 
 
-_STATE = LiveData._fields.index("operating_state")
+def _info_bits(
+    name: str, row: str, shift: int, mask: int, names: Mapping[int, str] = NO_NAMES
+) -> Field:
+    """Return the field ``row >> shift & mask`` of info data."""
+    return Field(
+        name=name,
+        unit="",
+        word=InfoData._fields.index(row),
+        low=0,
+        high=mask,
+        is_info=True,
+        shift=shift,
+        mask=mask,
+        names=names,
+    )
+
 
 KONTRONIK = EscProtocol(
     name="kontronik",
     make=Deframer,
     fields=(
-        *_wire(LiveData),
-        Field("operating_state", "", _STATE, 0, 255, names={n: s.text for n, s in _STATES.items()}),
-        Field("operating_state_raw", "", _STATE, 0, 255),
-        *_wire(InfoData),
-        _bits("device", "device_and_variant", 10, 0x3F, _DEVICES),
-        _bits("device_raw", "device_and_variant", 10, 0x3F),
-        _bits("variant", "device_and_variant", 0, 0x3FF),
-        _bits("firmware_main", "firmware_word", 8, 0xFF),
-        _bits("firmware_sub", "firmware_word", 0, 0xFF),
+        *_whole_fields(LiveData),
+        _state_field("operating_state", _STATE_NAMES),
+        _state_field("operating_state_raw"),
+        *_whole_fields(InfoData),
+        _info_bits("device", "device_and_variant", shift=10, mask=0x3F, names=_DEVICES),
+        _info_bits("device_raw", "device_and_variant", shift=10, mask=0x3F),
+        _info_bits("variant", "device_and_variant", shift=0, mask=0x3FF),
+        _info_bits("firmware_main", "firmware_word", shift=8, mask=0xFF),
+        _info_bits("firmware_sub", "firmware_word", shift=0, mask=0xFF),
     ),
     maker="KONTRONIK",
     even_parity=True,
@@ -54,5 +87,5 @@ KONTRONIK = EscProtocol(
     backward_states=frozenset({OperatingState.Sync_Backward, OperatingState.Backward}),
     devices=_DEVICES,
     wire=((body_format(LiveData), LiveData), (body_format(InfoData), InfoData)),
-    peak_current_of={int(d): d.peak_current_of for d in Device if d.peak_current_of is not None},
+    peak_current_of=_PEAK_CURRENTS,
 )

@@ -1,11 +1,13 @@
-"""An ESC with faults on request.
+"""A simulated ESC, with faults on request.
 
-Contract: time is handed in (integer ns), bytes are handed out; the same options, seed and start give the same bytes, however
-the calls are spaced. The data does not depend on the faults: they only change what becomes of it on the wire. Nothing blocks,
-reads a clock or does I/O. Every frame comes as a ``Sent``, which holds what was meant and what went out.
+1. Takes time as whole ns and returns frames. Does not block, read a clock or do I/O.
+2. The same options, seed and start give the same bytes, however the calls are spaced.
+3. The faults of the line do not change the data, only the bytes on the wire. Each frame is returned
+   as a ``Sent``, which has both.
 
-The flight is synthetic. Of recorded frames it keeps: the idle error word (bit 17 set), state 12 when idle, a logged maximum
-battery voltage of 0.00 V before the motor has run, the peak current as a held maximum, no BEC current on a JIVEPro.
+The flight is synthetic. These details are as in recorded frames: the idle error word (bit 17 set),
+state 12 when idle, a logged maximum battery voltage of 0.00 V before the motor has run, the peak
+current as a held maximum, no BEC current on a JIVEPro.
 """
 
 import math
@@ -24,35 +26,43 @@ from kontronik_can_gw.esc.kontronik.states import OperatingState
 from kontronik_can_gw.esc.kontronik.states import SelfTestError as SelfTestError
 
 BYTE_NS = 11 * SECOND_NS // 115_200
-"""Wire time of a byte: start, 8 data, parity, stop."""
+"""Time of a byte on the wire: start, 8 data, parity and stop bit."""
 
 
 _STANDING = frozenset(state for state in OperatingState if state <= OperatingState.StandBy)
-_CELLS, _CAPACITY = 6, 5000
-"""mAh of the battery. When less than a fifth is left at the profile's end, a fresh one is plugged in: the ESC powers up anew."""
-_MAX_CURRENT = 120.0
-"""A in the motor at full throttle, about."""
-_AMBIENT = 22.0
-"""°C"""
-_VARIANT, _FIRMWARE = 120, 4 << 8 | 17
-"""4.17"""
-_SPEED_PER_VOLT = 2500.0  # electrical 1/min for each V at the motor
+_CELLS = 6
+_CAPACITY_MAH = 5000
+"""Capacity of the battery.
+
+If less than a fifth is left at the end of the profile, a full battery is plugged in and the ESC
+powers up again.
+"""
+_MAX_CURRENT_A = 120.0
+"""Approximate motor current at full throttle."""
+_AMBIENT_C = 22.0
+_VARIANT = 120
+_FIRMWARE = 4 << 8 | 17
+"""Firmware 4.17."""
+_SPEED_PER_VOLT = 2500.0
+"""Electrical speed in 1/min for each volt at the motor."""
 _FULL_SPEED = 3.8 * _CELLS * _SPEED_PER_VOLT
-_SUPPLIES_NO_BEC_CURRENT = rows(LiveData)["bec_current"].not_on
+_WITHOUT_BEC_CURRENT = rows(LiveData)["bec_current"].not_on
 _EXTREMES = tuple(
-    name.partition("_")[::2] for name in InfoData._fields if name[:4] in ("max_", "min_")
+    name.partition("_")[::2] for name in InfoData._fields if name.startswith(("max_", "min_"))
 )
+"""("max" or "min", name of the live field) for each logged extreme."""
 
 
 class Phase(NamedTuple):
-    """A part of the profile. The throttle moves evenly to ``throttle`` within ``ramp_s``, then stays."""
+    """A part of the profile. The throttle ramps linearly to ``throttle``, then stays."""
 
     name: str
     duration_s: float
     throttle: int
-    """-100..100 %; the motor is driven above 0 and braked by regeneration below 0."""
+    """-100..100 %. Above 0 the motor is driven, below 0 it is braked by regeneration."""
     state: OperatingState
     ramp_s: float = 1.0
+    """Duration of the ramp. 0: the throttle jumps."""
 
 
 POWER_UP = (
@@ -73,11 +83,11 @@ FLIGHT = (
     Phase("stop", 4, -30, OperatingState.Brake, 0.5),
     Phase("cool-down", 12, 0, OperatingState.MotorOff, 0.5),
 )
-"""The profile, 50 s, repeated for ever."""
+"""A profile of 50 s, which is repeated for ever."""
 
 
 class FlightModel:
-    """Battery, motor and heat of one ESC since its power-up, stepped each ``period_s``."""
+    """Battery, motor and temperatures of one ESC, in steps of ``period_s`` since its power-up."""
 
     def __init__(
         self, profile: Sequence[Phase], period_s: float, device: Device, seed: int
@@ -86,100 +96,127 @@ class FlightModel:
         self._device = device
         self._dt = period_s
         self._random = Random(f"model {seed}").random
-        self._strength = _MAX_CURRENT * (0.95 + 0.1 * self._random())
-        self._stage_temperature = _AMBIENT + 4 + 2 * self._random()
-        self._bec_temperature = _AMBIENT + 6 + 2 * self._random()
-        self._phases = self._batteries()
+        self._strength_a = _MAX_CURRENT_A * (0.95 + 0.1 * self._random())
+        """Current scale of this ESC's motor."""
+        self._stage_c = _AMBIENT_C + 4 + 2 * self._random()
+        self._bec_c = _AMBIENT_C + 6 + 2 * self._random()
+        self._phases = self._endless_phases()
         self.phase = next(self._phases)
-        self._phase_s = self._ramp_from = 0.0
+        self._phase_s = 0.0
+        """Time since the start of the phase."""
+        self._ramp_from = 0.0
+        """Throttle at the start of the phase's ramp, in %."""
 
-    def _batteries(self) -> Iterator[Phase]:
-        """The phases of one battery after the other; with each the ESC's log begins again."""
+    def _endless_phases(self) -> Iterator[Phase]:
+        """Yield the phases with one battery after another. Each begins a new log of the ESC."""
         while True:
             self._full = 0.94 + 0.06 * self._random()
-            self._charge = self._speed = self._throttle = 0.0
+            """Charge of the fresh battery as a share of its capacity."""
+            self._charge_mah = 0.0
+            self._speed = 0.0
+            self._throttle = 0.0
             self._peak = 0
             self._log: dict[str, int] = {}
             yield from POWER_UP
-            while self._charge <= 0.8 * _CAPACITY:
+            while self._charge_mah <= 0.8 * _CAPACITY_MAH:
                 yield from self._profile
 
     def step(self, errors: int) -> LiveData:
-        """One period on; the live data at its end. ``errors`` are set beside the bits that belong to the state."""
+        """Advance by one period and return the live data at its end.
+
+        The bits of ``errors`` are set in addition to the bits implied by the state.
+        """
         self._phase_s += self._dt
         while self._phase_s >= self.phase.duration_s:
             self._phase_s -= self.phase.duration_s
-            self.phase = phase = next(self._phases)
-            # from driving to braking and back the throttle jumps to 0: no current runs against the state
-            self._ramp_from = self._throttle if phase.throttle * self._throttle >= 0 else 0.0
+            self.phase = next(self._phases)
+            # Between driving and braking the throttle jumps to 0, so that the sign of the current
+            # always agrees with the state.
+            has_same_sign = self.phase.throttle * self._throttle >= 0
+            self._ramp_from = self._throttle if has_same_sign else 0.0
         phase = self.phase
-        ramp = min(self._phase_s / phase.ramp_s, 1.0) if phase.ramp_s else 1.0
+        ramp = 1.0
+        if phase.ramp_s:
+            ramp = min(self._phase_s / phase.ramp_s, 1.0)
         self._throttle = self._ramp_from + (phase.throttle - self._ramp_from) * ramp
-        live = self._driven(self._throttle / 100, errors)
-        self._remember(live)
+        live = self._compute_live(self._throttle / 100, errors)
+        self._update_log(live)
         return live
 
-    def _driven(self, drive: float, errors: int) -> LiveData:
-        """A propeller: current with the square of the speed. ``drive``: throttle, -1..1; the brake feeds the battery."""
-        random, part = self._random, self._speed / _FULL_SPEED
-        open_voltage = _CELLS * (3.5 + 0.7 * max(self._full - self._charge / _CAPACITY, 0.0))
-        motor_current = battery_current = 0.0
+    def _compute_live(self, drive: float, errors: int) -> LiveData:
+        """Advance the model of a propeller by one period and return the live data.
+
+        ``drive`` is the throttle, -1..1. The current rises with the square of the speed. Braking
+        charges the battery.
+        """
+        random = self._random
+        part = self._speed / _FULL_SPEED
+        charge_left = max(self._full - self._charge_mah / _CAPACITY_MAH, 0.0)
+        open_v = _CELLS * (3.5 + 0.7 * charge_left)
+        motor_a = 0.0
+        battery_a = 0.0
         if drive > 0:
-            motor_current = self._strength * (0.75 * part * part + 0.01) * (0.98 + 0.04 * random())
-            battery_current = motor_current * drive
+            motor_a = self._strength_a * (0.75 * part * part + 0.01) * (0.98 + 0.04 * random())
+            battery_a = motor_a * drive
         elif drive < 0:
-            motor_current = self._strength * (1.5 * drive - 0.3) * part
-            battery_current = motor_current * part
-        wanted = open_voltage * max(drive, 0.0) * _SPEED_PER_VOLT
-        self._speed = self._later(self._speed, wanted, 0.4 if drive else 1.25)
+            motor_a = self._strength_a * (1.5 * drive - 0.3) * part
+            battery_a = motor_a * part
+        settled_speed = open_v * max(drive, 0.0) * _SPEED_PER_VOLT
+        self._speed = self._settle(self._speed, settled_speed, 0.4 if drive else 1.25)
         if drive <= 0 and self._speed < 400:
             self._speed = 0.0
-        self._charge += max(battery_current, 0.0) * self._dt / 3.6
-        bec_current = 0.25 + 0.1 * random() + (0.8 * random() if drive > 0 else 0.0)
-        settled = _AMBIENT + 4 + 60 * abs(motor_current) / _MAX_CURRENT
-        self._stage_temperature = self._later(self._stage_temperature, settled, 25)
-        settled = _AMBIENT + 5 + 4 * bec_current + 0.2 * (self._stage_temperature - _AMBIENT)
-        self._bec_temperature = self._later(self._bec_temperature, settled, 40)
+        self._charge_mah += max(battery_a, 0.0) * self._dt / 3.6
+        bec_a = 0.25 + 0.1 * random()
+        if drive > 0:
+            bec_a += 0.8 * random()
+        settled_c = _AMBIENT_C + 4 + 60 * abs(motor_a) / _MAX_CURRENT_A
+        self._stage_c = self._settle(self._stage_c, settled_c, 25)
+        settled_c = _AMBIENT_C + 5 + 4 * bec_a + 0.2 * (self._stage_c - _AMBIENT_C)
+        self._bec_c = self._settle(self._bec_c, settled_c, 40)
 
-        battery_raw, motor_raw = round(battery_current * 10), round(motor_current * 10)
+        battery_raw = round(battery_a * 10)
+        motor_raw = round(motor_a * 10)
         peak = battery_raw if self._device.peak_current_of == "battery" else motor_raw
         self._peak = max(self._peak, peak + peak // 8)
         throttle = round(self._throttle)
-        standing = self.phase.state in _STANDING
+        is_standing = self.phase.state in _STANDING
+        has_bec_current = self._device not in _WITHOUT_BEC_CURRENT
         return LiveData(
             electrical_speed=round(self._speed),
-            battery_voltage=round((open_voltage - battery_current * 0.015) * 100),
+            battery_voltage=round((open_v - battery_a * 0.015) * 100),
             battery_current=battery_raw,
             motor_current=motor_raw,
             peak_current=self._peak,
-            consumed_charge=int(self._charge),
-            bec_current=round(bec_current * 1000) * (self._device not in _SUPPLIES_NO_BEC_CURRENT),
-            bec_voltage=round((8.03 - 0.02 * bec_current) * 1000),
+            consumed_charge=int(self._charge_mah),
+            bec_current=round(bec_a * 1000) if has_bec_current else 0,
+            bec_voltage=round((8.03 - 0.02 * bec_a) * 1000),
             pwm_input=1001 + (9 * throttle if throttle > 0 else throttle),
             throttle=throttle,
             output_opening=abs(throttle) if self._speed > 0 else 0,
-            power_stage_temperature=round(self._stage_temperature),
-            bec_temperature=round(self._bec_temperature),
-            operating_errors=errors | standing << OperatingError.PROGRAMMING_ALLOWED,
+            power_stage_temperature=round(self._stage_c),
+            bec_temperature=round(self._bec_c),
+            operating_errors=errors | is_standing << OperatingError.PROGRAMMING_ALLOWED,
             operating_state=self.phase.state,
             timing=20,
         )
 
-    def _later(self, now: float, settled: float, seconds: float) -> float:
-        """A value one period on that settles with this lag."""
-        return now + (settled - now) * min(self._dt / seconds, 1.0)
+    def _settle(self, value: float, target: float, lag_s: float) -> float:
+        """Return the value one period later, if it approaches ``target`` with this lag."""
+        return value + (target - value) * min(self._dt / lag_s, 1.0)
 
-    def _remember(self, live: LiveData) -> None:
-        """The ESC's own log: the extremes of InfoData."""
+    def _update_log(self, live: LiveData) -> None:
+        """Update the ESC's own log, the extremes of InfoData."""
         log = self._log
-        for extreme, of in _EXTREMES:
-            value, name = getattr(live, of), f"{extreme}_{of}"
-            log[name] = (max if extreme == "max" else min)(log.get(name, value), value)
+        for extreme, field_name in _EXTREMES:
+            value = getattr(live, field_name)
+            name = f"{extreme}_{field_name}"
+            choose = max if extreme == "max" else min
+            log[name] = choose(log.get(name, value), value)
         if not log["max_electrical_speed"]:
             log["max_battery_voltage"] = 0
 
     def info(self, selftest_errors: int) -> InfoData:
-        """The info data now: extremes of all live data since power-up, sent or not."""
+        """Return the info data: extremes of all live data since power-up, sent or not."""
         return InfoData(
             device_and_variant=device_and_variant(self._device, _VARIANT),
             firmware_word=_FIRMWARE,
@@ -197,73 +234,82 @@ class Dropout(NamedTuple):
 
 
 class ErrorWindow(NamedTuple):
-    """An error bit that is set from ``start_ns`` for ``duration_ns`` (None: for ever), counted from the simulation's start."""
+    """An error bit that is set for a time."""
 
     bit: OperatingError | SelfTestError
     start_ns: int
+    """Counted from the start of the simulation."""
     duration_ns: int | None = None
+    """None: the bit stays set."""
 
 
 class Swap(NamedTuple):
-    """Another device is plugged in ``time_ns`` after the simulation's start. Layout None: the device's usual one."""
+    """Another device replaces the present one."""
 
     time_ns: int
+    """Counted from the start of the simulation."""
     device: Device
     layout: Layout | None = None
+    """None: the usual layout of the device."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Faults:
-    """What goes wrong."""
+    """Faults of the line and of the ESC."""
 
     flipped_bits: float = 0.0
-    """Share of the frames' bits that are flipped, 0..1."""
+    """Probability that a bit of a frame is flipped, 0..1."""
     dropout: Dropout | None = None
     errors: tuple[ErrorWindow, ...] = ()
     swaps: tuple[Swap, ...] = ()
-    """In order of time."""
+    """Ordered by time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EscOptions:
-    """What ESC it is, and how it sends."""
+    """The device and the way it sends."""
 
     device: Device = Device.KOSMIK
     layout: Layout | None = None
-    """None: the device's usual one."""
+    """None: the usual layout of the device."""
     period_ns: int = 10_000_000
-    """From live frame to live frame, 100 µs..10 s."""
+    """Time from one live frame to the next, 100 µs..10 s."""
     info_every: int = 100
-    """An info frame after every n-th live frame; 0: never."""
+    """An info frame follows every n-th live frame. 0: never."""
     profile: tuple[Phase, ...] = FLIGHT
     faults: Faults = field(default_factory=Faults)
 
 
 def usual_layout(device: Device) -> Layout:
-    """The layout in which the simulated device sends by default: legacy for the JIVEPro as recorded, else V4."""
+    """Return the layout that the simulated device uses by default.
+
+    It is legacy for the JIVEPro, as in recordings, and V4 for all others.
+    """
     return Layout.LEGACY if device is Device.JIVEPRO else Layout.V4
 
 
 class Sent(NamedTuple):
-    """A frame and what became of it."""
+    """A frame before and after the faults of the line."""
 
     time_ns: int
-    """When its first byte leaves, on the clock of ``start_ns``."""
+    """Time at which its first byte leaves, on the clock of ``start_ns``."""
     data: Data
-    """What the ESC meant to say."""
     frame: bytes
-    """The frame as built."""
+    """The correct frame with ``data``."""
     wire: bytes
-    """What goes out: the frame with flipped bits."""
+    """The frame with flipped bits."""
 
     @property
     def intact(self) -> bool:
-        """Where False, a receiver rejects the frame, but for flips of bits that the legacy layout's CRC does not cover."""
+        """False if bits are flipped.
+
+        A receiver then rejects the frame, unless the CRC of the legacy layout covers none of them.
+        """
         return self.wire == self.frame
 
 
 class SimulatedEsc:
-    """One ESC. The first frame leaves at ``start_ns``."""
+    """One simulated ESC. The first frame leaves at ``start_ns``."""
 
     def __init__(self, options: EscOptions | None = None, seed: int = 0, start_ns: int = 0) -> None:
         options = options or EscOptions()
@@ -278,36 +324,36 @@ class SimulatedEsc:
         self._tick_ns = start_ns
         self._frame_number = 0
         self._info_due = False
-        self._model = self._powered_up(options.device, seed)
+        self._model = self._power_up(options.device, seed)
         self._swaps = list(reversed(faults.swaps))
         self._faults = faults
         self._flips = Random(f"flips {seed}").random
 
     def frames_until(self, now_ns: int) -> list[Sent]:
-        """What leaves up to and including ``now_ns`` and was not returned yet, in order."""
+        """Return the frames up to and including ``now_ns`` that were not returned yet, in order."""
         frames: list[Sent] = []
         while self.next_ns <= now_ns:
-            sent = self._next()
+            sent = self._make_next_frame()
             if sent is not None:
                 frames.append(sent)
         return frames
 
-    def _next(self) -> Sent | None:
-        """The frame due at ``next_ns``, None in a dropout; moves ``next_ns`` on."""
+    def _make_next_frame(self) -> Sent | None:
+        """Return the frame due at ``next_ns``, or None in a dropout. Update ``next_ns``."""
         now_ns = self.next_ns
         since_start = now_ns - self._start_ns
         data: Data
         if self._info_due:
-            data = self._model.info(self._word(SelfTestError, since_start))
+            data = self._model.info(self._error_word(SelfTestError, since_start))
             self._info_due = False
             self.next_ns = self._tick_ns
         else:
             while self._swaps and since_start >= self._swaps[-1].time_ns:
                 self._plug_in(self._swaps.pop())
             options = self._options
-            live = self._model.step(self._word(OperatingError, since_start))
-            data = live
-            self._tick_ns = self.next_ns = now_ns + options.period_ns
+            data = self._model.step(self._error_word(OperatingError, since_start))
+            self._tick_ns = now_ns + options.period_ns
+            self.next_ns = self._tick_ns
             self._frame_number += 1
             if options.info_every and self._frame_number % options.info_every == 0:
                 self._info_due = True
@@ -318,27 +364,31 @@ class SimulatedEsc:
             if since_start % interval >= interval - duration:
                 return None
         frame = encode(data, self.layout)
-        return Sent(now_ns, data, frame, self._spoiled(frame))
+        return Sent(now_ns, data, frame, self._flip_bits(frame))
 
     def _plug_in(self, swap: Swap) -> None:
         self.device = swap.device
         self.layout = swap.layout or usual_layout(swap.device)
-        self._model = self._powered_up(swap.device, self._seed + 1_000_003 * (1 + len(self._swaps)))
+        seed = self._seed + 1_000_003 * (1 + len(self._swaps))
+        self._model = self._power_up(swap.device, seed)
         self._frame_number = 0
 
-    def _powered_up(self, device: Device, seed: int) -> FlightModel:
+    def _power_up(self, device: Device, seed: int) -> FlightModel:
         options = self._options
         return FlightModel(options.profile, options.period_ns / SECOND_NS, device, seed)
 
-    def _word(self, kind: type[OperatingError] | type[SelfTestError], since_start: int) -> int:
+    def _error_word(
+        self, bits: type[OperatingError] | type[SelfTestError], since_start: int
+    ) -> int:
+        """Return the word with the bits of this class that are set at this time."""
         word = 0
         for bit, start, duration in self._faults.errors:
             end = math.inf if duration is None else start + duration
-            if isinstance(bit, kind) and start <= since_start < end:
+            if isinstance(bit, bits) and start <= since_start < end:
                 word |= 1 << bit
         return word
 
-    def _spoiled(self, frame: bytes) -> bytes:
+    def _flip_bits(self, frame: bytes) -> bytes:
         share = self._faults.flipped_bits
         if not share:
             return frame

@@ -1,6 +1,6 @@
-"""Names of devices, operating states and error bits, with their class. Source: sheet V4, tables of the live and info frame.
+"""Names of devices, operating states and error bits (sheet V4, tables of the live and info frame).
 
-Numbers without a name stay numbers: no function here raises for a value that newer firmware may send.
+Newer firmware may send numbers that have no name here. They are shown as numbers.
 """
 
 from enum import IntEnum
@@ -10,12 +10,15 @@ from kontronik_can_gw.esc.decoder import ErrorBit, Severity, State
 
 
 class Device(IntEnum):
-    """High six bits of the info frame's first word. 0 is reserved. A member is written ``NAME = (number, text, peak_current_of)``."""
+    """Number of the device: the high six bits of the info frame's first word. 0 is reserved.
+
+    A member is written ``NAME = (number, text, peak_current_of)``.
+    """
 
     text: str
-    """The maker's spelling."""
+    """The name as the manufacturer writes it."""
     peak_current_of: str | None
-    """Whose peak current it reports (a held maximum): ``motor``, ``battery``, or None where unknown."""
+    """Origin of the peak current, a held maximum: ``motor`` or ``battery``. None if unknown."""
 
     def __new__(cls, number: int, text: str, peak_current_of: str | None) -> Self:
         member = int.__new__(cls, number)
@@ -33,9 +36,11 @@ class Device(IntEnum):
 
 # fmt: off
 class OperatingState(IntEnum):
-    """Live frame, offset 32. 0, 4, 5, 6 and 8 have no name; 12 stands in every recorded idle frame.
+    """Operating state: live frame, offset 32. 0, 4, 5, 6 and 8 have no name.
 
-    A member is written ``NAME = (number, meaning, kind, phase, remedy)``, see ``State``; the sheet has nothing but the names.
+    All recorded idle frames contain 12. A member is written
+    ``NAME = (number, meaning, kind, phase, remedy)``, as described in ``State``. Its name is the
+    spelling of the sheet, which describes nothing but the names.
     """
 
     about: State
@@ -47,7 +52,7 @@ class OperatingState(IntEnum):
         return member
 
     def __init__(self, *_: object) -> None:
-        self.about = self.about._replace(text=self.name)  # the sheet's spelling
+        self.about = self.about._replace(text=self.name)
 
     WaitForSignal = (1, "waits for a signal at its input", "idle", "Waiting",
         "If it stays: switch transmitter and receiver on, check the cable from the receiver.")
@@ -80,12 +85,15 @@ class OperatingState(IntEnum):
 LARGEST_STATE = max(OperatingState)
 
 
-# Two lines a bit: number, severity and meaning; remedy (common practice with any ESC: the sheet has none), emergency code, summary.
-_E, _W, _S = Severity.ERROR, Severity.WARNING, Severity.STATUS
+# The parts of a member are described in ``ErrorBit``. The sheet has no remedies: they are common
+# practice with any ESC.
+_E = Severity.ERROR
+_W = Severity.WARNING
+_S = Severity.STATUS
 
 
 class OperatingError(ErrorBit):
-    """Bits of the live frame's error word, offset 28."""
+    """Bits of the error word: live frame, offset 28."""
 
     UNDERVOLTAGE = (0, _E, "battery voltage too low",
         "Stop soon. Charge or check the battery. Check connectors and cables: long or thin ones lose voltage under load.", 0x3220)
@@ -140,7 +148,7 @@ class OperatingError(ErrorBit):
 
 
 class SelfTestError(ErrorBit):
-    """Bits of the info frame's self-test word, offset 8. All are errors."""
+    """Bits of the self-test word: info frame, offset 8. All are errors."""
 
     TEST_PHASE_LOW_SIDE = (0, _E, "motor phase low side does not switch",
         "Check the motor's wires and plugs for a short. If they are well, have the ESC checked.")
