@@ -1,12 +1,13 @@
-"""Message plans -> functions of ESCs, gateway and time: to the bits of a frame as an integer, or to the frame.
+"""Compiles message plans into functions that pack a frame from ESCs, gateway and time.
 
-A value that does not fit becomes the signal's Error code, one that is not available its NotAvailable code; nothing wraps, nothing is
-clipped. Bit 0 of the integer is bit 0 of byte 0.
+Nothing wraps and nothing is clipped: a value that does not fit becomes the signal's Error code, and
+a value that is not available becomes its NotAvailable code. The bits of a frame are one integer,
+whose bit 0 is bit 0 of byte 0.
 """
 
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
@@ -16,70 +17,86 @@ from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
-"""ESCs, gateway, time, alive counter and place of the page (``MessagePlan.pages``) to bits, without a CRC."""
+"""Maps ESCs, gateway, time, alive counter and page to the bits of a frame, without a CRC.
+
+The page is given by its position in ``MessagePlan.pages``.
+"""
 MakeFrame = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], CanFrame]
-"""The same to the frame with its CRC."""
-_Raw = Callable[[Sequence[EscTelemetry], GatewayStatus, int], int]
+"""Maps the same arguments to the frame, with its CRC."""
+_ReadRaw = Callable[[Sequence[EscTelemetry], GatewayStatus, int], int]
+"""Maps ESCs, gateway and time to a signal's raw value."""
 _FLOATS = {16: "<e", 32: "<f", 64: "<d"}
+"""struct codes of IEEE 754 numbers by their length in bits."""
 
 
 def place(pieces: Sequence[Piece], raw: int) -> int:
-    """A raw value (negative ones in two's complement) at its bits of the frame."""
+    """Return a frame's bits with a raw value at these pieces and 0 elsewhere.
+
+    Bits beyond the pieces are cut off, so a negative value is stored as two's complement.
+    """
     return sum([(raw >> piece.shift & (1 << piece.width) - 1) << piece.at for piece in pieces])
 
 
-def take(pieces: Sequence[Piece], bits: int) -> int:
-    """The raw value (unsigned) that stands at the pieces of a frame."""
+def extract(pieces: Sequence[Piece], bits: int) -> int:
+    """Return the unsigned raw value at these pieces of a frame's bits."""
     return sum((bits >> piece.at & (1 << piece.width) - 1) << piece.shift for piece in pieces)
 
 
 def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
-    """An alive counter runs 0..modulus-1: to its greatest value, with an E2E profile 1 CRC to 14 of 4 bits."""
-    return min(signal.high + 1, 15) if has_crc else signal.high + 1
+    """Return the number of values of an alive counter. It counts from 0 and then restarts.
+
+    It uses all values of its bits. In a message with a CRC it counts to 14 at most, as E2E profile
+    1 requires.
+    """
+    modulus = signal.high + 1
+    return min(modulus, 15) if has_crc else modulus
 
 
 def compile_pack(plan: MessagePlan) -> Pack:
-    """The function to the bits of a frame."""
+    """Return the function that packs the message's bits."""
     has_crc = any(signal.role is Role.CRC for signal in plan.signals)
     counters = [
         (signal.pieces, alive_modulus(signal, has_crc))
         for signal in plan.signals
         if signal.role is Role.ALIVE
     ]
-    pages = [_page(plan, page) for page in plan.pages]
+    pages = [_compile_page(plan, page) for page in plan.pages]
 
     def pack(
         escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, alive: int, at: int
     ) -> int:
         bits, sources = pages[at]
-        for pieces, raw in sources:
-            bits |= place(pieces, raw(escs, gateway, now))
-        for places, modulus in counters:
-            bits |= place(places, alive % modulus)
+        for pieces, read_raw in sources:
+            bits |= place(pieces, read_raw(escs, gateway, now))
+        for pieces, modulus in counters:
+            bits |= place(pieces, alive % modulus)
         return bits
 
     return pack
 
 
 def compile_frame(plan: MessagePlan) -> MakeFrame:
-    """The function to the frame."""
+    """Return the function that makes the message's frame."""
     pack = compile_pack(plan)
     crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
 
-    def frame(
+    def make_frame(
         escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, alive: int, at: int
     ) -> CanFrame:
         data = pack(escs, gateway, now, alive, at).to_bytes(plan.length, "little")
         if crc is not None:
-            data = _protected(data, crc.pieces[0].at // 8, plan.data_id)
-        # from FIRST_PART on a page would be a part of a transfer
-        return CanFrame(plan.can_id, data, plan.extended, plan.fd, at if at < FIRST_PART else -at)
+            data = _insert_crc(data, crc.pieces[0].at // 8, plan.data_id)
+        # FIRST_PART and greater numbers mean a part of a transfer. Negative numbers are free.
+        page = at if at < FIRST_PART else -at
+        return CanFrame(plan.can_id, data, plan.extended, plan.fd, page)
 
-    return frame
+    return make_frame
 
 
-def _page(plan: MessagePlan, page: int | None) -> tuple[int, list[tuple[tuple[Piece, ...], _Raw]]]:
-    """The constant bits of a page, and where the raw value of each of its sources stands."""
+def _compile_page(
+    plan: MessagePlan, page: int | None
+) -> tuple[int, list[tuple[tuple[Piece, ...], _ReadRaw]]]:
+    """Return a page's constant bits, and pieces and function of each signal with a source."""
     constant = 0
     sources = []
     for signal in plan.signals:
@@ -90,57 +107,117 @@ def _page(plan: MessagePlan, page: int | None) -> tuple[int, list[tuple[tuple[Pi
         elif signal.role is Role.CONSTANT:
             constant |= place(signal.pieces, signal.constant)
         elif signal.source is not None:
-            sources.append((signal.pieces, _raw(signal)))
+            sources.append((signal.pieces, _compile_raw(signal)))
     return constant, sources
 
 
-def _raw(signal: SignalPlan) -> _Raw:
-    """The function to a signal's raw value, multiplied first and rounded once to the nearest, halves up; else to one of its codes."""
-    source, index, numbers = signal.source, signal.esc or 0, signal.numbers
-    assert source is not None
-    low, high, error, not_available = signal.low, signal.high, signal.error, signal.not_available
-    common = signal.slope.denominator * signal.intercept.denominator
-    factor, offset = int(signal.slope * common), int(signal.intercept * common)
+def _compile_raw(signal: SignalPlan) -> _ReadRaw:
+    """Return the function that reads a signal's source and returns its raw value or a code."""
+    if signal.is_float:
+        return _compile_float(signal)
+    if signal.numbers is not None:
+        return _compile_enumeration(signal, signal.numbers)
+    return _compile_whole(signal)
 
-    def raw(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> int:
+
+def _compile_whole(signal: SignalPlan) -> _ReadRaw:
+    """Return the function of a signal with an integer raw value.
+
+    The value is multiplied first and rounded once to the nearest integer, halves up.
+    """
+    source = signal.source
+    assert source is not None
+    index = signal.esc or 0
+    low = signal.low
+    high = signal.high
+    error = signal.error
+    not_available = signal.not_available
+    common = signal.slope.denominator * signal.intercept.denominator
+    factor = int(signal.slope * common)
+    offset = int(signal.intercept * common)
+
+    def read_raw(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> int:
         esc = escs[index]
-        found = steps(source, esc, gateway, now)
-        by = None if found is None else divisor(source, esc)
-        if found is None or by is None:
+        count = steps(source, esc, gateway, now)
+        if count is None:
             return not_available
-        if signal.is_float:
-            number = _float(signal, found, by)
-            if number is None or not signal.limits[0] <= number <= signal.limits[1]:
-                return error
-            bits = float_bits(number, signal.length)
-            return error if bits is None or bits == not_available else bits
-        if numbers is not None:
-            return numbers.get(found, error)
-        over, under = by
-        value = (2 * (found * factor * under + offset * over) + common * over) // (
+        parts = divisor(source, esc)
+        if parts is None:
+            return not_available
+        over, under = parts
+        value = (2 * (count * factor * under + offset * over) + common * over) // (
             2 * common * over
         )
         if source.rolls:
             return value % (high + 1)
         if signal.saturates and value < low:
             return low
-        # a true value must not look like a code amid the values
+        # A true value must not be mistaken for a code that lies within the values.
         return value if low <= value <= high and value != not_available else error
 
-    return raw
+    return read_raw
 
 
-def _float(signal: SignalPlan, found: int, by: tuple[int, int]) -> float | None:
-    """Steps as a double, by one exact division; None for a number that the value table does not name."""
+def _compile_enumeration(signal: SignalPlan, numbers: Mapping[int, int]) -> _ReadRaw:
+    """Return the function of a signal that sends a raw value for each number of its source."""
+    source = signal.source
+    assert source is not None
+    index = signal.esc or 0
+    error = signal.error
+    not_available = signal.not_available
+
+    def read_raw(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> int:
+        esc = escs[index]
+        count = steps(source, esc, gateway, now)
+        if count is None or divisor(source, esc) is None:
+            return not_available
+        return numbers.get(count, error)
+
+    return read_raw
+
+
+def _compile_float(signal: SignalPlan) -> _ReadRaw:
+    """Return the function of a signal whose raw value is an IEEE 754 number."""
+    source = signal.source
+    assert source is not None
+    index = signal.esc or 0
+    low, high = signal.limits
+    length = signal.length
+    error = signal.error
+    not_available = signal.not_available
+
+    def read_raw(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> int:
+        esc = escs[index]
+        count = steps(source, esc, gateway, now)
+        if count is None:
+            return not_available
+        parts = divisor(source, esc)
+        if parts is None:
+            return not_available
+        number = _scale_to_float(signal, count, parts)
+        if number is None or not low <= number <= high:
+            return error
+        bits = float_bits(number, length)
+        return error if bits is None or bits == not_available else bits
+
+    return read_raw
+
+
+def _scale_to_float(signal: SignalPlan, count: int, parts: tuple[int, int]) -> float | None:
+    """Return the number to send for ``count`` steps and this divisor, computed with one division.
+
+    None for a number that the signal's value table does not contain.
+    """
     if signal.numbers is not None:
-        return signal.numbers.get(found)
+        return signal.numbers.get(count)
     slope = signal.slope
-    quotient = ratio(found * slope.numerator * by[1], slope.denominator * by[0])
+    over, under = parts
+    quotient = ratio(count * slope.numerator * under, slope.denominator * over)
     return quotient + float(signal.intercept)
 
 
 def ratio(numerator: int, denominator: int) -> float:
-    """A fraction as a double; infinite where it is too large."""
+    """Return the quotient as a double, infinite if it is too large."""
     try:
         return numerator / denominator
     except OverflowError:
@@ -148,7 +225,10 @@ def ratio(numerator: int, denominator: int) -> float:
 
 
 def float_bits(number: float | Fraction, length: int) -> int | None:
-    """The IEEE 754 bits of a float of 16, 32 or 64 bits; None where it is too large, and of any other length."""
+    """Return the IEEE 754 bits of a number in 16, 32 or 64 bits.
+
+    None if the number is too large, or for another length.
+    """
     try:
         packed = struct.pack(_FLOATS[length], float(number))
     except (KeyError, OverflowError):
@@ -157,7 +237,7 @@ def float_bits(number: float | Fraction, length: int) -> int | None:
 
 
 def has_code(signal: SignalPlan) -> bool:
-    """True where "not available" is a code of its own, outside the values."""
+    """Return True if the code for "not available" differs from every value of the signal."""
     if signal.is_float:
         value = float_of(signal.not_available, signal.length)
         return math.isnan(value) or not signal.limits[0] <= value <= signal.limits[1]
@@ -167,19 +247,22 @@ def has_code(signal: SignalPlan) -> bool:
 
 
 def float_of(bits: int, length: int) -> float:
-    """The number that IEEE 754 bits hold."""
+    """Return the number that IEEE 754 bits of 16, 32 or 64 bits represent."""
     number: float
     (number,) = struct.unpack(_FLOATS[length], bits.to_bytes(length // 8, "little"))
     return number
 
 
 def _crc_table() -> bytes:
-    """AUTOSAR E2E profile 1: CRC-8 SAE J1850 (polynomial 1Dh) over data id and data, start and final XOR 0 (PRS_E2EProtocol)."""
+    """Return the table of CRC-8 SAE J1850, polynomial 1Dh."""
     table = []
     for byte in range(256):
+        value = byte
         for _ in range(8):
-            byte = byte << 1 ^ (0x11D if byte & 0x80 else 0)
-        table.append(byte)
+            value <<= 1
+            if value & 0x100:
+                value ^= 0x11D
+        table.append(value)
     return bytes(table)
 
 
@@ -187,13 +270,18 @@ _CRC = _crc_table()
 
 
 def e2e_crc(data: bytes, at: int, data_id: int) -> int:
-    """The CRC of a frame whose CRC byte stands at ``at``: data id low byte, high byte, all other bytes in order."""
+    """Return the CRC of AUTOSAR E2E profile 1 (PRS_E2EProtocol) for a frame with its CRC at ``at``.
+
+    It is computed over low byte and high byte of the data id, then all other bytes of the frame.
+    Start value and final XOR are 0.
+    """
     value = 0
-    for byte in bytes((data_id & 0xFF, data_id >> 8 & 0xFF)) + data[:at] + data[at + 1 :]:
+    for byte in data_id.to_bytes(2, "little") + data[:at] + data[at + 1 :]:
         value = _CRC[value ^ byte]
     return value
 
 
-def _protected(data: bytes, at: int, data_id: int) -> bytes:
-    """The frame with its CRC at ``at``."""
-    return data[:at] + bytes((e2e_crc(data, at, data_id),)) + data[at + 1 :]
+def _insert_crc(data: bytes, at: int, data_id: int) -> bytes:
+    """Return the frame with its CRC in byte ``at``."""
+    crc = e2e_crc(data, at, data_id)
+    return data[:at] + bytes([crc]) + data[at + 1 :]

@@ -1,4 +1,7 @@
-"""Compiled messages: their signals, bits, what fills them and when they are sent. Made from a DBC (dbc/prepare.py) or a PDO mapping."""
+"""Compiled messages: bits and sources of their signals, and when the messages are sent.
+
+They are made from a DBC (dbc/prepare.py) or from the mapping of a PDO.
+"""
 
 import math
 from collections.abc import Mapping
@@ -13,12 +16,13 @@ from kontronik_can_gw.esc.values import Group, Value
 
 
 class SendType(Flag):
-    """When a message is sent. Several may hold."""
+    """When a message is sent. Several can be combined."""
 
     CYCLIC = 1
     EVENT = 2
-    """With each UART frame (or change of the link) that brings one of its signals."""
+    """With each UART frame, or change of the link, that updates one of its signals."""
     ON_CHANGE = 4
+    """When one of its values has changed."""
 
 
 SEND_TYPES = {
@@ -28,15 +32,16 @@ SEND_TYPES = {
     "CyclicAndEvent": SendType.CYCLIC | SendType.EVENT,
     "CyclicAndOnChange": SendType.CYCLIC | SendType.ON_CHANGE,
 }
-"""Send types by the names that a configuration has for them."""
+"""Send types by their names in a configuration."""
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""Possible numbers of data bytes of a CAN FD frame."""
 
 EXPECTED_LIVE_HZ = 100
-"""What a UART is expected to bring, for the computed bus load only; the gateway sends as frames come."""
+"""Expected live frames per second and UART. It is used only to compute the bus load."""
 
 
 class Role(Enum):
-    """What fills a signal."""
+    """The origin of a signal's raw value."""
 
     SOURCE = "source"
     ALIVE = "alive counter"
@@ -46,16 +51,20 @@ class Role(Enum):
 
 
 class Piece(NamedTuple):
-    """``(raw >> shift & (1 << width) - 1) << at``, ``at`` counted from bit 0 of byte 0 upward."""
+    """Neighbouring bits of a signal: ``(raw >> shift & (1 << width) - 1) << at``."""
 
     shift: int
     width: int
     at: int
+    """Position in the frame, counted upward from bit 0 of byte 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class SignalPlan:
-    """One signal with what fills it. Raw value of a source in steps x: ``x * slope + intercept``, rounded."""
+    """One signal and its source.
+
+    The raw value of x steps of the source is ``x / divisor * slope + intercept``, rounded once.
+    """
 
     name: str
     unit: str
@@ -65,43 +74,52 @@ class SignalPlan:
     is_float: bool
     pieces: tuple[Piece, ...]
     low: int
+    """Smallest raw value that is not a code."""
     high: int
+    """Greatest raw value that is not a code."""
     not_available: int
+    """Code that is sent while the value is not available."""
     error: int
+    """Code that is sent if the value does not fit."""
     slope: Fraction = Fraction(1)
     intercept: Fraction = Fraction(0)
     source: Value | None = None
     esc: int | None = None
-    """Index of the ESC the source is read from; None for the gateway."""
+    """Index of the source's ESC. None for a value of the gateway."""
     numbers: Mapping[int, int] | None = None
-    """Source number to raw value for an enumeration; what is missing is sent as Error."""
+    """For an enumeration, raw values by number of the source. Other numbers are sent as Error."""
     constant: int = 0
     saturates: bool = False
     """A value below ``low`` is sent as ``low``; one above ``high`` as Error, which then is ``high``."""
     limits: tuple[float, float] = (-math.inf, math.inf)
-    """Of a float, in raw values; its codes are bit patterns."""
+    """Smallest and greatest raw value of a float. Its codes are bit patterns."""
     page: int | None = None
-    """The multiplexer value under which the signal is sent; None: always."""
+    """Value of the multiplexer with which the signal is sent. None: with every value."""
     factor: Fraction = Fraction(1)
     offset: Fraction = Fraction(0)
-    """Physical value of a raw one: ``raw * factor + offset``, in ``unit``."""
+    """The physical value in ``unit`` is ``raw * factor + offset``."""
     texts: Mapping[int, str] = field(default_factory=dict)
-    """Value table, raw value to text, without the codes for not available and error."""
+    """Texts of the value table by raw value, without the codes for not available and error."""
     notes: tuple[str, ...] = ()
-    """What resolution or range is lost, for people."""
+    """For the user: lost resolution and range."""
     unbound: bool = False
-    """A constant because it is bound to nothing."""
+    """True if the signal is a constant because it has no source."""
 
 
 def classic_bits(length: int, extended: bool = False) -> int:
-    """Bits of a classic CAN frame with ``length`` data bytes and the most stuffing that is possible."""
-    head = 54 if extended else 34
-    return head + 13 + 8 * length + (head + 8 * length - 1) // 4
+    """Return the bits of a classic CAN frame with ``length`` data bytes.
+
+    The greatest possible number of stuff bits is included.
+    """
+    head = 54 if extended else 34  # without data, but with the CRC
+    tail = 13  # delimiters, acknowledgement, end of frame and pause, all without stuff bits
+    stuffed = head + 8 * length
+    return stuffed + tail + (stuffed - 1) // 4
 
 
 @dataclass(frozen=True, slots=True)
 class MessagePlan:
-    """One message of ours, as it is sent."""
+    """One message that the gateway sends."""
 
     name: str
     can_id: int
@@ -110,96 +128,118 @@ class MessagePlan:
     length: int
     send_type: SendType
     cycle_ns: int
-    """0: not cyclic."""
+    """Period of a cyclic message. 0: not cyclic."""
     delay_ns: int
-    """Minimum distance between two frames."""
+    """Minimum time between two frames. 0: no minimum."""
     compiled: tuple[SignalPlan, ...]
-    """Its signals, or those of the message that it is a copy of."""
+    """Signals of this message. For a copy, the signals of the original message."""
     escs: frozenset[int]
+    """Indices of the ESCs whose values the message contains."""
     paces: frozenset[Group]
-    """What the message's values change with."""
+    """Groups whose data changes the message's values."""
     pages: tuple[int | None, ...] = (None,)
+    """Values of the multiplexer, one frame for each. None: without a multiplexer."""
     data_id: int = 0
-    """AUTOSAR E2E profile 1 data id, used where the message has a CRC signal."""
+    """Data id of AUTOSAR E2E profile 1, if the message has a CRC signal."""
     renamed: tuple[str, str] | None = None
-    """Of a copy for another ESC: with what names of signals begin in ``compiled``, and with what here."""
+    """For a copy for another ESC: prefix of the signals' names in ``compiled``, and prefix here."""
 
     @property
     def signals(self) -> tuple[SignalPlan, ...]:
-        """Those of a copy are made when they are asked for: with many ESCs they would be most of the memory."""
+        """The signals of this message.
+
+        The signals of a copy are made at each call. With many ESCs, they would otherwise take most
+        of the memory.
+        """
         if self.renamed is None:
             return self.compiled
-        (esc,), (old, new) = self.escs, self.renamed
+        (esc,) = self.escs
+        old, new = self.renamed
         return tuple(
-            replace(s, name=new + s.name.removeprefix(old), esc=None if s.esc is None else esc)
-            for s in self.compiled
+            replace(
+                signal,
+                name=new + signal.name.removeprefix(old),
+                esc=None if signal.esc is None else esc,
+            )
+            for signal in self.compiled
         )
 
     @property
     def bits(self) -> tuple[int, int]:
-        """Bits on the bus at the nominal rate and at CAN FD's data rate, with the most stuffing that is possible."""
-        if self.fd:
-            head = 36 if self.extended else 17
-            data = 5 + 8 * self.length
-            return head + head // 4 + 13, data + data // 4 + (33 if self.length > 16 else 28)
-        return classic_bits(self.length, self.extended), 0
+        """Bits of a frame at the nominal bit rate, and at CAN FD's data bit rate.
+
+        The greatest possible number of stuff bits is included.
+        """
+        if not self.fd:
+            return classic_bits(self.length, self.extended), 0
+        head = 36 if self.extended else 17
+        tail = 13
+        nominal = head + head // 4 + tail
+        data = 5 + 8 * self.length
+        crc = 33 if self.length > 16 else 28  # with its fixed stuff bits
+        return nominal, data + data // 4 + crc
 
     @property
     def rate_hz(self) -> float:
-        """Usual frames a second with all UARTs at 100 Hz. Frames sent on change are not counted."""
+        """Usual frames per second with EXPECTED_LIVE_HZ at every UART.
+
+        Frames that are sent because a value changed are not counted.
+        """
         return self._rate_hz(SendType.EVENT)
 
     @property
     def worst_rate_hz(self) -> float:
-        """The same if every value that is sent on change changes all the time."""
+        """Frames per second if every value that is sent on change changes all the time."""
         return self._rate_hz(SendType.EVENT | SendType.ON_CHANGE)
 
     def _rate_hz(self, counted: SendType) -> float:
-        events = 0.0
+        rate = 0.0
         if counted & self.send_type:
             if Group.LIVE in self.paces:
-                events = EXPECTED_LIVE_HZ * len(self.escs)
+                rate = EXPECTED_LIVE_HZ * len(self.escs)
             else:
-                events = 1.0 * max(1, len(self.escs))
+                rate = 1.0 * max(1, len(self.escs))
         if self.cycle_ns:
-            events += 1e9 / self.cycle_ns
-        return min(events, 1e9 / self.delay_ns) if self.delay_ns else events
+            rate += 1e9 / self.cycle_ns
+        if self.delay_ns:
+            rate = min(rate, 1e9 / self.delay_ns)
+        return rate
 
 
 @dataclass(frozen=True)
 class Layout:
-    """All messages of ours and what should be said about them."""
+    """All messages that the gateway sends, and warnings about them."""
 
     file: str
+    """Name of the DBC."""
     node: str
+    """Node of the DBC whose messages the gateway sends."""
     messages: tuple[MessagePlan, ...]
     warnings: tuple[str, ...] = ()
 
     @cached_property
     def fingerprint(self) -> str:
-        """Eight hexadecimal digits that differ where a receiver would read frames otherwise: ids, bits, scaling, units, texts, names."""
-        crc, comma = crc32(b"["), ""
-        for message in self.messages:  # of all of them at once the memory would not come back
-            found = (
-                *(message.name, message.can_id, message.extended, message.fd, message.length),
-                [
-                    (
-                        *(s.name, s.unit, s.page, s.length, s.signed, s.is_float),
-                        *(tuple(map(tuple, s.pieces)), str(s.factor), str(s.offset)),
-                        sorted(s.texts.items()),
-                    )
-                    for s in message.signals
-                ],
-            )
-            crc, comma = crc32(f"{comma}{found!r}".encode(), crc), ", "
-        return f"{crc32(b']', crc):08X}"
+        """Eight hexadecimal digits that identify everything by which a receiver reads the frames.
+
+        That is ids, bits, scaling, units, texts and names. The digits are a CRC over the text of a
+        list. Changing that text changes the fingerprint of every layout.
+        """
+        crc = crc32(b"[")
+        comma = ""
+        # One message at a time: the memory for the text of all would not be given back.
+        for message in self.messages:
+            crc = crc32(f"{comma}{_identity_of_message(message)!r}".encode(), crc)
+            comma = ", "
+        crc = crc32(b"]", crc)
+        return f"{crc:08X}"
 
     def bus_load(
         self, bitrate: int, data_bitrate: int = 2_000_000, is_worst: bool = False
     ) -> float:
-        """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s.
+        """Return the share of the bus that the messages need at these rates in bit/s.
 
-        ``is_worst``: with ``worst_rate_hz`` instead of ``rate_hz``.
+        1 is the whole bus. The result can be greater. ``is_worst``: with ``worst_rate_hz`` instead
+        of ``rate_hz``.
         """
         load = 0.0
         for message in self.messages:
@@ -207,3 +247,29 @@ class Layout:
             rate_hz = message.worst_rate_hz if is_worst else message.rate_hz
             load += rate_hz * (nominal / bitrate + at_data_rate / data_bitrate)
         return load
+
+
+def _identity_of_message(message: MessagePlan) -> tuple[object, ...]:
+    return (
+        message.name,
+        message.can_id,
+        message.extended,
+        message.fd,
+        message.length,
+        [_identity_of_signal(signal) for signal in message.signals],
+    )
+
+
+def _identity_of_signal(signal: SignalPlan) -> tuple[object, ...]:
+    return (
+        signal.name,
+        signal.unit,
+        signal.page,
+        signal.length,
+        signal.signed,
+        signal.is_float,
+        tuple(tuple(piece) for piece in signal.pieces),
+        str(signal.factor),
+        str(signal.offset),
+        sorted(signal.texts.items()),
+    )

@@ -1,27 +1,43 @@
-"""A payload as one or several classic CAN frames with a 29-bit id (DroneCAN's transfers; specification, 4.1).
+"""Splits a payload into classic CAN frames with a 29-bit id: DroneCAN's transfers (4.1).
 
-The last byte of each frame, the tail, says where it belongs: begin, end, a bit that toggles, the number of the transfer. What is
-longer than a frame has a CRC-16/CCITT in front. Twin in C: make_transfer of native/core.c.
+The last byte of each frame, its tail, has bits for start and end of the transfer, a bit that
+toggles, and the number of the transfer. A payload longer than one frame begins with its
+CRC-16/CCITT. Twin in C: make_transfer of native/core.c.
 """
 
 from binascii import crc_hqx
 
 from kontronik_can_gw.frames import CanFrame
 
-START, END, TOGGLE, TRANSFER_ID = 0x80, 0x40, 0x20, 0x1F
-"""Bits of a tail."""
+START = 0x80
+END = 0x40
+TOGGLE = 0x20
+TRANSFER_ID = 0x1F
+"""Bits of a tail. The last is the mask of the transfer's number."""
+_BYTES_PER_FRAME = 7
 
 
 def transfer(
     can_id: int, seed: int, payload: bytes, transfer_id: int, queued: bool = False, page: int = 0
 ) -> list[CanFrame]:
-    """The frames. ``seed``: what the CRC begins with; ``queued`` as in CanFrame; ``page`` counts on from the first frame."""
-    if len(payload) > 7:
+    """Return the frames of a transfer.
+
+    ``seed`` is the start value of the CRC. ``queued`` is as in CanFrame. ``page`` is the page of
+    the first frame; each further frame has the next page.
+    """
+    if len(payload) > _BYTES_PER_FRAME:
         payload = crc_hqx(payload, seed).to_bytes(2, "little") + payload
-    count = (len(payload) + 6) // 7 or 1
     frames = []
-    for part in range(count):
-        tail = START * (part == 0) | END * (part == count - 1) | TOGGLE * (part & 1) | transfer_id
-        data = payload[7 * part : 7 * part + 7] + bytes((tail,))
+    last = max(len(payload) - 1, 0) // _BYTES_PER_FRAME
+    for part in range(last + 1):
+        tail = transfer_id
+        if part == 0:
+            tail |= START
+        if part == last:
+            tail |= END
+        if part % 2 == 1:
+            tail |= TOGGLE
+        begin = part * _BYTES_PER_FRAME
+        data = payload[begin : begin + _BYTES_PER_FRAME] + bytes([tail])
         frames.append(CanFrame(can_id, data, True, page=page + part, queued=queued))
     return frames

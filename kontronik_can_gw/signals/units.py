@@ -1,4 +1,7 @@
-"""Unit texts as they are met in DBC files, and exact conversion between those of one quantity. The units stand in ``units.tsv``."""
+"""Unit texts of DBC files, and exact conversion between units of one quantity.
+
+The units are listed in ``units.tsv``.
+"""
 
 from collections.abc import Mapping
 from fractions import Fraction
@@ -8,7 +11,7 @@ from typing import NamedTuple
 
 
 class Unit(NamedTuple):
-    """``base value = value * scale + shift`` within one quantity."""
+    """A unit of a quantity: ``value in the base unit = value * scale + shift``."""
 
     quantity: str
     scale: Fraction
@@ -16,10 +19,11 @@ class Unit(NamedTuple):
 
 
 Spellings = Mapping[str, Mapping[str, Unit]]
-"""Key of a spelling -> by quantity the unit that it means."""
+"""For the key of each spelling, its possible units by quantity."""
 _NONE = "none"
+"""The quantity of spellings that mean "no unit"."""
 _MOJIBAKE = (("Â", ""), ("Î¼", "µ"))
-"""UTF-8 read as Windows-1252, as it stands in files that went through both."""
+"""Repairs of UTF-8 texts that were read as Windows-1252."""
 _LETTERS = str.maketrans(
     {"µ": "u", "μ": "u", "°": "deg", "º": "deg", "˚": "deg", "⁻": "-", "¹": "1", "·": "*"}
     | dict.fromkeys("()[]_. ")
@@ -27,16 +31,23 @@ _LETTERS = str.maketrans(
 
 
 def _key(text: str) -> str:
-    """A spelling as it is compared where case matters."""
+    """Return the text by which a spelling is looked up. Its case is unchanged."""
     for wrong, right in _MOJIBAKE:
         text = text.replace(wrong, right)
     text = text.strip()
-    return (text[5:] if text[:5].casefold() == "unit_" else text).translate(_LETTERS)
+    if text[:5].casefold() == "unit_":
+        text = text[5:]
+    return text.translate(_LETTERS)
 
 
 @cache
 def _tables() -> tuple[Spellings, Spellings, tuple[tuple[str, str], ...]]:
-    """Spellings whose case matters, those in any case, and of each row quantity and the spelling to show."""
+    """Read the file. Returns three tables:
+
+    1. the spellings whose case matters,
+    2. the spellings whose case does not matter,
+    3. quantity and spelling to show of each unit.
+    """
     exact: dict[str, dict[str, Unit]] = {}
     loose: dict[str, dict[str, Unit]] = {}
     shown = []
@@ -54,37 +65,40 @@ def _tables() -> tuple[Spellings, Spellings, tuple[tuple[str, str], ...]]:
 
 
 def meanings(text: str) -> Mapping[str, Unit]:
-    """By quantity what a unit text can mean; empty for an unknown one."""
+    """Return the possible units of a text by quantity. Empty if the text is unknown."""
     exact, loose, _ = _tables()
     key = _key(text) or text.strip()
     return exact.get(key) or loose.get(key.casefold(), {})
 
 
 def says_nothing(text: str) -> bool:
-    """True for no text, and for one that says that there is no unit."""
+    """Return True for an empty text, and for a text that means "no unit"."""
     return not text.strip() or _NONE in meanings(text)
 
 
 def conversion(source: str, target: str) -> tuple[Fraction, Fraction] | None:
-    """(m, b) with ``value in target = value in source * m + b``; None where the two are not of one quantity.
+    """Return (m, b), so that ``value in target = value in source * m + b``.
 
-    A target that says nothing means the source's own unit.
+    None if the two are not units of one quantity. A target without a unit means the source's unit.
     """
     if target == source or says_nothing(target):
         return Fraction(1), Fraction(0)
-    of_source = meanings(source or "count")
-    for quantity, b in meanings(target).items():
-        if (a := of_source.get(quantity)) is not None:
-            return a.scale / b.scale, (a.shift - b.shift) / b.scale
+    source_units = meanings(source or "count")
+    for quantity, target_unit in meanings(target).items():
+        source_unit = source_units.get(quantity)
+        if source_unit is not None:
+            factor = source_unit.scale / target_unit.scale
+            offset = (source_unit.shift - target_unit.shift) / target_unit.scale
+            return factor, offset
     return None
 
 
 def texts_like(source: str) -> list[str]:
-    """A spelling of each unit that a source's unit can be converted to, for messages to people."""
+    """Return a spelling of each unit to which a source's unit can be converted, for messages."""
     known = meanings(source or "count")
     return [text for quantity, text in _tables()[2] if quantity in known]
 
 
 def names() -> tuple[str, ...]:
-    """The spelling to show of every unit."""
+    """Return the spelling to show of every unit."""
     return tuple(dict.fromkeys(text for _, text in _tables()[2]))

@@ -1,10 +1,12 @@
-"""CAN frames of a layout -> values: what a logger with the DBC sees. The other way round of packer.py, from the same plans.
+"""Decodes the CAN frames of a layout into values, as a logger with the DBC does.
 
-Each message (and multiplexer page) is a list of signals: where the raw value stands, and what makes the value of it. A value is an int
-or a float in the signal's unit, a text where the signal is an enumeration, None where it is not available (or could not be sent: the
-Error code). A flag, which has no code for that, is not available where the other values of its message are not.
+It uses the same plans as packer.py. A value is an integer or a float in the signal's unit, or a
+text if the signal is an enumeration. It is None if the value is not available, or if the frame has
+the Error code because the value did not fit. A flag has no code. It is None if the other values of
+its message are not available.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -13,53 +15,62 @@ from typing import NamedTuple
 
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.signals.packer import float_of, has_code, place, take
+from kontronik_can_gw.signals.packer import extract, float_of, has_code, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 Value = int | float | str | None
 Chunk = tuple[int, list[Value]]
-"""Values of neighbouring columns, and the index of the first."""
+"""Index of the first of some neighbouring columns, and their values."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One signal of a layout. Alive counters, CRCs, multiplexers and constants are no columns."""
+    """One signal of a layout that has a source.
+
+    Alive counters, CRCs, multiplexers and constants are not columns.
+    """
 
     name: str
-    """Of the signal in the DBC."""
+    """Name of the signal in the DBC."""
     unit: str
     message: str
     key: int
-    """CAN id of the message, with ``EXTENDED`` for 29 bits."""
+    """CAN id of the message, with ``EXTENDED`` for an id of 29 bits."""
     source: str
-    """What the signal is bound to: a name of values.py."""
+    """Name of the value in values.py to which the signal is bound."""
     esc: int | None
-    """Index of the ESC; None for the gateway's own."""
+    """Index of the ESC. None for a value of the gateway."""
     texts: tuple[tuple[int, str], ...] = ()
-    """Raw value and text of an enumeration, in the order of the values; empty for a number."""
+    """Raw values and texts of an enumeration, ordered by raw value. Empty for a number."""
     digits: int | None = 0
-    """Decimals that the signal can differ in; None for a float."""
+    """Decimals that are needed to write every value. None for a float."""
     low: float = 0
+    """Smallest value that can be sent, in ``unit``."""
     high: float = 0
-    """Least and greatest value that can be sent, in ``unit``."""
+    """Greatest value that can be sent, in ``unit``."""
 
     @property
     def is_flag(self) -> bool:
-        """One bit that is set or not."""
+        """True if the value is one bit."""
         return not self.texts and (self.low, self.high, self.digits) == (0, 1, 0)
 
     @property
     def is_whole(self) -> bool:
-        """True where every value is a whole number."""
+        """True if every value is a whole number."""
         return not self.texts and self.digits == 0
 
 
 @dataclass(frozen=True)
 class Part:
-    """Neighbouring columns that come together: those of a message without page, or of one of its pages."""
+    """Neighbouring columns that are always in the same frames of a message.
+
+    They are the columns without a page, or the columns of one page.
+    """
 
     first: int
+    """Index of the first column."""
     count: int
+    """Number of columns."""
     plan: MessagePlan
     page: int | None
 
@@ -68,17 +79,20 @@ _Unpack = Callable[[int], list[Value]]
 
 
 class _Message(NamedTuple):
-    """How the frames of one message are read."""
+    """Functions that decode the frames of one message."""
 
     length: int
     page_of: Callable[[int], int] | None
-    """The multiplexer's value, from the bits of a frame."""
+    """Returns the multiplexer's value. None if the message has no multiplexer."""
     unpacks: dict[int | None, tuple[int, _Unpack]]
-    """For each page (None: every frame) the index of its first column, and what makes the values."""
+    """For each page, the index of its first column and the function that decodes its values.
+
+    The page None is in every frame.
+    """
 
 
 class SignalReader:
-    """Reads the frames of one layout. ``columns`` in the order of messages, pages and signals."""
+    """Decodes the frames of one layout. Its ``columns`` are ordered by message, page and signal."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -87,49 +101,64 @@ class SignalReader:
         self._messages: dict[int, _Message] = {}
         for plan in layout.messages:
             key = plan.can_id | (EXTENDED if plan.extended else 0)
-            multiplexer = next((s for s in plan.signals if s.role is Role.MULTIPLEXER), None)
+            all_signals = plan.signals
             unpacks: dict[int | None, tuple[int, _Unpack]] = {}
             for page in dict.fromkeys((None, *plan.pages)):
-                signals = [s for s in plan.signals if s.role is Role.SOURCE and s.page == page]
+                signals = [s for s in all_signals if s.role is Role.SOURCE and s.page == page]
                 if not signals:
                     continue
                 self.parts.append(Part(len(columns), len(signals), plan, page))
                 unpacks[page] = (len(columns), unpack_of(signals))
-                columns += [_column(s, plan, key) for s in signals]
-            page_of = None if multiplexer is None else partial(take, multiplexer.pieces)
+                columns += [_column(signal, plan, key) for signal in signals]
+            page_of = None
+            for signal in all_signals:
+                if signal.role is Role.MULTIPLEXER:
+                    page_of = partial(extract, signal.pieces)
+                    break
             self._messages[key] = _Message(plan.length, page_of, unpacks)
         self.columns = tuple(columns)
 
     @property
     def keys(self) -> frozenset[int]:
-        """CAN ids of the layout's messages, with ``EXTENDED`` for 29 bits."""
+        """CAN ids of the layout's messages, with ``EXTENDED`` for ids of 29 bits."""
         return frozenset(self._messages)
 
     def read(self, key: int, data: bytes) -> list[Chunk] | None:
-        """The values of a frame; None where its id is not ours, or it is shorter than its message."""
+        """Return the values of a frame.
+
+        None if the layout has no message with this id, or if the frame is shorter than its message.
+        """
         message = self._messages.get(key)
         if message is None or len(data) < message.length:
             return None
         length, page_of, unpacks = message
         bits = int.from_bytes(data[:length], "little")
         chunks = []
-        if (common := unpacks.get(None)) is not None:
-            chunks.append((common[0], common[1](bits)))
-        if page_of is not None and (paged := unpacks.get(page_of(bits))) is not None:
-            chunks.append((paged[0], paged[1](bits)))
+        common = unpacks.get(None)
+        if common is not None:
+            first, unpack = common
+            chunks.append((first, unpack(bits)))
+        if page_of is not None:
+            paged = unpacks.get(page_of(bits))
+            if paged is not None:
+                first, unpack = paged
+                chunks.append((first, unpack(bits)))
         return chunks
 
 
 _KEPT_VALUES = 2048
 """Values of a longer signal that are kept, because computing one takes several times as long as finding it."""
 _TABLE_BITS = 8
-"""Up to this length a signal's values are looked up in a table of all its raw values."""
+"""Signals of at most this length are decoded with a table of all raw values."""
 
 
 def unpack_of(signals: Sequence[SignalPlan]) -> _Unpack:
-    """A function from the bits of a frame (bit 0 is bit 0 of byte 0) to the signals' values."""
+    """Return a function that decodes the signals from a frame's bits.
+
+    Bit 0 is bit 0 of byte 0.
+    """
     rows = [_row(signal) for signal in signals]
-    lost = _lost_flags(signals)
+    lost = _conditions_of_lost_flags(signals)
 
     def unpack(bits: int) -> list[Value]:
         values = [value_of(bits >> at & mask) for at, mask, value_of in rows]
@@ -143,10 +172,14 @@ def unpack_of(signals: Sequence[SignalPlan]) -> _Unpack:
 
 
 def _row(signal: SignalPlan) -> tuple[int, int, Callable[[int], Value]]:
-    """Where a signal's raw value stands, the mask of its length, and the function from it to the value."""
+    """Return position, mask and function of a signal.
+
+    ``function(bits >> position & mask)`` is its value.
+    """
     value_of = _value_of(signal)
     if signal.length <= _TABLE_BITS:
-        value_of = tuple(value_of(raw) for raw in range(1 << signal.length)).__getitem__
+        table = tuple(value_of(raw) for raw in range(1 << signal.length))
+        value_of = table.__getitem__
     else:
         value_of = lru_cache(_KEPT_VALUES)(value_of)
     pieces = [(piece.at, (1 << piece.width) - 1, piece.shift) for piece in signal.pieces]
@@ -164,12 +197,12 @@ def _row(signal: SignalPlan) -> tuple[int, int, Callable[[int], Value]]:
 
 
 def _value_of(signal: SignalPlan) -> Callable[[int], Value]:
-    """A function from a signal's raw value, without its sign, to its value."""
+    """Return a function that maps a signal's unsigned raw value to its value."""
     if signal.source is not None and not signal.source.supplied:
         return lambda _raw: None
     if _is_flag(signal):
         return int
-    # a code amid the values counts as the code: the packer sends no value that looks like it
+    # If a code lies within the values, it means the code: the packer never sends such a value.
     codes = tuple(sorted({signal.not_available, signal.error}))
     if signal.is_float:
         return partial(
@@ -188,21 +221,27 @@ def _value_of(signal: SignalPlan) -> Callable[[int], Value]:
     factor, offset = int(signal.factor * common), int(signal.offset * common)
 
     def number(raw: int) -> Value:
-        """The float nearest to the exact decimal, which prints as it stands in the DBC; an int where all are whole."""
+        """Return an int if all values are whole, or else the float nearest to the exact value.
+
+        That float is printed with the decimals of the DBC's factor.
+        """
         if raw >= least_negative:
             raw -= modulus
         if raw in codes:
             return None
-        scaled = raw * factor + offset
-        return scaled if common == 1 else scaled / common
+        value = raw * factor + offset
+        return value if common == 1 else value / common
 
     return number
 
 
-def _lost_flags(signals: Sequence[SignalPlan]) -> list[tuple[list[int], int, int]]:
-    """Flags that are not available where a frame has these bits under this mask.
+def _conditions_of_lost_flags(
+    signals: Sequence[SignalPlan],
+) -> list[tuple[list[int], int, int]]:
+    """Return flags, mask and codes: the flags are not available if ``bits & mask == codes``.
 
-    A flag has no code for not available: it is that where all values of the same ESC's frame that have one say so, in its message.
+    A flag has no code. It is not available if all other signals in its message, from the
+    same kind of frame of the same ESC, have their code for "not available".
     """
     groups: dict[tuple[int | None, Group], tuple[list[int], list[SignalPlan]]] = {}
     for index, signal in enumerate(signals):
@@ -214,31 +253,31 @@ def _lost_flags(signals: Sequence[SignalPlan]) -> list[tuple[list[int], int, int
             flags.append(index)
         elif has_code(signal):
             others.append(signal)
-    return [
-        (
-            flags,
-            sum(place(signal.pieces, -1) for signal in others),
-            sum(place(signal.pieces, signal.not_available) for signal in others),
-        )
-        for flags, others in groups.values()
-        if flags and others
-    ]
+    conditions = []
+    for flags, others in groups.values():
+        if flags and others:
+            mask = sum(place(signal.pieces, -1) for signal in others)
+            codes = sum(place(signal.pieces, signal.not_available) for signal in others)
+            conditions.append((flags, mask, codes))
+    return conditions
 
 
 def _is_flag(signal: SignalPlan) -> bool:
-    """One bit as it stands; it has no codes."""
-    as_it_stands = signal.numbers is None and signal.factor == 1 and signal.offset == 0
-    return signal.length == 1 and not signal.signed and not signal.is_float and as_it_stands
+    """Return True for a single bit that is sent unchanged. Such a signal has no codes."""
+    is_scaled = signal.numbers is not None or signal.factor != 1 or signal.offset != 0
+    return signal.length == 1 and not signal.signed and not signal.is_float and not is_scaled
 
 
 def float_value(
     bits: int, length: int, codes: tuple[int, ...], factor: float, offset: float
 ) -> float | None:
-    """The physical value of a float signal's bits; None for its codes and for NaN."""
+    """Return the physical value of a float signal. None for its codes and for NaN."""
     if bits in codes:
         return None
     raw = float_of(bits, length)
-    return None if raw != raw else raw * factor + offset
+    if math.isnan(raw):
+        return None
+    return raw * factor + offset
 
 
 def _column(signal: SignalPlan, plan: MessagePlan, key: int) -> Column:
@@ -249,22 +288,26 @@ def _column(signal: SignalPlan, plan: MessagePlan, key: int) -> Column:
         ends = [raw * float(signal.factor) + float(signal.offset) for raw in signal.limits]
     else:
         ends = [float(raw * signal.factor + signal.offset) for raw in (signal.low, signal.high)]
-        digits = max(_digits(signal.factor), _digits(signal.offset))
-        texts = tuple(sorted(signal.texts.items())) if signal.numbers is not None else ()
+        digits = max(_count_decimals(signal.factor), _count_decimals(signal.offset))
+        if signal.numbers is not None:
+            texts = tuple(sorted(signal.texts.items()))
     return Column(
-        signal.name,
-        signal.unit,
-        plan.name,
-        key,
-        signal.source.name,
-        signal.esc,
-        texts,
-        digits,
+        name=signal.name,
+        unit=signal.unit,
+        message=plan.name,
+        key=key,
+        source=signal.source.name,
+        esc=signal.esc,
+        texts=texts,
+        digits=digits,
         low=min(ends),
         high=max(ends),
     )
 
 
-def _digits(number: Fraction) -> int:
-    """Decimals of a number; 9 at most."""
-    return next((digits for digits in range(9) if (number * 10**digits).denominator == 1), 9)
+def _count_decimals(number: Fraction) -> int:
+    """Return the decimals that write the number exactly, 9 at most."""
+    for digits in range(9):
+        if (number * 10**digits).denominator == 1:
+            return digits
+    return 9

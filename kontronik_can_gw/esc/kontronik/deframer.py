@@ -152,9 +152,12 @@ _get_all = attrgetter(*_NAMES)
 
 
 def has_longer_crc(frame: bytes) -> bool:
-    """Whether the CRC of a legacy live frame covers everything before it, as one other receiver takes it."""
-    crc_at = _LEGACY_LIVE.crc_at
-    return bool(crc32(frame[:crc_at]) == _LEGACY_LIVE.crc_of(frame)[0])
+    """Return True if the CRC of a legacy live frame covers all bytes before it.
+
+    One receiver in the field accepts such frames. No recording of one is public.
+    """
+    (found,) = _LEGACY_LIVE.unpack_crc(frame)
+    return bool(crc32(frame[: _LEGACY_LIVE.length - 4]) == found)
 
 
 class Deframer:
