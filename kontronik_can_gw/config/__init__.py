@@ -1,1 +1,1 @@
-"""The TOML configuration: its keys, and the objects assembled from it."""
+"""The TOML configuration: its keys, and the objects that are made from it."""

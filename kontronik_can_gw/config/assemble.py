@@ -1,4 +1,7 @@
-"""Loads a configuration and the files that it names: ESCs, DBC, CANopen nodes, stored parameters. Reports all mistakes at once."""
+"""Loads a configuration and the files that it names: DBC, EDS, stored parameters.
+
+All mistakes are reported at once.
+"""
 
 import os
 import re
@@ -35,7 +38,7 @@ _NODES = "the CANopen nodes"
 
 @contextmanager
 def collecting(problems: list[str]) -> Iterator[None]:
-    """Collect the lines of a UserError in ``problems``; a RunError is raised as usual."""
+    """Append the lines of a UserError to ``problems``. Other exceptions, also RunError, pass."""
     try:
         yield
     except RunError:
@@ -45,12 +48,18 @@ def collecting(problems: list[str]) -> Iterator[None]:
 
 
 def without_clashing_escs(config: Config) -> Config:
-    """The configuration without ESCs whose name, port or node-ID is taken or invalid, so that the rest can be checked."""
+    """Return the configuration without faulty ESCs, so that the rest can be checked.
+
+    An ESC is faulty if it has the name, port or node-ID of an earlier one, or an invalid node-ID.
+    """
     kept: list[EscConfig] = []
     seen: set[object] = set()
     for esc, node_id in zip(config.esc, config.node_ids, strict=True):
-        own = {normalize(esc.name), ("port", esc.port), *({node_id} - {UNCONFIGURED})}
-        if not own & seen and (node_id <= 127 or node_id == UNCONFIGURED):
+        own: set[object] = {normalize(esc.name), ("port", esc.port)}
+        if node_id != UNCONFIGURED:
+            own.add(node_id)
+        is_valid = node_id <= 127 or node_id == UNCONFIGURED
+        if is_valid and not own & seen:
             kept.append(replace(esc, node_id=node_id))
             seen |= own
     return replace(config, esc=tuple(kept))
@@ -58,31 +67,33 @@ def without_clashing_escs(config: Config) -> Config:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A checked configuration and the objects made from it. ``database`` None: no DBC output; ``canopen`` None: no nodes."""
+    """A checked configuration and the objects made from it."""
 
     config: Config
     escs: list[EscSettings]
-    """The settings in effect: configuration, then parameters that a master stored."""
+    """The settings in effect: of the configuration, or stored by a master."""
     database: "Database | None"
-    """The DBC as it was read."""
+    """The DBC, parsed. None without the DBC output."""
     layout: Layout
     canopen: "CanopenSetup | None"
+    """None without CANopen nodes."""
     damaged: tuple[tuple[int, str], ...]
-    """ESCs whose stored parameters cannot be read, and why."""
+    """Index of each ESC whose stored parameters cannot be read, and the reason."""
     store: "ParameterStore | None"
     warnings: tuple[str, ...] = ()
     dbc: bytes = b""
-    """The DBC file as it was read."""
+    """Content of the DBC file."""
     outputs: tuple[OutputSetup, ...] = ()
-    """Of the outputs besides DBC and CANopen."""
+    """Setups of the outputs other than DBC and CANopen."""
 
 
 def load_configuration(
     path: Path, store: "Callable[[Path], ParameterStore] | None" = None
 ) -> Loaded:
-    """Load a configuration and the files that it names. UserError with every mistake.
+    """Load a configuration and the files that it names. Raises UserError with every mistake.
 
-    ``store`` makes the parameter store of a running gateway; None: stored parameters are only read.
+    ``store`` makes the parameter store of a running gateway. If it is None, stored parameters are
+    read and nothing is written.
     """
     config, problems = examine(path)
     if config is None:
@@ -101,12 +112,16 @@ def load_configuration(
 
 
 def check_devices(config: Config) -> None:
-    """UserError where two names lead to one device: two ESCs on one port, or the CAN adapter on the port of an ESC."""
+    """Raise UserError if one device has two names.
+
+    Two ESCs may have the same port, or the CAN adapter may have the port of an ESC.
+    """
     problems = []
     ports: dict[str, str] = {}
     for esc in config.esc:
         real = os.path.realpath(esc.port)
-        if (other := ports.setdefault(real, esc.name)) != esc.name:
+        other = ports.setdefault(real, esc.name)
+        if other != esc.name:
             problems.append(
                 f"{config.file}: the ports of {other} and {esc.name} are one device, {real}"
             )
@@ -122,7 +137,11 @@ def check_devices(config: Config) -> None:
 def _outputs(
     config: Config, problems: list[str], taken: dict[int, str], bits: dict[str, float]
 ) -> tuple[OutputSetup, ...]:
-    """The setups of the outputs in the tuple that are enabled. Adds mistakes in their tables, the ids they take, the bits/s they need."""
+    """Return the setups of the enabled outputs of ``OUTPUTS``.
+
+    Adds mistakes in their tables to ``problems``, their CAN ids to ``taken``, and the bits per
+    second that they need to ``bits``.
+    """
     found = []
     for name in OUTPUTS:
         table = getattr(config, name)
@@ -156,14 +175,17 @@ def _output_warnings(config: Config, outputs: Sequence[OutputSetup]) -> list[str
 
 
 def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
-    """The objects made from a configuration. Without a store its files are only read.
+    """Make the objects of a configuration.
 
-    A faulty configuration, DBC or EDS is refused. Stored parameters that do not fit them are ignored with a warning.
+    Raises UserError with every mistake in configuration, DBC and EDS. Stored parameters that do not
+    fit them are ignored with a warning. Without a store, their files are read and not changed.
     """
     problems: list[str] = []
     with collecting(problems):
         check_devices(config)
-    escs, plain, canopen = config.escs, None, None
+    escs = config.escs
+    plain = None
+    canopen = None
     stored: list[Stored] = []
     damaged: list[tuple[int, str]] = []
     ignored: list[str] = []
@@ -171,8 +193,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     taken: dict[int, str] = {}
     bits: dict[str, float] = {}
     worst: dict[str, float] = {}
-    if config.canopen.enabled:  # what only nodes need is not loaded without them
-        from kontronik_can_gw.config import nodes
+    if config.canopen.enabled:
+        from kontronik_can_gw.config import nodes  # only here: a start without nodes stays short
 
         with collecting(problems):
             plain = nodes.plain_setup(config)
@@ -182,26 +204,43 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             stored, damaged, warnings = nodes.read_stored(config, store)
             escs = replace(plain, stored=tuple(stored)).esc_settings(config.escs)
     outputs = _outputs(config, problems, taken, bits)
-    database, layout, dbc, file = None, Layout("", "", ()), b"", str(config.dbc_path)
+    database = None
+    layout = Layout("", "", ())
+    dbc = b""
     if config.dbc.enabled:
+        file = str(config.dbc_path)
         with collecting(problems):
             dbc = read_dbc(config.dbc_path)
             database = parse_database(dbc, file, ignored)
             layout = prepare(database, file, escs, config.dbc, config.can.fd, taken)
     if problems:
         raise UserError(*problems)
-    load = _load_warning(config, layout, bits, worst)
+    load_warning = _load_warning(config, layout, bits, worst)
     if plain is not None:
         foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
-        canopen, given_way = nodes.with_stored(plain, stored, config, escs, foreign)
-        warnings = [*given_way, *warnings]
+        canopen, ignored_ids = nodes.with_stored(plain, stored, config, escs, foreign)
+        warnings = [*ignored_ids, *warnings]
         if canopen.stored != plain.stored:
             _, bits[_NODES], worst[_NODES] = nodes.needs(canopen, escs)
-            with collecting(warnings):  # more than the bus has is no reason not to start
-                load = _load_warning(config, layout, bits, worst)
+            # Stored parameters that overload the bus do not prevent a start.
+            with collecting(warnings):
+                load_warning = _load_warning(config, layout, bits, worst)
     warnings += _output_warnings(config, outputs)
-    mute = [*unreported(layout, config.dbc.silent_on_loss), *unsupplied(layout, escs)]
-    said = (*config.warnings, *ignored, *mute, *filter(None, [load]), *warnings)
+    all_warnings = [*config.warnings, *ignored]
+    all_warnings += unreported(layout, config.dbc.silent_on_loss)
+    all_warnings += unsupplied(layout, escs)
+    if load_warning:
+        all_warnings.append(load_warning)
+    all_warnings += warnings
     return Loaded(
-        *(config, escs, database, layout, canopen, tuple(damaged), store, said, dbc, outputs)
+        config=config,
+        escs=escs,
+        database=database,
+        layout=layout,
+        canopen=canopen,
+        damaged=tuple(damaged),
+        store=store,
+        warnings=tuple(all_warnings),
+        dbc=dbc,
+        outputs=outputs,
     )

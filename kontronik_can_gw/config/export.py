@@ -10,7 +10,7 @@ from kontronik_can_gw.config.keys import REMOVED_KEYS, TABLES, Config, required
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of the configuration, for editors."""
+    """Return the JSON Schema (draft 2020-12) of the configuration, for editors."""
     properties = {name: _schema_of_table(name, kind) for name, kind in TABLES.items()}
     properties["esc"] = {"type": "array", "minItems": 1, "items": properties["esc"]}
     return {
@@ -33,22 +33,26 @@ def _schema_of_table(name: str, kind: Any) -> dict[str, Any]:
         "type": "object",
         "description": kind.__doc__,
         "additionalProperties": False,
-        "properties": {f.name: _schema_of_key(f) for f in fields(kind)} | removed,
+        "properties": {row.name: _schema_of_key(row) for row in fields(kind)} | removed,
     }
-    if needed := [f.name for f in required(kind)]:
-        table["required"] = needed
+    required_names = [row.name for row in required(kind)]
+    if required_names:
+        table["required"] = required_names
     return table
 
 
-def _schema_of_key(f: Field[Any]) -> dict[str, Any]:
-    entry = {"description": f.metadata["doc"], **f.metadata["kind"].schema}
-    if f.default not in (MISSING, None, "", ()):
-        entry["default"] = float(f.default) if isinstance(f.default, Fraction) else f.default
+def _schema_of_key(row: Field[Any]) -> dict[str, Any]:
+    entry = {"description": row.metadata["doc"], **row.metadata["kind"].schema}
+    default = row.default
+    if isinstance(default, Fraction):
+        default = float(default)
+    if default not in (MISSING, None, "", ()):
+        entry["default"] = default
     return entry
 
 
 def as_toml(config: Config) -> str:
-    """The effective configuration as TOML, including defaults."""
+    """Return the effective configuration as TOML, including defaults."""
     lines: list[str] = []
     for name in TABLES:
         table = getattr(config, name)
@@ -62,20 +66,23 @@ def as_toml(config: Config) -> str:
 
 def _toml_table(head: str, table: Any) -> list[str]:
     lines = [head]
-    for f in fields(table):
-        value = getattr(table, f.name)
+    for row in fields(table):
+        value = getattr(table, row.name)
         if isinstance(value, Mapping):
-            lines += [f"{f.name}.{_toml(key)} = {_toml(entry)}" for key, entry in value.items()]
+            lines += [f"{row.name}.{_toml(key)} = {_toml(entry)}" for key, entry in value.items()]
         elif value is not None:
-            lines.append(f"{f.name} = {_toml(value)}")
-    return [*lines, ""]
+            lines.append(f"{row.name} = {_toml(value)}")
+    lines.append("")
+    return lines
 
 
 def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, Fraction):
-        return repr(float(value)) if Fraction(repr(float(value))) == value else f'"{value}"'
+        decimal = repr(float(value))
+        is_exact = Fraction(decimal) == value
+        return decimal if is_exact else f'"{value}"'
     if isinstance(value, tuple):
         return f"[{', '.join(map(_toml, value))}]"
     if isinstance(value, str):

@@ -1,6 +1,7 @@
-"""The keys of the TOML configuration: a row for each, with what it may hold, its default and its meaning.
+"""The keys of the TOML configuration: a row for each key with its kind, default and meaning.
 
-Check (``parse``), JSON Schema and TOML text (``export``) and the docs come from these rows.
+parse.py checks a configuration by these rows. export.py and the docs are made from them. The
+docstring of a table's class is its description in the docs and in the JSON Schema.
 """
 
 from collections.abc import Mapping
@@ -36,14 +37,15 @@ from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
 
 REQUIRED = MISSING
-"""Default of a key that has to be given."""
+"""Default of a key that must be given."""
 REMOVED_KEYS: dict[str, str] = {
     "statistics.prometheus": "`kontronik-can-gw metrics` serves /metrics; `sudo systemctl enable --now kontronik-can-gw-metrics`.",
     "record.can_log": "`kontronik-can-gw convert CAPTURE flight.log` makes the log from a capture.",
 }
-"""Table and key of earlier versions, as "record.can_log", and what to do instead, as a sentence.
+"""For removed keys, as "record.can_log", a sentence about the replacement.
 
-For a year each is ignored with a warning: a gateway must not fall silent after an upgrade.
+A removed key is ignored with a warning for a year, because a gateway must not fall silent after an
+upgrade.
 """
 
 _OF_CAN = frozenset({"interface", "channel", "bitrate", "fd", "data_bitrate"})
@@ -129,12 +131,13 @@ class MqttConfig:
 
     @property
     def address(self) -> tuple[str, int] | None:
-        """Host and port of the broker."""
+        """Host and port of the broker. None if no broker is configured."""
         if self.broker is None:
             return None
         host, colon, port = self.broker.rpartition(":")
         if not colon or self.broker.endswith("]"):
-            host, port = self.broker, "8883" if self.tls else "1883"
+            host = self.broker
+            port = "8883" if self.tls else "1883"
         return host.strip("[]"), int(port)
 
 
@@ -162,18 +165,19 @@ class EscConfig:
 
     @property
     def settings(self) -> EscSettings:
+        """The settings for the core."""
         return EscSettings(
-            self.name,
-            self.pole_pairs,
-            self.gear,
-            self.cell_count,
+            name=self.name,
+            pole_pairs=self.pole_pairs,
+            gear=self.gear,
+            cell_count=self.cell_count,
             timeout_ns=self.telemetry_timeout_ms * MS,
             protocol=self.protocol,
         )
 
     @property
     def device_number(self) -> int | None:
-        """Number of the device that belongs here; None for any."""
+        """Number of the configured device. None if none is configured or the protocol has none."""
         devices = protocol_named(self.protocol).devices
         return next((number for number, text in devices.items() if text == self.device), None)
 # fmt: on
@@ -181,7 +185,7 @@ class EscConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """The whole configuration; ``file`` is where it came from."""
+    """The whole configuration."""
 
     can: CanConfig
     dbc: DbcConfig
@@ -193,8 +197,9 @@ class Config:
     mqtt: MqttConfig
     esc: tuple[EscConfig, ...]
     file: str
+    """Path of the configuration file. Paths in it are relative to its folder."""
     warnings: tuple[str, ...] = ()
-    """One line for each key that was removed."""
+    """One line for each removed key that the file contains."""
 
     @cached_property
     def escs(self) -> list[EscSettings]:
@@ -202,48 +207,59 @@ class Config:
 
     @property
     def dbc_path(self) -> Path:
-        """The DBC file, the shipped one or relative to the configuration."""
-        return self._layout(self.dbc.file, "dbc/kontronik_esc.dbc")
+        """Path of the DBC file."""
+        return self._path(self.dbc.file, "dbc/kontronik_esc.dbc")
 
     @property
     def eds_path(self) -> Path:
-        """The EDS file, the shipped one or relative to the configuration."""
-        return self._layout(self.canopen.eds, "eds/kontronik_esc.eds")
+        """Path of the EDS file."""
+        return self._path(self.canopen.eds, "eds/kontronik_esc.eds")
 
-    def _layout(self, name: str, own: str) -> Path:
-        return shipped(own) if name == SHIPPED else Path(self.file).parent / name
+    def _path(self, name: str, shipped_name: str) -> Path:
+        if name == SHIPPED:
+            return shipped(shipped_name)
+        return Path(self.file).parent / name
 
     @property
     def statistics_path(self) -> Path | None:
-        """The statistics file, relative to the configuration; None where it does not say."""
-        name = self.statistics.file
-        return None if name is None else Path(self.file).parent / name
+        """Path of the statistics file. None if it is not configured."""
+        if self.statistics.file is None:
+            return None
+        return Path(self.file).parent / self.statistics.file
 
     @property
     def node_ids(self) -> list[int]:
-        """CANopen node-IDs of the ESCs, in their order."""
+        """CANopen node-IDs of the ESCs, in their order. They may be greater than 127, or clash."""
         base = self.canopen.node_id
-        return [
-            (base if base == UNCONFIGURED else base + number)
-            if esc.node_id is None
-            else esc.node_id
-            for number, esc in enumerate(self.esc)
-        ]
+        ids = []
+        for index, esc in enumerate(self.esc):
+            if esc.node_id is not None:
+                ids.append(esc.node_id)
+            elif base == UNCONFIGURED:
+                ids.append(UNCONFIGURED)
+            else:
+                ids.append(base + index)
+        return ids
 
 
 TABLES: Mapping[str, Any] = {
     table.name: table.type for table in fields(Config) if is_dataclass(table.type)
 } | {"esc": EscConfig}
-"""Classes of the tables by their names, ``[[esc]]`` last."""
+"""Classes of the tables by name. ``[[esc]]`` is the last."""
 
 
 def required(table: Any) -> list[Field[Any]]:
-    """Keys of a table that have no default."""
-    return [f for f in fields(table) if f.default is REQUIRED and f.default_factory is MISSING]
+    """Return the rows of a table's keys that have no default."""
+    return [
+        row for row in fields(table) if row.default is REQUIRED and row.default_factory is MISSING
+    ]
 
 
 def shipped(name: str) -> Path:
-    """Path of a file shipped with the package: inside it when installed, next to it in a checkout."""
+    """Return the path of a file that is shipped with the package.
+
+    It is inside the package if that is installed, or next to it in a checkout.
+    """
     package = Path(__file__).parent.parent
     installed = package / "shipped" / name
     return installed if installed.exists() else package.parent / name

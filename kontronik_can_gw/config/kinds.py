@@ -1,4 +1,4 @@
-"""Kinds of configuration keys: what each accepts, as JSON Schema and as a check of it, and in a few words for the docs."""
+"""Kinds of configuration keys: a check, a JSON Schema and a range in words for each."""
 
 import math
 import re
@@ -19,44 +19,52 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
 
 
 class Kind(NamedTuple):
-    """What a key may hold."""
+    """The values that a key accepts."""
 
     span: str
     """The range in a few words."""
     schema: dict[str, Any]
+    """The accepted values as JSON Schema."""
     check: Callable[[Any], Any]
-    """The value as it is used; ValueError says what is wrong with it."""
+    """Maps a value from TOML to the value in use, or raises ValueError with the mistake."""
 
 
 def key(kind: Kind, default: Any, doc: str) -> Any:
-    """A row of a table: what it may hold, its default, its meaning."""
+    """Return the row of a table for one key: its kind, default and meaning."""
     metadata = {"kind": kind, "doc": doc}
     if isinstance(default, dict):
         return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
-def _typed(value: Any, name: str) -> Any:
-    kind, words = _TYPES[name]
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+def _check_type(value: Any, name: str) -> Any:
+    """Return the value if it has this JSON type. In Python a bool is an int, in JSON it is not."""
+    expected, words = _TYPES[name]
+    is_stray_bool = isinstance(value, bool) and expected is not bool
+    if is_stray_bool or not isinstance(value, expected):
         raise ValueError(f"{value!r} is not {words}")
     return value
 
 
 def _plain(span: str, problem: str = "", **schema: Any) -> Kind:
-    """A value of one JSON type within its limits or of its form; ``problem`` follows another value in the error."""
-    low, high = schema.get("minimum", -math.inf), schema.get("maximum", math.inf)
+    """Return the kind that a JSON Schema of one type describes.
+
+    In the error, ``problem`` follows the refused value.
+    """
+    low = schema.get("minimum", -math.inf)
+    high = schema.get("maximum", math.inf)
     gap = schema.get("not", {"exclusiveMinimum": math.inf, "exclusiveMaximum": 0})
-    form, longest = schema.get("pattern", ""), schema.get("maxLength", math.inf)
+    form = schema.get("pattern", "")
+    longest = schema.get("maxLength", math.inf)
 
     def check(value: Any) -> Any:
-        _typed(value, schema["type"])
+        _check_type(value, schema["type"])
         if schema["type"] == "string":
-            is_right = len(value) <= longest and re.fullmatch(form, value)
+            is_valid = len(value) <= longest and re.fullmatch(form, value)
         else:
-            in_gap = gap["exclusiveMinimum"] < value < gap["exclusiveMaximum"]
-            is_right = low <= value <= high and not in_gap
-        if not is_right:
+            is_in_gap = gap["exclusiveMinimum"] < value < gap["exclusiveMaximum"]
+            is_valid = low <= value <= high and not is_in_gap
+        if not is_valid:
             raise ValueError(f"{value!r} {problem}")
         return value
 
@@ -64,36 +72,46 @@ def _plain(span: str, problem: str = "", **schema: Any) -> Kind:
 
 
 def integer(low: int, high: int, also: int | None = None) -> Kind:
-    """A whole number from ``low`` to ``high``, or ``also``, which is above."""
-    schema: dict[str, Any] = {"type": "integer", "minimum": low, "maximum": also or high}
-    span, problem = f"{low} … {high}", f"is outside {low}..{high}"
+    """Accept a whole number from ``low`` to ``high``, or the greater number ``also``."""
+    schema: dict[str, Any] = {"type": "integer", "minimum": low, "maximum": high}
+    span = f"{low} … {high}"
+    problem = f"is outside {low}..{high}"
     if also is not None:
+        schema["maximum"] = also
         schema["not"] = {"exclusiveMinimum": high, "exclusiveMaximum": also}
-        span, problem = f"{span}, {also}", f"{problem} and not {also}"
+        span = f"{span}, {also}"
+        problem = f"{problem} and not {also}"
     return _plain(span, problem, **schema)
 
 
 def number(low: float, high: float) -> Kind:
-    """A number from ``low`` to ``high``."""
+    """Accept a number from ``low`` to ``high``."""
     problem = f"is outside {low}..{high}"
     return _plain(f"{low} … {high}", problem, type="number", minimum=low, maximum=high)
 
 
 def pattern(span: str, form: str, problem: str, **limits: int) -> Kind:
-    """A text of the form of a regular expression; ``problem`` follows another text in the error."""
+    """Accept a text that matches the regular expression ``form``.
+
+    In the error, ``problem`` follows the refused text.
+    """
     return _plain(span, problem, type="string", pattern=f"^{form}$", **limits)
 
 
 def choice(*choices: str) -> Kind:
-    """One of a few texts."""
+    """Accept one of these texts."""
     return choice_of(lambda: choices)
 
 
 def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> Kind:
-    """One of a few texts that are asked for at each check: a list that may grow, as that of the devices."""
+    """Accept one of the texts that ``known`` returns at each check.
+
+    The list may grow after import, as the list of devices does with another ESC protocol.
+    """
 
     def check(value: Any) -> str:
-        if (text := _typed(value, "string")) not in known():
+        text = _check_type(value, "string")
+        if text not in known():
             near = did_you_mean(text, known(), 0.5, or_known=True)
             raise ValueError(f"{text!r} is not known here.{near}")
         return str(text)
@@ -103,16 +121,16 @@ def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> Kind:
 
 
 def meanings(known: Sequence[str]) -> Kind:
-    """A table: for each text of the user's one of many that are known."""
+    """Accept a table that maps each of the user's texts to one of the known texts."""
     return table_of(choice_of(lambda: known, "meanings"))
 
 
 def table_of(kind: Kind) -> Kind:
-    """A table with names of the user's, all entries of one kind."""
+    """Accept a table with any names, whose entries are all of one kind."""
 
     def check(value: Any) -> dict[str, Any]:
         checked = {}
-        for name, entry in _typed(value, "object").items():
+        for name, entry in _check_type(value, "object").items():
             try:
                 checked[name] = kind.check(entry)
             except ValueError as error:
@@ -123,7 +141,10 @@ def table_of(kind: Kind) -> Kind:
 
 
 def options(path: str, own: frozenset[str]) -> Kind:
-    """A table of texts, numbers and booleans. ``own``: names that are keys of the table ``path``."""
+    """Accept a table of texts, numbers and booleans.
+
+    Refuses the names in ``own``, which are keys of the table ``path``.
+    """
 
     def entry(value: Any) -> Any:
         if not isinstance(value, (str, int, float)):
@@ -134,16 +155,19 @@ def options(path: str, own: frozenset[str]) -> Kind:
 
     def check(value: Any) -> Any:
         checked = kind.check(value)
-        for name in sorted(own & set(checked)):
+        misplaced = sorted(own & set(checked))
+        if misplaced:
+            name = misplaced[0]
             raise ValueError(f"{name} has its own key: {path}.{name}")
         return checked
 
     return Kind(kind.span, kind.schema | {"propertyNames": {"not": {"enum": sorted(own)}}}, check)
 
 
-def _ratio(value: Any) -> Fraction:
+def _check_ratio(value: Any) -> Fraction:
     try:
-        if isinstance(value, bool) or (isinstance(value, str) and not re.fullmatch(_RATIO, value)):
+        is_wrong_text = isinstance(value, str) and not re.fullmatch(_RATIO, value)
+        if isinstance(value, bool) or is_wrong_text:
             raise ValueError
         numerator, _, denominator = str(value).partition("/")
         ratio = Fraction(numerator) / Fraction(denominator or 1)
@@ -154,13 +178,13 @@ def _ratio(value: Any) -> Fraction:
     return ratio
 
 
-def _names(value: Any) -> tuple[str, ...]:
+def _check_names(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list):
         raise ValueError(f'{value!r} is not a list of names, as ["Motor_*"]')
     return tuple(TEXT.check(name) for name in value)
 
 
-def _source(value: Any) -> Any:
+def _check_source(value: Any) -> Any:
     if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
         return value
     if isinstance(value, str):
@@ -168,11 +192,17 @@ def _source(value: Any) -> Any:
     raise ValueError(f"{value!r} is neither the name of a source nor a number")
 
 
-def _bindings(value: Any) -> Any:
+def _check_bindings(value: Any) -> Any:
+    """Return sources by "Signal" or "Message.Signal".
+
+    In TOML, ``Message.Signal = x`` without quotes is a nested table.
+    """
     flat: dict[str, Any] = {}
-    for name, entry in _typed(value, "object").items():
-        nested = entry if isinstance(entry, dict) else None
-        flat |= {name: entry} if nested is None else {f"{name}.{n}": e for n, e in nested.items()}
+    for name, entry in _check_type(value, "object").items():
+        if isinstance(entry, dict):
+            flat |= {f"{name}.{signal}": source for signal, source in entry.items()}
+        else:
+            flat[name] = entry
     return _SOURCES.check(flat)
 
 
@@ -181,14 +211,13 @@ TEXT = pattern("string", r"[^\x00]*[^\x00\s][^\x00]*", "is not a text")
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _RATIO_NUMBER = {"type": "number", "minimum": 0.001, "maximum": 1000}
 _RATIO_TEXT = {"type": "string", "pattern": f"^{_RATIO}$"}
-RATIO = Kind("ratio", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _ratio)
-NAMES = Kind("names", {"type": "array", "items": TEXT.schema}, _names)
-_SOURCES = table_of(Kind("bindings", {"anyOf": [TEXT.schema, {"type": "number"}]}, _source))
+RATIO = Kind("ratio", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _check_ratio)
+NAMES = Kind("names", {"type": "array", "items": TEXT.schema}, _check_names)
+_SOURCES = table_of(Kind("bindings", {"anyOf": [TEXT.schema, {"type": "number"}]}, _check_source))
 _SIGNAL_OR_MESSAGE = {"anyOf": [_SOURCES.schema["additionalProperties"], _SOURCES.schema]}
 BINDINGS = Kind(
-    "bindings", {"type": "object", "additionalProperties": _SIGNAL_OR_MESSAGE}, _bindings
+    "bindings", {"type": "object", "additionalProperties": _SIGNAL_OR_MESSAGE}, _check_bindings
 )
-"""Sources by signal; ``Message.Signal = x`` without quotes is a nested table in TOML."""
 
 _PORT = "(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5][0-9]{4}|[1-9][0-9]{0,3})"
 BROKER = pattern(

@@ -1,7 +1,7 @@
 """Builds the CANopen nodes of a configuration: EDS, node-IDs, serial numbers and stored parameters.
 
-A faulty configuration or EDS is refused. Parameters stored over the bus never prevent a start: where they clash with the configuration,
-another node or a DBC message, they are ignored with a warning.
+A faulty configuration or EDS is refused. Parameters that a master stored never prevent a start. If
+they clash with the configuration, another node or a DBC message, they are ignored with a warning.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,11 +27,11 @@ from kontronik_can_gw.signals.plan import classic_bits
 
 
 def load_eds(config: Config) -> Eds:
-    """The EDS in use, checked."""
+    """Load and check the EDS. Raises UserError with every mistake in it."""
     path = config.eds_path
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)  # one byte more shows that it is too large
+            data = file.read(MAX_BYTES + 1)  # one byte more, to recognise a file that is too large
     except OSError as error:
         raise UserError(
             f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file."
@@ -47,47 +47,60 @@ def load_eds(config: Config) -> Eds:
 
 
 def parameter_folder(config: Config) -> Path:
-    """The folder of the stored parameters."""
+    """Return the folder of the stored parameters."""
     if config.canopen.store is None:
         return state_folder()
     return Path(config.file).parent / config.canopen.store
 
 
 def plain_setup(config: Config) -> CanopenSetup:
-    """The nodes from configuration and EDS, without stored parameters."""
-    canopen, identity = config.canopen, machine_identity()
-    # SDO block uploads use at most half of the bus
+    """Return the setup of the nodes from configuration and EDS, without stored parameters."""
+    canopen = config.canopen
+    identity = machine_identity()
+    # At this pace SDO block uploads use at most half of the bus.
     segment_ns = 2 * classic_bits(8) * SECOND // config.can.bitrate
     settings = []
     for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
         serial = serial_number(number + 1, esc.name, identity)
         if canopen.serial is not None:
             serial = canopen.serial + number & 0xFFFFFFFF
-        own = NodeSettings(
-            *(node_id, serial, canopen.vendor_id, canopen.self_start, canopen.read_only),
+        node = NodeSettings(
+            node_id=node_id,
+            serial=serial,
+            vendor_id=canopen.vendor_id,
+            self_start=canopen.self_start,
+            read_only=canopen.read_only,
             bitrate=config.can.bitrate,
             segment_ns=segment_ns,
             version=__version__,
             device=esc.device_number,
         )
-        settings.append(own)
-    nothing = (Stored(),) * len(settings)
-    return CanopenSetup(load_eds(config), tuple(settings), nothing, tuple(config.escs))
+        settings.append(node)
+    nothing_stored = (Stored(),) * len(settings)
+    return CanopenSetup(load_eds(config), tuple(settings), nothing_stored, tuple(config.escs))
 
 
 def needs(setup: CanopenSetup, escs: Sequence[EscSettings]) -> tuple[dict[int, str], float, float]:
-    """COB-IDs of the nodes and their users, and the bits per second they need: usual and worst."""
-    made = setup.nodes(escs)
-    ids = {cob_id: what for node in made.nodes for cob_id, what, *_ in uses(node)}
-    return ids, made.traffic()[1], made.traffic(is_worst=True)[1]
+    """Return the COB-IDs of the nodes with the use of each, and their usual and worst load in bit/s."""
+    nodes = setup.nodes(escs)
+    ids = {use.cob_id: use.what for node in nodes.nodes for use in uses(node)}
+    return ids, nodes.traffic()[1], nodes.traffic(is_worst=True)[1]
 
 
 Kept = tuple[list[Stored], list[tuple[int, str]], list[str]]
-"""What is stored for each ESC's node; ESCs whose parameters cannot be read, and why; warnings."""
+"""Three lists about stored parameters:
+
+1. the parameters of each ESC's node,
+2. index of each ESC whose parameters cannot be read, and the reason,
+3. warnings.
+"""
 
 
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
-    """Parameters that masters stored. Without a store its files are only read."""
+    """Read the parameters that masters stored.
+
+    With a store, its files are locked. Without one, they are only read.
+    """
     stored: list[Stored] = []
     damaged: list[tuple[int, str]] = []
     warnings: list[str] = []
@@ -101,8 +114,9 @@ def read_stored(config: Config, store: ParameterStore | None) -> Kept:
             if reason is not None:
                 warnings.append(f"{esc.name}: stored parameters: {reason}")
         else:
-            if trouble := store.lock(esc.name):
-                warnings.append(f"{esc.name}: parameters could not be stored: {trouble}")
+            lock_problem = store.lock(esc.name)
+            if lock_problem:
+                warnings.append(f"{esc.name}: parameters could not be stored: {lock_problem}")
             found, reason = store.load(esc.name)
         stored.append(found)
         if reason is not None:
@@ -111,7 +125,7 @@ def read_stored(config: Config, store: ParameterStore | None) -> Kept:
 
 
 def _read_stored_file(path: Path) -> tuple[Stored, str | None]:
-    """What is stored for a node, and why it cannot be read; nothing is changed."""
+    """Return the parameters in a file, and the reason if it cannot be read."""
     try:
         return decode(path.read_bytes()), None
     except FileNotFoundError:
@@ -129,20 +143,25 @@ def with_stored(
     escs: Sequence[EscSettings],
     foreign: Mapping[int, str],
 ) -> tuple[CanopenSetup, list[str]]:
-    """The nodes with stored parameters, without the ids of those that clash; and a warning for each of these."""
+    """Return the setup with stored parameters, and warnings about ignored ones.
+
+    The stored node-ID and COB-IDs of a node are ignored if one of them clashes with another node or
+    with ``foreign``, the DBC messages by 11-bit id.
+    """
     if all(each == Stored() for each in stored):
         return plain, []
-    said: list[str] = []
+    warnings: list[str] = []
     kept = list(stored)
     while True:
         setup = replace(plain, stored=tuple(kept))
-        found = [n for n in sorted(_clashing(setup, escs, foreign)) if kept[n].has_ids]
-        # a node that is moved onto another one's ids clashes with a node that may be right
-        clash = [n for n in found if kept[n].node_id is not None] or found
-        if not clash:
-            return setup, said
-        for number in clash:
-            said.append(
+        clashing = [n for n in sorted(_clashing(setup, escs, foreign)) if kept[n].has_ids]
+        # Nodes with a stored node-ID first: the other node of the clash may be right.
+        moved = [n for n in clashing if kept[n].node_id is not None]
+        to_ignore = moved or clashing
+        if not to_ignore:
+            return setup, warnings
+        for number in to_ignore:
+            warnings.append(
                 f"{config.esc[number].name}: the stored node-ID and COB-IDs are ignored: one of them is used otherwise now"
             )
             kept[number] = kept[number].without_ids()
@@ -151,23 +170,30 @@ def with_stored(
 def _clashing(
     setup: CanopenSetup, escs: Sequence[EscSettings], foreign: Mapping[int, str]
 ) -> set[int]:
-    """Nodes with a COB-ID that something else uses, or that wait for a node-ID although LSS is refused."""
+    """Return the numbers of the nodes that cannot use their ids.
+
+    Another node or a DBC message has one of their COB-IDs, or they wait for a node-ID although LSS
+    is refused.
+    """
     users: dict[int, list[tuple[int, Use]]] = {}
     for number, node in enumerate(setup.nodes(escs, foreign).nodes):
         for use in uses(node):
             users.setdefault(use.cob_id, []).append((number, use))
-    found = {
-        number
-        for cob_id, those in users.items()
-        if cob_id in foreign or (len(those) > 1 and any(use.own for _, use in those))
-        for number, _ in those
-    }
-    pairs = enumerate(zip(setup.settings, setup.stored, strict=True))
-    return found | {n for n, (own, s) in pairs if own.read_only and s.node_id == UNCONFIGURED}
+    clashing: set[int] = set()
+    for cob_id, users_of_id in users.items():
+        is_shared = len(users_of_id) > 1 and any(use.own for _, use in users_of_id)
+        if is_shared or cob_id in foreign:
+            clashing.update(number for number, _ in users_of_id)
+    for number, (settings, stored) in enumerate(zip(setup.settings, setup.stored, strict=True)):
+        if settings.read_only and stored.node_id == UNCONFIGURED:
+            clashing.add(number)
+    return clashing
 
 
 def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:
-    """Nodes from the shipped EDS, without a configuration."""
+    """Return the setup of nodes from the shipped EDS, without a configuration."""
     settings = tuple(NodeSettings(node_id, version=__version__) for node_id in node_ids)
+    nothing_stored = (Stored(),) * len(settings)
     file = shipped("eds/kontronik_esc.eds")
-    return CanopenSetup(eds_of(file.read_bytes(), str(file)), settings, (Stored(),) * len(settings))
+    eds = eds_of(file.read_bytes(), str(file))
+    return CanopenSetup(eds, settings, nothing_stored)

@@ -1,4 +1,4 @@
-"""The keys of the outputs: rows as in keys.py, where they are tables of the configuration."""
+"""The keys of the outputs. Each class is a table of the configuration, as in keys.py."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +21,9 @@ from kontronik_can_gw.signals.plan import SEND_TYPES
 
 SHIPPED = "shipped"
 NODE_ID = integer(1, 127, also=UNCONFIGURED)
-"""Of a CANopen node."""
-_CAN_ID_MAX, _UINT32_MAX = 0x1FFFFFFF, 0xFFFFFFFF
+"""Node-ID of a CANopen node."""
+_CAN_ID_MAX = 0x1FFFFFFF
+_UINT32_MAX = 0xFFFFFFFF
 
 
 # fmt: off

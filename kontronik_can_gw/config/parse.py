@@ -1,4 +1,8 @@
-"""Makes a configuration of TOML: every mistake in it is reported at once, with its place, a remedy and what was meant."""
+"""Makes a configuration from TOML.
+
+All mistakes are reported at once, each with its place, a remedy, and the name that was probably
+meant.
+"""
 
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -15,23 +19,29 @@ from kontronik_can_gw.output import OUTPUTS
 
 
 def load(path: Path) -> Config:
-    """Read and check a configuration file. UserError with every mistake, each with file, key and remedy."""
-    return _valid(*examine(path))
+    """Read and check a configuration file. Raises UserError with every mistake."""
+    config, problems = examine(path)
+    return _require_valid(config, problems)
 
 
 def parse(tables: Mapping[str, Any], file: str) -> Config:
-    """A configuration from TOML tables. UserError with every mistake."""
-    return _valid(*_config(tables, file))
+    """Make a configuration from TOML tables. Raises UserError with every mistake."""
+    config, problems = _make_config(tables, file)
+    return _require_valid(config, problems)
 
 
-def _valid(config: Config | None, problems: list[str]) -> Config:
+def _require_valid(config: Config | None, problems: list[str]) -> Config:
     if config is None or problems:
         raise UserError(*problems)
     return config
 
 
 def examine(path: Path) -> tuple[Config | None, list[str]]:
-    """A configuration and its mistakes; None where too little is valid to go on. UserError where the file cannot be read."""
+    """Read a configuration file. Returns the configuration and its mistakes.
+
+    The configuration is None if a table is invalid. It can have mistakes nevertheless, for example
+    in rules about several keys. Raises UserError if the file cannot be read.
+    """
     try:
         text = path.read_bytes().decode("utf-8-sig")  # editors on Windows write a byte order mark
     except OSError as error:
@@ -43,15 +53,17 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
+        # TOMLDecodeError is a ValueError. A number of 5000 digits raises ValueError, and 1000
+        # nested brackets raise RecursionError.
         reason = "a number in it is too long, or it is nested too deep"
         if isinstance(error, tomllib.TOMLDecodeError):
             reason = str(error)
         raise UserError(f"{path}: is not valid TOML: {reason}") from None
-    return _config(tables, str(path))
+    return _make_config(tables, str(path))
 
 
-def _config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[str]]:
-    """The configuration, None where a table is invalid, and all mistakes."""
+def _make_config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[str]]:
+    """Return the configuration, or None if a table is invalid, and all mistakes."""
     problems: list[str] = []
     removed: list[str] = []
     for name in tables:
@@ -59,7 +71,7 @@ def _config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[s
             near = did_you_mean(name, TABLES, 0.5, or_known=True)
             problems.append(f"{name}: unknown table.{near}")
     made = {
-        name: _table(tables.get(name, {}), name, name, problems, removed)
+        name: _make_table(tables.get(name, {}), name, name, problems, removed)
         for name in TABLES
         if name != "esc"
     }
@@ -74,7 +86,8 @@ def _config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[s
     escs: dict[int, EscConfig] = {}
     for number, entry in enumerate(listed, 1):
         named = {"name": f"esc{number}"} | entry
-        if esc := _table(named, "esc", f"esc[{number}]", problems, removed):
+        esc = _make_table(named, "esc", f"esc[{number}]", problems, removed)
+        if esc is not None:
             escs[number] = esc
     config = None
     if not problems:
@@ -86,16 +99,20 @@ def _config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[s
     return config, [f"{file}: {text}" for text in problems]
 
 
-def _table(given: Any, name: str, place: str, problems: list[str], removed: list[str]) -> Any:
-    """The object of a table; None where it is invalid. Adds what is wrong, and a line for each key that was removed."""
+def _make_table(given: Any, name: str, place: str, problems: list[str], removed: list[str]) -> Any:
+    """Return the object of a table, or None if the table is invalid.
+
+    Adds mistakes to ``problems``, and a line for each removed key to ``removed``.
+    """
     if not isinstance(given, dict):
         problems.append(f"{place}: is a table, written [{place}]")
         return None
     before = len(problems)
-    kinds = {f.name: f.metadata["kind"] for f in fields(TABLES[name])}
+    kinds = {row.name: row.metadata["kind"] for row in fields(TABLES[name])}
     values: dict[str, Any] = {}
     for key, value in given.items():
-        if advice := REMOVED_KEYS.get(f"{name}.{key}"):
+        advice = REMOVED_KEYS.get(f"{name}.{key}")
+        if advice is not None:
             removed.append(f"{place}.{key}: was removed and is ignored. {advice}")
         elif key not in kinds:
             near = did_you_mean(key, kinds, 0.5, or_known=True)
@@ -105,21 +122,24 @@ def _table(given: Any, name: str, place: str, problems: list[str], removed: list
                 values[key] = kinds[key].check(value)
             except ValueError as error:
                 problems.append(f"{place}.{key}: {error}")
-    for f in required(TABLES[name]):
-        if f.name not in given:
-            problems.append(f"{place}.{f.name}: is required: {f.metadata['doc']}")
-    return TABLES[name](**values) if len(problems) == before else None
+    for row in required(TABLES[name]):
+        if row.name not in given:
+            problems.append(f"{place}.{row.name}: is required: {row.metadata['doc']}")
+    if len(problems) > before:
+        return None
+    return TABLES[name](**values)
 
 
 # --- rules about several keys
 
 
 def _esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
-    """Names and ports that are taken, names that are ambiguous. ``escs``: the valid ones, by their number in the file."""
+    """Yield mistakes in the names, ports and devices of ESCs, given by their number in the file."""
     names = {number: normalize(esc.name) for number, esc in escs.items()}
-    for number, other in _taken(names):
+    ports = {number: esc.port for number, esc in escs.items()}
+    for number, other in _duplicates(names):
         yield f"esc[{number}].name: {escs[number].name!r} is also that of esc[{other}]"
-    for number, other in _taken({number: esc.port for number, esc in escs.items()}):
+    for number, other in _duplicates(ports):
         yield f"esc[{number}].port: {escs[number].port!r} is also that of esc[{other}]"
     for number, esc in escs.items():
         if esc.device is not None and esc.device_number is None:
@@ -132,18 +152,21 @@ def _esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
             )
 
 
-def _taken(values: Mapping[int, object]) -> Iterator[tuple[int, int]]:
-    """Each number whose value an earlier one has, and that one."""
-    seen: dict[object, int] = {}
+def _duplicates(values: Mapping[int, object]) -> Iterator[tuple[int, int]]:
+    """Yield each number with the value of an earlier number, and that earlier number."""
+    first: dict[object, int] = {}
     for number, value in values.items():
-        if (other := seen.setdefault(value, number)) != number:
+        other = first.setdefault(value, number)
+        if other != number:
             yield number, other
 
 
 def _is_ambiguous(name: str, starts: set[str]) -> bool:
-    """True where a name, after one of ``starts``, and a value's name make another value's name.
+    """Return True if an ESC's name can be mistaken for a part of a value's name.
 
-    "max" and "electrical_speed" give "max_electrical_speed", which is a value; "a" and "a_max" clash too.
+    Signals are named by the ESC's name and the value's name. An ESC called "max" is ambiguous:
+    "max_electrical_speed" is also a value. ESCs called "a" and "a_max" are ambiguous, too, so
+    ``starts`` has the names of all ESCs and "".
     """
     rests = [name.removeprefix(start) for start in starts if name.startswith(start)]
     return any(
@@ -154,13 +177,16 @@ def _is_ambiguous(name: str, starts: set[str]) -> bool:
 
 
 def _output_problems(config: Config) -> Iterator[str]:
-    """Outputs that are all off, a statistics file that is read elsewhere, node-IDs that clash."""
+    """Yield mistakes in the outputs: a statistics file that would overwrite an input, invalid
+    node-IDs, or only disabled outputs.
+    """
     files = {
         "the configuration": Path(config.file),
         "the DBC": config.dbc_path,
         "the EDS": config.eds_path,
     }
-    if (path := config.statistics_path) is not None:
+    path = config.statistics_path
+    if path is not None:
         for what, other in files.items():
             if normpath(path) == normpath(other):
                 yield f"statistics.file: {str(path)!r} is {what}, which would be overwritten"
@@ -173,7 +199,7 @@ def _output_problems(config: Config) -> Iterator[str]:
 
 def _node_id_problems(config: Config) -> Iterator[str]:
     ids = dict(enumerate(config.node_ids, 1))
-    taken = dict(_taken(ids))
+    duplicates = dict(_duplicates(ids))
     for number, node_id in ids.items():
         if node_id == UNCONFIGURED:
             if config.canopen.read_only:
@@ -186,5 +212,5 @@ def _node_id_problems(config: Config) -> Iterator[str]:
                 f"esc[{number}]: its node-ID would be {node_id}. "
                 "Choose a smaller canopen.node_id, or a node_id for it."
             )
-        elif number in taken:
-            yield f"esc[{number}].node_id: {node_id} is also that of esc[{taken[number]}]"
+        elif number in duplicates:
+            yield f"esc[{number}].node_id: {node_id} is also that of esc[{duplicates[number]}]"
