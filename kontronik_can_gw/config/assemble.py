@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -164,14 +164,92 @@ def _outputs(
 def _load_warning(
     config: Config, layout: Layout, bits: Mapping[str, float], worst: Mapping[str, float]
 ) -> str | None:
-    """A warning of the bus load. ``worst`` has the outputs whose worst load is another one."""
+    """Return a warning of the bus load. ``worst`` has the outputs whose worst load differs."""
     can = config.can
     return check_load(layout, can.bitrate, can.data_bitrate, bits, {**bits, **worst})
 
 
-def _output_warnings(config: Config, outputs: Sequence[OutputSetup]) -> list[str]:
-    bitrate = config.can.bitrate
-    return [f"{config.file}: {text}" for each in outputs for text in each.warnings(bitrate)]
+@dataclass
+class _NodesRead:
+    """CANopen nodes before their stored parameters are checked."""
+
+    plain: "CanopenSetup"
+    """The nodes without stored parameters."""
+    stored: "list[Stored]"
+    damaged: list[tuple[int, str]]
+    warnings: list[str]
+
+
+def _read_nodes(
+    config: Config,
+    store: "ParameterStore | None",
+    problems: list[str],
+    taken: dict[int, str],
+    bits: dict[str, float],
+    worst: dict[str, float],
+) -> _NodesRead | None:
+    """Read EDS and stored parameters of the CANopen nodes. None without nodes or with problems.
+
+    Adds mistakes, COB-IDs and bits per second as ``_outputs`` does. ``worst`` has the worst load.
+    """
+    if not config.canopen.enabled:
+        return None
+    from kontronik_can_gw.config import nodes  # only here: a start without nodes stays short
+
+    with collecting(problems):
+        plain = nodes.plain_setup(config)
+        escs = plain.esc_settings(config.escs)
+        cob_ids, bits[_NODES], worst[_NODES] = nodes.needs(plain, escs)
+        taken |= cob_ids
+    if problems:
+        return None
+    stored, damaged, warnings = nodes.read_stored(config, store)
+    return _NodesRead(plain, stored, damaged, warnings)
+
+
+def _apply_stored(
+    config: Config,
+    read: _NodesRead,
+    layout: Layout,
+    escs: list[EscSettings],
+    bits: dict[str, float],
+    worst: dict[str, float],
+) -> tuple["CanopenSetup", list[str]]:
+    """Return the nodes with the stored parameters that fit, and all warnings about these.
+
+    Updates the usual and the worst bits per second that the nodes need.
+    """
+    from kontronik_can_gw.config import nodes
+
+    foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
+    setup, warnings = nodes.with_stored(read.plain, read.stored, config, escs, foreign)
+    if setup.stored != read.plain.stored:
+        _, bits[_NODES], worst[_NODES] = nodes.needs(setup, escs)
+    return setup, [*warnings, *read.warnings]
+
+
+@dataclass
+class _DbcRead:
+    """The DBC in use. The defaults are used without a DBC output."""
+
+    content: bytes = b""
+    database: "Database | None" = None
+    layout: Layout = field(default_factory=lambda: Layout("", "", ()))
+    warnings: list[str] = field(default_factory=list)
+
+
+def _compile_dbc(
+    config: Config, escs: list[EscSettings], problems: list[str], taken: dict[int, str]
+) -> _DbcRead:
+    """Read and compile the DBC. Adds mistakes in it to ``problems``."""
+    read = _DbcRead()
+    if config.dbc.enabled:
+        file = str(config.dbc_path)
+        with collecting(problems):
+            read.content = read_dbc(config.dbc_path)
+            read.database = parse_database(read.content, file, read.warnings)
+            read.layout = prepare(read.database, file, escs, config.dbc, config.can.fd, taken)
+    return read
 
 
 def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
@@ -181,66 +259,40 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     fit them are ignored with a warning. Without a store, their files are read and not changed.
     """
     problems: list[str] = []
-    with collecting(problems):
-        check_devices(config)
-    escs = config.escs
-    plain = None
-    canopen = None
-    stored: list[Stored] = []
-    damaged: list[tuple[int, str]] = []
-    ignored: list[str] = []
-    warnings: list[str] = []
     taken: dict[int, str] = {}
     bits: dict[str, float] = {}
     worst: dict[str, float] = {}
-    if config.canopen.enabled:
-        from kontronik_can_gw.config import nodes  # only here: a start without nodes stays short
-
-        with collecting(problems):
-            plain = nodes.plain_setup(config)
-            of_nodes = plain.esc_settings(config.escs)
-            taken, bits[_NODES], worst[_NODES] = nodes.needs(plain, of_nodes)
-        if plain is not None and not problems:
-            stored, damaged, warnings = nodes.read_stored(config, store)
-            escs = replace(plain, stored=tuple(stored)).esc_settings(config.escs)
+    with collecting(problems):
+        check_devices(config)
+    nodes = _read_nodes(config, store, problems, taken, bits, worst)
+    escs = config.escs
+    if nodes is not None:
+        escs = replace(nodes.plain, stored=tuple(nodes.stored)).esc_settings(config.escs)
     outputs = _outputs(config, problems, taken, bits)
-    database = None
-    layout = Layout("", "", ())
-    dbc = b""
-    if config.dbc.enabled:
-        file = str(config.dbc_path)
-        with collecting(problems):
-            dbc = read_dbc(config.dbc_path)
-            database = parse_database(dbc, file, ignored)
-            layout = prepare(database, file, escs, config.dbc, config.can.fd, taken)
+    dbc = _compile_dbc(config, escs, problems, taken)
     if problems:
         raise UserError(*problems)
-    load_warning = _load_warning(config, layout, bits, worst)
-    if plain is not None:
-        foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
-        canopen, ignored_ids = nodes.with_stored(plain, stored, config, escs, foreign)
-        warnings = [*ignored_ids, *warnings]
-        if canopen.stored != plain.stored:
-            _, bits[_NODES], worst[_NODES] = nodes.needs(canopen, escs)
-            # Stored parameters that overload the bus do not prevent a start.
-            with collecting(warnings):
-                load_warning = _load_warning(config, layout, bits, worst)
-    warnings += _output_warnings(config, outputs)
-    all_warnings = [*config.warnings, *ignored]
-    all_warnings += unreported(layout, config.dbc.silent_on_loss)
-    all_warnings += unsupplied(layout, escs)
-    if load_warning:
-        all_warnings.append(load_warning)
-    all_warnings += warnings
+    load_warning = _load_warning(config, dbc.layout, bits, worst)
+    canopen = None
+    warnings: list[str] = []
+    if nodes is not None:
+        canopen, warnings = _apply_stored(config, nodes, dbc.layout, escs, bits, worst)
+        # Stored parameters that overload the bus do not prevent a start.
+        with collecting(warnings):
+            load_warning = _load_warning(config, dbc.layout, bits, worst)
+    for output in outputs:
+        warnings += [f"{config.file}: {text}" for text in output.warnings(config.can.bitrate)]
+    mute = [*unreported(dbc.layout, config.dbc.silent_on_loss), *unsupplied(dbc.layout, escs)]
+    load_warnings = [] if load_warning is None else [load_warning]
     return Loaded(
         config=config,
         escs=escs,
-        database=database,
-        layout=layout,
+        database=dbc.database,
+        layout=dbc.layout,
         canopen=canopen,
-        damaged=tuple(damaged),
+        damaged=() if nodes is None else tuple(nodes.damaged),
         store=store,
-        warnings=tuple(all_warnings),
-        dbc=dbc,
+        warnings=(*config.warnings, *dbc.warnings, *mute, *load_warnings, *warnings),
+        dbc=dbc.content,
         outputs=outputs,
     )

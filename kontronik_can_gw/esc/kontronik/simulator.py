@@ -149,30 +149,18 @@ class FlightModel:
         ``drive`` is the throttle, -1..1. The current rises with the square of the speed. Braking
         charges the battery.
         """
-        random = self._random
-        part = self._speed / _FULL_SPEED
         charge_left = max(self._full - self._charge_mah / _CAPACITY_MAH, 0.0)
         open_v = _CELLS * (3.5 + 0.7 * charge_left)
-        motor_a = 0.0
-        battery_a = 0.0
-        if drive > 0:
-            motor_a = self._strength_a * (0.75 * part * part + 0.01) * (0.98 + 0.04 * random())
-            battery_a = motor_a * drive
-        elif drive < 0:
-            motor_a = self._strength_a * (1.5 * drive - 0.3) * part
-            battery_a = motor_a * part
+        motor_a, battery_a = self._compute_currents(drive)
         settled_speed = open_v * max(drive, 0.0) * _SPEED_PER_VOLT
         self._speed = self._settle(self._speed, settled_speed, 0.4 if drive else 1.25)
         if drive <= 0 and self._speed < 400:
             self._speed = 0.0
         self._charge_mah += max(battery_a, 0.0) * self._dt / 3.6
-        bec_a = 0.25 + 0.1 * random()
+        bec_a = 0.25 + 0.1 * self._random()
         if drive > 0:
-            bec_a += 0.8 * random()
-        settled_c = _AMBIENT_C + 4 + 60 * abs(motor_a) / _MAX_CURRENT_A
-        self._stage_c = self._settle(self._stage_c, settled_c, 25)
-        settled_c = _AMBIENT_C + 5 + 4 * bec_a + 0.2 * (self._stage_c - _AMBIENT_C)
-        self._bec_c = self._settle(self._bec_c, settled_c, 40)
+            bec_a += 0.8 * self._random()
+        self._update_temperatures(motor_a, bec_a)
 
         battery_raw = round(battery_a * 10)
         motor_raw = round(motor_a * 10)
@@ -199,6 +187,24 @@ class FlightModel:
             operating_state=self.phase.state,
             timing=20,
         )
+
+    def _compute_currents(self, drive: float) -> tuple[float, float]:
+        """Return the current in the motor and the current from the battery, in A."""
+        part = self._speed / _FULL_SPEED
+        if drive > 0:
+            noise = 0.98 + 0.04 * self._random()
+            motor_a = self._strength_a * (0.75 * part * part + 0.01) * noise
+            return motor_a, motor_a * drive
+        if drive < 0:
+            motor_a = self._strength_a * (1.5 * drive - 0.3) * part
+            return motor_a, motor_a * part
+        return 0.0, 0.0
+
+    def _update_temperatures(self, motor_a: float, bec_a: float) -> None:
+        settled_c = _AMBIENT_C + 4 + 60 * abs(motor_a) / _MAX_CURRENT_A
+        self._stage_c = self._settle(self._stage_c, settled_c, 25)
+        settled_c = _AMBIENT_C + 5 + 4 * bec_a + 0.2 * (self._stage_c - _AMBIENT_C)
+        self._bec_c = self._settle(self._bec_c, settled_c, 40)
 
     def _settle(self, value: float, target: float, lag_s: float) -> float:
         """Return the value one period later, if it approaches ``target`` with this lag."""
