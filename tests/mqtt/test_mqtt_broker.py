@@ -24,7 +24,7 @@ from vcan_tools import GatewayProcess, wait_for
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.desk.mqtt import client as mqtt_client
 from kontronik_can_gw.desk.mqtt.client import MqttClient
-from kontronik_can_gw.desk.mqtt.messages import Message
+from kontronik_can_gw.desk.mqtt.messages import Publication
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin:/sbin")
 pytestmark = [
@@ -150,10 +150,10 @@ def turning(client: MqttClient, condition: Callable[[], object]) -> None:
 def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosquitto) -> None:
     client = MqttClient(to(broker.port), "test", ONLINE)
     for number in range(1000):
-        client.offer(Message("k/test/state", b"%d" % number))
-        client.offer(Message("k/test/other", b"%d" % number))
-    client.offer(Message("k/test/known", b"1", lasting=True, retain=True))
-    client.offer(Message("k/test/known", b"2", lasting=True, retain=True))
+        client.offer(Publication("k/test/state", b"%d" % number))
+        client.offer(Publication("k/test/other", b"%d" % number))
+    client.offer(Publication("k/test/known", b"1", lasting=True, retain=True))
+    client.offer(Publication("k/test/known", b"2", lasting=True, retain=True))
     assert waiting(client) == 3
     with Subscriber(broker.port, "k/test/#") as heard:
         client.start()
@@ -180,7 +180,7 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(broker: Mosquitto) ->
 
         def offer() -> None:
             sent.append(b"%06d" % len(sent) + b"x" * 100_000)
-            client.offer(Message("k/test/state", sent[-1]))
+            client.offer(Publication("k/test/state", sent[-1]))
             client.turn(time.monotonic_ns())
 
         broker.freeze(True)
@@ -240,7 +240,7 @@ def test_tls_with_an_authority_of_ones_own_and_certificates_that_do_not_fit(tmp_
         with connecting(right) as client:
             turning(client, lambda: client.problem == "")
             # more than a record of TLS, and than the kernel takes at once
-            client.offer(Message("k/tls/big", b"x" * 300_000, lasting=True))
+            client.offer(Publication("k/tls/big", b"x" * 300_000, lasting=True))
             turning(client, lambda: not waiting(client))
         wrong: list[tuple[dict[str, Any], str]] = [
             ({"ca_file": None}, "CERTIFICATE_VERIFY_FAILED"),

@@ -16,7 +16,7 @@ from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_error
 
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.dbc.writer import copies_text
-from kontronik_can_gw.desk.mqtt.messages import MIN_PAUSE_NS, Message, Publisher, Topics, iso
+from kontronik_can_gw.desk.mqtt.messages import MIN_PAUSE_NS, Publication, Publisher, Topics, iso
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
     ErrorWindow,
@@ -40,7 +40,7 @@ def publisher(*names: str, rate: float = 1, **options: Any) -> Publisher:
     return Publisher(bus_of(names), TOPICS, MqttConfig(rate=rate, **options))
 
 
-Published = list[tuple[int, Message]]
+Published = list[tuple[int, Publication]]
 
 
 def run(made: Publisher, frames: Timed, until_s: float, step_ns: int = STEP_NS) -> Published:

@@ -20,7 +20,7 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from kontronik_can_gw.config.keys import MqttConfig
-from kontronik_can_gw.desk.mqtt.messages import OFFLINE, ONLINE, Message
+from kontronik_can_gw.desk.mqtt.messages import OFFLINE, ONLINE, Publication
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.fault_log import FaultLog
 
@@ -77,9 +77,9 @@ class MqttClient:
         self._connections = self._greeted = 0
         self._answered = False
         self._ended = threading.Event()
-        self._offline = Message(online, OFFLINE, True, True)
-        self._lasting = {online: Message(online, ONLINE, True, True)}
-        self._waiting: dict[str, Message] = {}
+        self._offline = Publication(online, OFFLINE, True, True)
+        self._lasting = {online: Publication(online, ONLINE, True, True)}
+        self._waiting: dict[str, Publication] = {}
         self._handed: dict[str, paho.MQTTMessageInfo] = {}
         """paho's record of the newest message of each topic that it was given."""
         self._faults = FaultLog()
@@ -121,7 +121,7 @@ class MqttClient:
                 f"127.0.0.1: {error.strerror or error}. MQTT needs this machine's own network: sudo ip link set lo up"
             ) from None
 
-    def offer(self, message: Message) -> None:
+    def offer(self, message: Publication) -> None:
         """Queue a message; a pending one of the same topic is replaced."""
         if message.lasting:
             self._lasting[message.topic] = message
@@ -153,7 +153,7 @@ class MqttClient:
         if self._client.disconnect() == MQTTErrorCode.MQTT_ERR_SUCCESS:
             self._ended.wait(max(0.0, end - time.monotonic()))
 
-    def _send(self, message: Message) -> paho.MQTTMessageInfo:
+    def _send(self, message: Publication) -> paho.MQTTMessageInfo:
         qos = 1 if message.lasting else 0
         return self._client.publish(message.topic, message.payload, qos, message.retain)
 

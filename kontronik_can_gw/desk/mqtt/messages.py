@@ -38,7 +38,7 @@ _FIRST_NS = SECOND // 2
 """Delay of the first state, so that the first frames of all messages can arrive."""
 
 
-class Message(NamedTuple):
+class Publication(NamedTuple):
     """A message to publish. ``lasting``: retained, and published again after each reconnection."""
 
     topic: str
@@ -170,19 +170,19 @@ class Publisher:
                 if value is not None and at in self._signs:
                     self._signs[at].heard_ns = now
 
-    def messages(self, now: int, wall_ns: int) -> list[Message]:
+    def messages(self, now: int, wall_ns: int) -> list[Publication]:
         """The messages to publish now."""
         self._view.expire(now)
-        made: list[Message] = []
+        made: list[Publication] = []
         for member in self._members:
             if member.is_due(now, round(SECOND / self._config.rate)):
                 for topic, payload in self._lasting_of(member, now).items():
                     if self._lasting.get(topic) != payload:
-                        made.append(Message(topic, payload, lasting=True, retain=True))
+                        made.append(Publication(topic, payload, lasting=True, retain=True))
                         self._lasting[topic] = payload
                 topic = self._topics.of(member.name, "state")
                 state = {"time": iso(wall_ns)} | member.document(now)
-                made.append(Message(topic, _json(state), retain=self._config.retain))
+                made.append(Publication(topic, _json(state), retain=self._config.retain))
         return made
 
     def _lasting_of(self, member: Published, now: int) -> dict[str, bytes]:
