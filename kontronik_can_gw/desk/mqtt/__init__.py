@@ -1,1 +1,1 @@
-"""The MQTT publisher: topics and messages, and a client that reconnects by itself."""
+"""The MQTT publisher: topics, payloads, Home Assistant's discovery, a client that reconnects."""

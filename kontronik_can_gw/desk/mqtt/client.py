@@ -1,7 +1,10 @@
-"""Publishes through paho, whose own thread connects, sends, and connects again for ever with growing pauses.
+"""Publishes to an MQTT broker through paho.
 
-Of each topic one message at most is with paho, and the newest waits here: a slow or missing broker makes nothing pile up and delays
-nobody. Lasting messages are published again after each reconnection. MQTT 3.1.1, which every broker understands.
+paho's thread connects and sends. After a loss it tries again for ever, with growing pauses. For
+each topic, paho has at most one message that is not sent yet, and the newest further message is
+kept here. So memory stays bounded and callers are not delayed if the broker is slow or missing.
+Lasting messages are published again after each reconnection. The version is MQTT 3.1.1, which every
+broker supports.
 """
 
 import contextlib
@@ -25,13 +28,14 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.fault_log import FaultLog
 
 KEEPALIVE_S = 15
-"""The broker publishes the last will after 1.5 times this without a packet."""
-MIN_PAUSE_S, MAX_PAUSE_S = 1, 30
-"""Time between two attempts to connect; paho doubles it each time."""
+"""After 1.5 times this without a packet, the broker publishes the last will."""
+MIN_PAUSE_S = 1
+MAX_PAUSE_S = 30
+"""Limits of the time between two attempts to connect. paho doubles it after each attempt."""
 
 
 def password(file: str) -> str:
-    """The password in the first line of a file. OSError with the remedy where there is none."""
+    """Return the password in the first line of a file. Raises OSError if there is no password."""
     try:
         line = Path(file).read_text(encoding="utf-8").partition("\n")[0].rstrip("\r")
     except OSError as error:
@@ -44,7 +48,7 @@ def password(file: str) -> str:
 
 
 class _Client(paho.Client):
-    """paho's client, whose thread outlives the errors that paho raises for malformed packets."""
+    """paho's client. Its thread continues after the exceptions of malformed packets."""
 
     on_malformed: Callable[[], None]
 
@@ -57,62 +61,90 @@ class _Client(paho.Client):
                 return super().loop_forever(timeout, retry_first_connection)
             except Exception:
                 self.on_malformed()
-                if (sock := self.socket()) is not None:
+                sock = self.socket()
+                if sock is not None:
                     with contextlib.suppress(OSError):
-                        sock.close()  # paho's loop notices it, and connects again
+                        sock.close()  # so that paho's loop connects again
                 time.sleep(MIN_PAUSE_S)
 
 
 class MqttClient:
-    """Keeps one connection to a broker from ``start`` to ``stop``. ``online``: the topic of its state, "online" or "offline" (retained).
+    """Keeps one connection to a broker from ``start`` to ``stop``.
 
-    OSError where a file is missing or damaged. All but paho's callbacks belongs to the thread that calls ``turn``.
+    ``online`` is the topic of the connection's state, "online" or "offline" (retained). All methods
+    except paho's callbacks must be called by one thread. Raises OSError if a file is missing or
+    damaged.
     """
 
     def __init__(self, config: MqttConfig, client_id: str, online: str) -> None:
         assert config.address is not None
-        self.address, self._config, self._client_id = config.address, config, client_id
+        self.address = config.address
+        self._config = config
+        self._client_id = client_id
         self.problem: str | None = None
-        """Why there is no connection; empty while there is one, None before the first result."""
-        self._connections = self._greeted = 0
-        self._answered = False
+        """The reason why there is no connection.
+
+        Empty while there is a connection. None before the result of the first attempt.
+        """
+        self._connections = 0
+        """Number of connections that the broker has accepted."""
+        self._reported_connections = 0
+        """Number of connections that ``turn`` has reported."""
+        self._has_answered = False
+        """True if the broker has answered the present attempt."""
         self._ended = threading.Event()
         self._offline = Publication(online, OFFLINE, True, True)
         self._lasting = {online: Publication(online, ONLINE, True, True)}
         self._waiting: dict[str, Publication] = {}
+        """The newest message of each topic that paho does not have yet."""
         self._handed: dict[str, paho.MQTTMessageInfo] = {}
-        """paho's record of the newest message of each topic that it was given."""
+        """paho's record of the last message of each topic that it received."""
         self._faults = FaultLog()
-        self._client = client = _Client(CallbackAPIVersion.VERSION2, client_id)
-        client.on_malformed = self._malformed
-        client.on_pre_connect, client.on_socket_open = self._prepare, self._opened
-        client.on_connect, client.on_connect_fail = self._connected, self._not_connected
-        client.on_disconnect = self._disconnected
+        client = _Client(CallbackAPIVersion.VERSION2, client_id)
+        client.on_malformed = self._on_malformed
+        client.on_pre_connect = self._on_pre_connect
+        client.on_socket_open = self._on_socket_open
+        client.on_connect = self._on_connect
+        client.on_connect_fail = self._on_connect_fail
+        client.on_disconnect = self._on_disconnect
         client.will_set(online, OFFLINE, qos=1, retain=True)
+        self._client = client
         if config.tls:
-            files = config.ca_file, config.cert_file, config.key_file
-            try:
-                # a key with a passphrase would ask for it on the terminal
-                client.tls_set(*files, keyfile_password="")
-            except (OSError, ValueError) as error:
-                why = "cannot be used for TLS"  # the text of a library's error is of no use
-                if isinstance(error, OSError) and not isinstance(error, ssl.SSLError):
-                    why = f"cannot be read: {error.strerror}"
-                raise OSError(
-                    f"{', '.join(filter(None, files))}: {why}. Certificates must be in PEM form, keys without passphrase."
-                ) from None
+            self._use_tls()
         if config.password_file is not None:
             password(config.password_file)
-        # random, for the sake of a broker of many gateways
+        # A random limit, so that many gateways do not all reconnect to a broker at the same time.
         longest = random.uniform(MAX_PAUSE_S / 2, MAX_PAUSE_S)
         client.reconnect_delay_set(MIN_PAUSE_S, longest)  # type: ignore[arg-type]
 
+    def _use_tls(self) -> None:
+        """Use the certificates of the configuration. Raises OSError, with the files, if they are unusable."""
+        config = self._config
+        files = [config.ca_file, config.cert_file, config.key_file]
+        try:
+            # Without this password, a key with a passphrase would ask for it on the terminal.
+            self._client.tls_set(*files, keyfile_password="")
+        except (OSError, ValueError) as error:
+            # The text of a library's own error does not help a user.
+            problem = "cannot be used for TLS"
+            if isinstance(error, OSError) and not isinstance(error, ssl.SSLError):
+                problem = f"cannot be read: {error.strerror}"
+            names = ", ".join(file for file in files if file)
+            raise OSError(
+                f"{names}: {problem}. Certificates must be in PEM form, keys without passphrase."
+            ) from None
+
     def __str__(self) -> str:
         host, port = self.address
-        return f"MQTT broker [{host}]:{port}" if ":" in host else f"MQTT broker {host}:{port}"
+        if ":" in host:
+            host = f"[{host}]"
+        return f"MQTT broker {host}:{port}"
 
     def start(self) -> None:
-        """Start paho's thread, which connects. RunError with the remedy where 127.0.0.1, by which paho wakes it, does not work."""
+        """Start paho's thread, which connects.
+
+        Raises RunError if 127.0.0.1 is not available. paho needs it to wake its thread.
+        """
         self._client.connect_async(*self.address, KEEPALIVE_S)
         try:
             self._client.loop_start()
@@ -122,30 +154,36 @@ class MqttClient:
             ) from None
 
     def offer(self, message: Publication) -> None:
-        """Queue a message; a pending one of the same topic is replaced."""
+        """Queue a message. It replaces a waiting message of the same topic."""
         if message.lasting:
             self._lasting[message.topic] = message
         self._waiting[message.topic] = message
 
     def turn(self, now: int) -> None:
-        """Hand over what can be sent, and report faults of the connection. To be called often; never waits."""
+        """Pass messages to paho, and log faults of the connection.
+
+        Never waits. Messages are delayed until the next call, so call it several times a second.
+        """
         if self.problem:
             self._faults.begin("broker", f"{self}: {self.problem}", now)
         elif self.problem == "":
-            if self._greeted != self._connections:
-                if self._greeted == 0:
-                    self._faults.forget("broker")
-                    self._faults.say(logging.INFO, f"{self}: connected as {self._client_id}")
-                self._faults.end("broker", f"{self}: connected", now)
-                self._greeted = self._connections
+            if self._reported_connections != self._connections:
+                self._report_connection(now)
                 self._waiting = self._lasting | self._waiting
             for topic in list(self._waiting):
                 if topic not in self._handed or _is_done(self._handed[topic]):
                     self._handed[topic] = self._send(self._waiting.pop(topic))
         self._faults.advance(now)
 
+    def _report_connection(self, now: int) -> None:
+        if self._reported_connections == 0:
+            self._faults.forget("broker")
+            self._faults.say(logging.INFO, f"{self}: connected as {self._client_id}")
+        self._faults.end("broker", f"{self}: connected", now)
+        self._reported_connections = self._connections
+
     def stop(self, seconds: float) -> None:
-        """Publish "offline" and end the connection, within ``seconds``."""
+        """Publish "offline" and end the connection. Returns after ``seconds`` at the latest."""
         end = time.monotonic() + seconds
         if self.problem == "":
             with contextlib.suppress(ValueError, RuntimeError):
@@ -159,19 +197,22 @@ class MqttClient:
 
     # --- paho's thread
 
-    def _prepare(self, *_: object) -> None:
-        """Before each connection: the password may be another now."""
-        self._answered = False
-        if (user := self._config.username) is not None:
+    def _on_pre_connect(self, *_: object) -> None:
+        """Read the password again before each connection, because the file may have changed."""
+        self._has_answered = False
+        user = self._config.username
+        if user is not None:
             file = self._config.password_file
             self._client.username_pw_set(user, None if file is None else password(file))
 
-    def _opened(self, _client: object, _data: object, sock: Any) -> None:
-        # a small buffer in the kernel, since data in it cannot be replaced by newer
+    def _on_socket_open(self, _client: object, _data: object, sock: Any) -> None:
+        # The kernel's buffer is small, because newer data cannot replace the data in it.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 15)
 
-    def _connected(self, _client: object, _data: object, _flags: object, reason: Any, *_: object) -> None:  # fmt: skip
-        self._answered = True
+    def _on_connect(
+        self, _client: object, _data: object, _flags: object, reason: Any, *_: object
+    ) -> None:
+        self._has_answered = True
         if reason.is_failure:
             text = str(reason).lower()
             self.problem = f"refuses the connection: {text}. Check username, password_file and gateway of [mqtt]."
@@ -180,20 +221,20 @@ class MqttClient:
         self._ended.clear()
         self.problem = ""
 
-    def _malformed(self) -> None:
+    def _on_malformed(self) -> None:
         self.problem = "its answer is not MQTT. Is this the port of an MQTT broker?"
 
-    def _not_connected(self, *_: object) -> None:
+    def _on_connect_fail(self, *_: object) -> None:
         error = sys.exc_info()[1]
         self.problem = f"cannot be reached: {getattr(error, 'strerror', None) or error}"
 
-    def _disconnected(self, *_: object) -> None:
+    def _on_disconnect(self, *_: object) -> None:
         if self.problem == "":
             self.problem = (
                 "the connection was lost. If that goes on: does another program use the client id "
                 f"{self._client_id!r} (mqtt.gateway)?"
             )
-        elif not self._answered:
+        elif not self._has_answered:
             self.problem = (
                 "does not answer as an MQTT broker. Is the port right, does it want mqtt.tls?"
             )
@@ -201,8 +242,11 @@ class MqttClient:
 
 
 def _is_done(info: paho.MQTTMessageInfo) -> bool:
-    """True once paho has sent a message (QoS 1: once the broker has it), or has given it up."""
+    """Return True if paho has sent a message or has given it up.
+
+    A message with QoS 1 is sent when the broker has confirmed it.
+    """
     try:
         return info.is_published()
-    except (ValueError, RuntimeError):  # it could not be queued, or the connection was lost
+    except (ValueError, RuntimeError):  # not queued, or the connection was lost
         return True

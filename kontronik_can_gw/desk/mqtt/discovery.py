@@ -1,4 +1,7 @@
-"""Home Assistant's discovery: which entity shows which value, with unit, device class and availability. Pure."""
+"""Home Assistant's discovery: an entity for each value, with unit, device class, availability.
+
+No I/O, no clock.
+"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -23,16 +26,21 @@ _UNITS: dict[str, tuple[str | None, str | None, str]] = {
     "mAh": ("mAh", None, "total_increasing"),
     "s": ("s", "duration", "total_increasing"),
 }
-"""Our unit: Home Assistant's unit, device class and state class. Speed and charge have none, and % is neither humidity nor battery.
+"""For our units: Home Assistant's unit, device class and state class.
 
-What grows does so until the ESC or the gateway restarts.
+Home Assistant has no device class for rotational speed or charge, and its classes for % are
+humidity and battery level. Values of the class ``total_increasing`` restart at 0 with the ESC or
+the gateway.
 """
 _DIAGNOSTIC = {Group.LINK, Group.INFO, Group.GATEWAY}
-_OF_USE = {"energy_used", "motor_run_time", "link_state"}
+"""Groups whose values are diagnostic."""
+_NOT_DIAGNOSTIC = {"energy_used", "motor_run_time", "link_state"}
+"""Values of these groups that are shown with the measured values nevertheless."""
 _UPPER = {"bec", "pwm", "crc", "can", "id", "esc", "eeprom"}
+"""Words that are written in capitals."""
 _LEFT_OUT = {"operating_state_raw", "device_raw", "operating_errors", "selftest_errors"}
 _LEFT_OUT |= {"firmware_main", "firmware_sub"}
-"""Sources without an entity, because another one shows the same."""
+"""Sources without an entity, because another entity shows the same."""
 _MOTOR: dict[str, Any] = {
     "platform": "sensor",
     "name": "Motor",
@@ -62,8 +70,9 @@ _ERROR_ENTITIES: dict[str, dict[str, Any]] = {
 
 
 def device(topics: "Topics", member: "Published") -> dict[str, Any]:
-    """The discovery of the gateway or of an ESC: one device with all its entities."""
-    identifier, online = topics.identifier(member.name), {"topic": topics.of("online")}
+    """Return the discovery payload of the gateway or an ESC: one device with all its entities."""
+    identifier = topics.identifier(member.name)
+    online = {"topic": topics.of("online")}
     components: dict[str, dict[str, Any]] = {}
     for source in member.no_flags:
         if source not in _LEFT_OUT:
@@ -75,7 +84,7 @@ def device(topics: "Topics", member: "Published") -> dict[str, Any]:
     for key, component in components.items():
         components[key] = {**component, "unique_id": f"{identifier}_{key}"}
         if key in VALUES and VALUES[key].group is Group.LINK:
-            # values of the link are valid, and most useful, while the ESC sends nothing
+            # Values of the link stay valid while the ESC sends nothing, and are most useful then.
             components[key] |= {
                 "availability": [online, {"topic": topics.of("available")}],
                 "availability_mode": "all",
@@ -94,35 +103,45 @@ def _about(topics: "Topics", member: "Published") -> dict[str, Any]:
     if member.index is None:
         return {"name": f"KONTRONIK gateway {topics.gateway}", "model": PROGRAM}
     model, firmware = member.identity or (None, None)
-    about = {"name": f"{topics.gateway} {member.name}", "manufacturer": member.protocol.maker}
-    about["model"] = model or "ESC"
-    about["via_device"] = topics.identifier()
-    return about if firmware is None else about | {"sw_version": firmware}
+    about = {
+        "name": f"{topics.gateway} {member.name}",
+        "manufacturer": member.protocol.maker,
+        "model": model or "ESC",
+        "via_device": topics.identifier(),
+    }
+    if firmware is not None:
+        about["sw_version"] = firmware
+    return about
 
 
 def entity(source: str, member: "Published") -> dict[str, Any]:
-    """Home Assistant's entity of a value."""
-    about, column = VALUES[source], member.view.reader.columns[member.columns[source]]
-    made: dict[str, Any] = {
+    """Return Home Assistant's entity of a value."""
+    value = VALUES[source]
+    column = member.view.reader.columns[member.columns[source]]
+    found: dict[str, Any] = {
         "platform": "sensor",
-        "name": _in_words(source),
+        "name": _display_name(source),
         "value_template": f"{{{{ value_json.{source} }}}}",
     }
-    if about.group in _DIAGNOSTIC and source not in _OF_USE:
-        made["entity_category"] = "diagnostic"
+    if value.group in _DIAGNOSTIC and source not in _NOT_DIAGNOSTIC:
+        found["entity_category"] = "diagnostic"
     if column.texts:
         options = list(dict.fromkeys(text for _, text in column.texts))
-        return made | {"device_class": "enum", "options": options}
-    if about.names:  # sent as a plain number
-        return made
-    counts = "total_increasing" if about.rolls else "measurement"
-    unit, kind, made["state_class"] = _UNITS.get(about.unit, (about.unit or None, None, counts))
-    made |= {"unit_of_measurement": unit, "device_class": kind}
-    made["suggested_display_precision"] = None if source in member.factors else column.digits
-    return {key: value for key, value in made.items() if value is not None}
+        return found | {"device_class": "enum", "options": options}
+    if value.names:  # an enumeration that the DBC sends as a number without texts
+        return found
+    default_class = "total_increasing" if value.rolls else "measurement"
+    default = (value.unit or None, None, default_class)
+    unit, device_class, state_class = _UNITS.get(value.unit, default)
+    found["state_class"] = state_class
+    found["unit_of_measurement"] = unit
+    found["device_class"] = device_class
+    if source not in member.factors:
+        found["suggested_display_precision"] = column.digits
+    return {key: entry for key, entry in found.items() if entry is not None}
 
 
-def _in_words(source: str) -> str:
+def _display_name(source: str) -> str:
     words = [word.upper() if word in _UPPER else word for word in source.split("_")]
     text = " ".join("ESCs" if word == "escs" else word for word in words)
     return text[0].upper() + text[1:]
