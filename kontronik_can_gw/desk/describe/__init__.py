@@ -1,1 +1,4 @@
-"""What a gateway sends and what it means: ``tables`` of the DBC and EDS in use, values, errors and states; ``markdown`` renders them."""
+"""Tables of everything a gateway sends and its meaning, rendered as Markdown.
+
+They cover messages and objects of the DBC and EDS in use, values, errors and states.
+"""

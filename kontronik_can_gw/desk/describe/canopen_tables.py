@@ -1,4 +1,7 @@
-"""Tables of CANopen: nodes, objects and emergencies, of the EDS in use, its bindings and the errors' definitions."""
+"""Tables of CANopen nodes, objects and emergencies.
+
+They are made from the EDS in use, the bindings of its objects and the definitions of the errors.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
@@ -26,16 +29,18 @@ _EMERGENCIES = (
 
 
 def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
-    """Nodes with their COB-IDs and PDOs, and the object dictionary that all have."""
-    eds, nodes = setup.eds, setup.nodes(escs).nodes
+    """Return tables of the nodes' COB-IDs and TPDOs, and of their object dictionary."""
+    eds = setup.eds
+    nodes = setup.nodes(escs).nodes
     named = [(_title(node, esc), node) for node, esc in zip(nodes, escs, strict=True)]
     ids = [
         {"node": name, "cob_id": cob_id, "use": use}
         for name, node in named
         for cob_id, use in sorted({use.cob_id: use.what for use in uses(node)}.items())
     ]
-    writes = any(settings.read_only for settings in setup.settings)
-    refused = "Nothing can be written over the bus: canopen.read_only is true." if writes else ""
+    refused = ""
+    if any(settings.read_only for settings in setup.settings):
+        refused = "Nothing can be written over the bus: canopen.read_only is true."
     text = [f"{PurePath(eds.name).name}. {refused}"]
     meanings = meanings_of(escs)
     return [
@@ -46,30 +51,40 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
 
 
 def _title(node: Node, esc: EscSettings) -> str:
-    return f"{esc.name}, {'waits for LSS' if node.node_id == UNCONFIGURED else node.node_id}"
+    state = "waits for LSS" if node.node_id == UNCONFIGURED else str(node.node_id)
+    return f"{esc.name}, {state}"
 
 
 def _pdos(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
-    """Enabled transmit PDOs. ``mapped``: from the lowest bit up."""
+    """Yield a row for each enabled transmit PDO. Mapped objects are listed from the lowest bit."""
     for name, node in nodes:
+        if node.node_id == UNCONFIGURED:
+            continue
         for tpdo in node.tpdos:
-            if tpdo.valid and node.node_id != UNCONFIGURED:
-                entries = [variable.entry for variable in tpdo.mapped]
-                yield {
-                    "node": name,
-                    "TPDO": tpdo.number + 1,
-                    "cob_id": tpdo.cob_id,
-                    "type": tpdo.type,
-                    "inhibit_ms": number(Fraction(tpdo.inhibit_ns, MS)),
-                    "event_ms": number(Fraction(tpdo.event_ns, MS)),
-                    "mapped": [f"{entry.place} {entry.name}" for entry in entries],
-                }
+            if not tpdo.valid:
+                continue
+            entries = [variable.entry for variable in tpdo.mapped]
+            yield {
+                "node": name,
+                "TPDO": tpdo.number + 1,
+                "cob_id": tpdo.cob_id,
+                "type": tpdo.type,
+                "inhibit_ms": number(Fraction(tpdo.inhibit_ns, MS)),
+                "event_ms": number(Fraction(tpdo.event_ns, MS)),
+                "mapped": [f"{entry.place} {entry.name}" for entry in entries],
+            }
 
 
 def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
-    """An entry. Value in ``unit``: raw * ``step``. ``node_id``: the node-ID is added to the default; a live value has none."""
+    """Return the row of an entry.
+
+    The value in ``unit`` is raw * ``step``. ``node_id`` is true if the node-ID is added to the
+    default. An entry that shows a value of the ESC or the gateway has no default.
+    """
     bound = BINDINGS.get((entry.index, entry.sub))
-    default = entry.default.decode("latin-1") if isinstance(entry.default, bytes) else entry.default
+    default: object = entry.default
+    if isinstance(default, bytes):
+        default = default.decode("latin-1")
     name = eds.object_names[entry.index]
     return {
         "object": entry.place,
@@ -92,17 +107,21 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
 
 
 def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
-    """Emergencies of the ESCs' bits that the EDS enables, and of the gateway's faults."""
+    """Return the table of emergencies: bits that the EDS enables, and faults of the gateway."""
     mask = 0 if eds is None else Dictionary(eds).number(*_MASK)
     rows: list[Row] = []
     for protocol in protocols_of(escs):
         bits = protocol.errors.get("operating_errors", ())
-        codes, named = BitCodes(bits), {int(bit): bit for bit in bits}
-        for bit in (bit for bit in range(32 if bits else 0) if mask >> bit & 1):
-            found = named.get(bit)
+        if not bits:
+            continue
+        codes = BitCodes(bits)
+        named = {int(bit): bit for bit in bits}
+        for bit in range(32):
+            if not mask >> bit & 1:
+                continue
             about = (f"bit{bit}", "a bit that has no name yet", "Ask the maker of the ESC.")
-            if found is not None:
-                about = (found.text, found.meaning, found.remedy)
+            if bit in named:
+                about = (named[bit].text, named[bit].meaning, named[bit].remedy)
             rows.append(_emergency(codes.code(bit), str(bit), None, about))
     for fault in GatewayError:
         code, detail = fault.value
@@ -114,6 +133,17 @@ def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
 
 
 def _emergency(code: int, byte3: str, byte4: int | None, about: tuple[str, str, str]) -> Row:
-    """``register``: the bits of 1001h that it sets; ``byte4`` None: not fixed."""
-    row: Row = {"code": code, "register": register_of(code) if code else 0, "byte3": byte3}
-    return {**row, "byte4": byte4, "name": about[0], "meaning": about[1], "remedy": about[2]}
+    """Return the row of an emergency. ``about`` is its name, meaning and remedy.
+
+    ``register`` has the bits of 1001h that it sets. ``byte4`` is None if it is not fixed.
+    """
+    name, meaning, remedy = about
+    return {
+        "code": code,
+        "register": register_of(code) if code else 0,
+        "byte3": byte3,
+        "byte4": byte4,
+        "name": name,
+        "meaning": meaning,
+        "remedy": remedy,
+    }

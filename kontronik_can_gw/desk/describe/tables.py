@@ -1,13 +1,13 @@
 """Makes the tables of ``describe`` and of docs/reference.
 
-Each row is read from DBC, EDS, layout or definitions; only the meanings of the states of link, CAN controller and gateway are defined here.
-
-Ids, indices and bit numbers are integers, times in ms. A physical value is raw * factor + offset.
+Rows are made from DBC, EDS, layout and definitions. Only the meanings of the states of link, CAN
+controller and gateway are defined here. Ids, indices and bit numbers are integers, times are in ms.
+A physical value is raw * factor + offset.
 """
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from fractions import Fraction
 from pathlib import PurePath
 from typing import Any, NamedTuple
@@ -40,48 +40,57 @@ _SEND_TYPES = {SendType.CYCLIC: "cyclic", SendType.EVENT: "event", SendType.ON_C
 
 
 def configuration() -> list[Table]:
-    """The keys of the TOML configuration."""
+    """Return a table for each table of the TOML configuration."""
+    found = []
+    for name, table in TABLES.items():
+        title = f"[[{name}]]" if name == "esc" else f"[{name}]"
+        found.append(Table(title, [table.__doc__ or ""], _keys(table)))
+    return found
+
+
+def _keys(table: Any) -> list[Row]:
     return [
-        Table(f"[[{name}]]" if name == "esc" else f"[{name}]", [kind.__doc__ or ""], _keys(kind))
-        for name, kind in TABLES.items()
+        {
+            "key": key.name,
+            "range": key.metadata["kind"].span,
+            "default": _default(key),
+            "meaning": key.metadata["doc"],
+        }
+        for key in fields(table)
     ]
 
 
-def _keys(kind: Any) -> list[Row]:
-    rows = []
-    for f in fields(kind):
-        default = f.default if f.default_factory is MISSING else None
-        if isinstance(default, bool | Fraction):
-            default = str(default).lower()
-        shown = "required" if default is MISSING else None if default == () else default
-        rows.append(
-            {"key": f.name, "range": f.metadata["kind"].span, "default": shown}
-            | {"meaning": f.metadata["doc"]}
-        )
-    return rows
+def _default(key: Field[Any]) -> object:
+    """Return the default as the table shows it. None if it is empty."""
+    if key.default_factory is not MISSING or key.default == ():
+        return None
+    if key.default is MISSING:
+        return "required"
+    if isinstance(key.default, bool | Fraction):
+        return str(key.default).lower()
+    default: object = key.default
+    return default
 
 
 # --- DBC
 
 
 def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
-    """Messages that the gateway sends, and their signals."""
+    """Return tables of the messages that the gateway sends, and of their signals."""
     copies = bus.copies()
-    plans = [(plan, copies[plan.name]) for plan in bus.layout.messages]
     comment = next((each.comment for each in bus.database.buses if each.comment), "")
     file = f"{PurePath(bus.layout.file).name}, messages of {bus.layout.node}."
-    signals = [
-        {"message": plan.name, **_signal(plan, signal, of_file[signal.name], escs)}
-        for plan, copy in plans
-        for of_file in [{sent: signal for signal, sent in copy.signals()}]
-        for signal in plan.signals
-    ]
+    messages: list[Row] = []
+    signals: list[Row] = []
+    for plan in bus.layout.messages:
+        copy = copies[plan.name]
+        messages.append(_message(plan, copy.message))
+        signal_of_file = {name: signal for signal, name in copy.signals()}
+        for signal in plan.signals:
+            row = _signal(plan, signal, signal_of_file[signal.name], escs)
+            signals.append({"message": plan.name, **row})
     return [
-        Table(
-            "Messages",
-            [file, _line(comment)],
-            [_message(plan, copy.message) for plan, copy in plans],
-        ),
+        Table("Messages", [file, _line(comment)], messages),
         Table("Signals", [_SIGNALS], signals, by="message"),
     ]
 
@@ -90,7 +99,7 @@ _SIGNALS = "start counts as in DBC files; not available and error are raw values
 
 
 def _message(plan: MessagePlan, message: Any) -> Row:
-    """A message. None: no cycle, or no minimum distance between two frames (``delay_ms``)."""
+    """Return the row of a message. Without cycle or minimum time, these cells are None."""
     return {
         "name": plan.name,
         "id": plan.can_id,
@@ -107,29 +116,27 @@ def _message(plan: MessagePlan, message: Any) -> Row:
 def _signal(
     message: MessagePlan, plan: SignalPlan, signal: Any, escs: Sequence[EscSettings]
 ) -> Row:
-    """A signal. ``min`` and ``max`` are those of the DBC, else of what can be sent; ``shows``: the value, or the role of the bits."""
-    flag = plan.length == 1 and not plan.signed and plan.factor == 1 and plan.offset == 0
-    codes: tuple[int | None, int | None] = plan.not_available, plan.error
-    if plan.role is not Role.SOURCE or (flag and plan.numbers is None):
-        codes = (None, None)
+    """Return the row of a signal.
+
+    ``min`` and ``max`` are the DBC's, or else the limits of the values that can be sent. ``shows``
+    is the name of the value, or the role of the bits.
+    """
+    is_flag = plan.length == 1 and not plan.signed and plan.factor == 1 and plan.offset == 0
+    not_available: int | None = plan.not_available
+    error: int | None = plan.error
+    if plan.role is not Role.SOURCE or (is_flag and plan.numbers is None):
+        not_available = None
+        error = None
     limits = plan.limits if plan.is_float else (plan.low, plan.high)
     low, high = sorted(float(raw * plan.factor + plan.offset) for raw in limits)
-    kind = "float" if plan.is_float else "signed" if plan.signed else "unsigned"
     choices = {int(value): str(word) for value, word in (signal.choices or {}).items()}
-    lost = list(plan.notes)
-    if is_mute(plan) and (found := reporter(message, plan)) is not None:
-        lost.append(f"{found.name} reports the loss")
-    if plan.unbound:
-        lost.append(f"bound to nothing: always {held(plan)}")
-    elif plan.role is Role.CONSTANT:
-        lost.append(f"always raw {plan.constant}")
-    notes = [f"{note[:1].upper()}{note[1:]}." for note in lost]
-    several = plan.esc is not None and len(escs) > 1
+    codes = (not_available, error)
+    has_esc = plan.esc is not None and len(escs) > 1
     return {
         "signal": plan.name,
         "start": signal.start,
         "bits": plan.length,
-        "type": "flag" if flag else kind,
+        "type": "flag" if is_flag else _number_type(plan),
         "big_endian": signal.byte_order == "big_endian",
         "page": plan.page,
         "factor": number(plan.factor),
@@ -137,22 +144,44 @@ def _signal(
         "min": _finite(low if signal.minimum is None else signal.minimum),
         "max": _finite(high if signal.maximum is None else signal.maximum),
         "unit": plan.unit,
-        "not_available": codes[0],
-        "error": codes[1],
+        "not_available": not_available,
+        "error": error,
         "shows": plan.role.value if plan.source is None else plan.source.name,
-        "esc": escs[plan.esc or 0].name if several else None,
-        "meaning": " ".join(filter(None, [_line(signal.comment), *notes])),
+        "esc": escs[plan.esc or 0].name if has_esc else None,
+        "meaning": " ".join(filter(None, [_line(signal.comment), *_notes(message, plan)])),
         "names": {value: choices[value] for value in sorted(choices) if value not in codes},
     }
 
 
+def _number_type(plan: SignalPlan) -> str:
+    if plan.is_float:
+        return "float"
+    return "signed" if plan.signed else "unsigned"
+
+
+def _notes(message: MessagePlan, plan: SignalPlan) -> list[str]:
+    """Return sentences about lost range, the loss of telemetry, and constants."""
+    notes = list(plan.notes)
+    if is_mute(plan):
+        found = reporter(message, plan)
+        if found is not None:
+            notes.append(f"{found.name} reports the loss")
+    if plan.unbound:
+        notes.append(f"bound to nothing: always {held(plan)}")
+    elif plan.role is Role.CONSTANT:
+        notes.append(f"always raw {plan.constant}")
+    return [f"{note[:1].upper()}{note[1:]}." for note in notes]
+
+
 def held(signal: SignalPlan) -> str:
-    """The physical value of a constant, or its text in the value table."""
+    """Return the physical value of a constant with its unit, or its text in the value table."""
     raw: float = signal.constant
     if signal.is_float:
         raw = float_of(signal.constant, signal.length)
-    elif text := signal.texts.get(signal.constant):
-        return text
+    else:
+        text = signal.texts.get(signal.constant)
+        if text:
+            return text
     return f"{raw * float(signal.factor) + float(signal.offset):.10g} {signal.unit}".rstrip()
 
 
@@ -164,7 +193,7 @@ def _finite(value: float) -> float | None:
 
 
 class Text(NamedTuple):
-    """Meaning of a state, and remedy."""
+    """Meaning and remedy of a state."""
 
     meaning: str
     remedy: str = "Nothing to do."
@@ -205,23 +234,26 @@ GATEWAY_STATES: Mapping[GatewayState, Text] = {
 
 
 def values(escs: Sequence[EscSettings]) -> list[Table]:
-    """Every value that a signal or object can show; errors, states and devices."""
+    """Return tables of every value that a signal or object can show, of errors, states, devices."""
     meanings = meanings_of(escs)
     sources = [binding.source for binding in BINDINGS.values()]
-    others = {source.name: source for source in sources if source.name not in VALUES}
-    rows = [
-        {
+    only_objects = {source.name: source for source in sources if source.name not in VALUES}
+    rows = []
+    for name, value in {**VALUES, **only_objects}.items():
+        available = _AVAILABLE[value.group]
+        if value.optional:
+            available += ", where supplied"
+        row = {
             "name": name,
             "unit": value.unit,
-            "available": _AVAILABLE[value.group] + (", where supplied" if value.optional else ""),
+            "available": available,
             "counter": value.rolls,
             "objects": [place(*key) for key, each in BINDINGS.items() if each.source.name == name],
-            "only_objects": name in others,
+            "only_objects": name in only_objects,
             "meaning": meanings.get(name, name.replace("_", " ").capitalize()),
-            "names": {int(key): word for key, word in value.names.items()},
+            "names": {int(number): text for number, text in value.names.items()},
         }
-        for name, value in {**VALUES, **others}.items()
-    ]
+        rows.append(row)
     protocols = protocols_of(escs)
     operating = [(n, state.text, state) for p in protocols for n, state in p.states.items()]
     return [
@@ -242,7 +274,7 @@ _VALUES = "What a signal of a DBC of your own can be bound to, by its name or un
 
 
 def place(index: int, sub: int) -> str:
-    """An object as it is written."""
+    """Return index and sub-index of an object as text, for example "2001h:01"."""
     return f"{index:04X}h:{sub:02X}"
 
 
@@ -266,7 +298,7 @@ def _about(of: Text | State | ErrorBit) -> Row:
 
 
 def _device(protocol: EscProtocol, device: int) -> Row:
-    """A kind of ESC; ``peak_current_of`` None: not known of what."""
+    """Return the row of a device. ``peak_current_of`` is None if it is unknown."""
     live = [field for field in protocol.fields if not field.is_info]
     return {
         "value": device,
@@ -277,27 +309,34 @@ def _device(protocol: EscProtocol, device: int) -> Row:
 
 
 def protocols_of(escs: Sequence[EscSettings]) -> list[EscProtocol]:
+    """Return the protocols of these ESCs, each once."""
     return list(dict.fromkeys(protocol_named(esc.protocol) for esc in escs))
 
 
 def meanings_of(escs: Sequence[EscSettings]) -> dict[str, str]:
-    """Meaning of each value: of a flag that of the bit, else the comment of the shipped signal bound to it."""
-    shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    found = {
-        plan.source.name: _line(
-            shown.database.get_message_by_name(m.name).get_signal_by_name(plan.name).comment
-        )
-        for m in shown.layout.messages
-        for plan in m.signals
-        if plan.source is not None
-    }
-    return found | {bit.text: bit.meaning for p in protocols_of(escs) for bit in p.bits.values()}
+    """Return the meaning of each value by name.
+
+    For a flag it is the meaning of its bit. For other values it is the comment of the signal of the
+    shipped DBC that is bound to it.
+    """
+    shipped_dbc = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    found = {}
+    for plan in shipped_dbc.layout.messages:
+        message = shipped_dbc.database.get_message_by_name(plan.name)
+        for signal in plan.signals:
+            if signal.source is not None:
+                comment = message.get_signal_by_name(signal.name).comment
+                found[signal.source.name] = _line(comment)
+    for protocol in protocols_of(escs):
+        found |= {bit.text: bit.meaning for bit in protocol.bits.values()}
+    return found
 
 
 def number(value: Fraction) -> int | float:
-    """A number as JSON has it."""
+    """Return a whole number as int, another one as float."""
     return value.numerator if value.denominator == 1 else float(value)
 
 
 def _line(comment: object) -> str:
+    """Return a DBC comment in one line."""
     return " ".join(str(comment or "").split())
