@@ -1,6 +1,7 @@
-"""An ESC, or the gateway itself, as its frames show it on the bus. Pure.
+"""The values of an ESC, or of the gateway itself, as CAN frames show them. No I/O, no clock.
 
-Values are addressed by the names of values.py, not of signals, so any DBC works. A value that is not available is None, never an old one.
+Values have the names of values.py, not of signals, so that any DBC works. A value that is not
+available is None, never an old value.
 """
 
 import math
@@ -17,11 +18,12 @@ from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import Value
 
 _WORDS = {"operating_errors": Group.LIVE, "selftest_errors": Group.INFO}
+"""The error words, and the group in which each is available."""
 _SEVERITIES = list(Severity)
 
 
 class Flag(NamedTuple):
-    """An alarm that is no bit with a name, shown as one."""
+    """An alarm that is not an ErrorBit but has the same attributes."""
 
     text: str
     severity: Severity
@@ -35,55 +37,68 @@ Alarm = ErrorBit | Flag
 
 
 def alarms_of(flags: Iterable[Alarm]) -> list[Alarm]:
-    """What to show, errors first: no normal bits, and no summary of bits that are shown anyway."""
+    """Return the alarms to show, errors first.
+
+    Normal bits are left out, and summaries of other alarms in the result.
+    """
     found = [flag for flag in flags if not flag.is_normal]
-    shown = {flag.severity for flag in found if not flag.is_summary}
-    found = [flag for flag in found if not flag.is_summary or flag.severity not in shown]
+    explained = {flag.severity for flag in found if not flag.is_summary}
+    found = [flag for flag in found if not flag.is_summary or flag.severity not in explained]
     return sorted(found, key=lambda flag: _SEVERITIES.index(flag.severity))
 
 
 class Member:
-    """The gateway (``settings`` and ``index`` None) or an ESC. ``columns``: of each of its values in the layout, the first."""
+    """An ESC, or the gateway, for which ``settings`` and ``index`` are None."""
 
     def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
-        self.view, self.index = view, index
+        self.view = view
+        self.index = index
         self.name = "" if settings is None else settings.name
         self.protocol = protocol_named(None if settings is None else settings.protocol)
         self.columns: dict[str, int] = {}
+        """Index of the first column in the layout of each value by name."""
         for at, column in enumerate(view.reader.columns):
             if column.esc == index:
                 self.columns.setdefault(column.source, at)
         self.no_flags = {n: at for n, at in self.columns.items() if n not in self.protocol.bits}
-        """The columns of all that is no flag."""
+        """The columns of the values that are not flags."""
         self.of_group = {
             group: [at for name, at in self.no_flags.items() if VALUES[name].group is group]
             for group in Group
         }
-        """Those of each group."""
+        """The columns in ``no_flags`` of each group."""
         self._bits = {
             word: {bit: self.columns.get(bit.text) for bit in self.protocol.errors.get(word, ())}
             for word in _WORDS
         }
-        """The bits of each error word, and the columns of those that are signals of their own."""
+        """Bits of each error word, with the column of a bit that has a signal, or None."""
         self.factors: dict[str, tuple[float, float]] = {}
-        """Factor and offset of the values whose signal has another unit than their source."""
+        """Factor and offset of values whose signal has another unit than their source."""
         for name, at in self.columns.items():
             unit = VALUES[name].unit
-            factor, offset = units.conversion(view.reader.columns[at].unit or unit, unit) or (1, 0)
-            if (factor, offset) != (1, 0):
+            conversion = units.conversion(view.reader.columns[at].unit or unit, unit)
+            if conversion is None:
+                continue
+            factor, offset = conversion
+            if factor != 1 or offset != 0:
                 self.factors[name] = float(factor), float(offset)
 
     def has(self, *sources: str) -> bool:
-        """True where the DBC has a signal for one of the sources."""
+        """Return True if the DBC has a signal for one of the sources."""
         return any(source in self.columns for source in sources)
 
     def value(self, source: str) -> Value:
-        """The value in the unit of its source."""
+        """Return the value in the unit of its source."""
         at = self.columns.get(source)
-        return None if at is None else self.converted(source, self.view.values[at])
+        if at is None:
+            return None
+        return self.converted(source, self.view.values[at])
 
     def converted(self, source: str, value: Value) -> Value:
-        """A signal's value in the unit of its source; infinity, which a float signal can hold, is none."""
+        """Return a signal's value in the unit of its source.
+
+        None for infinity, which a float signal can contain.
+        """
         if value is None or isinstance(value, str):
             return value
         if source in self.factors:
@@ -92,79 +107,97 @@ class Member:
         return value if math.isfinite(value) else None
 
     def number(self, source: str) -> float | None:
-        """The value of a numeric source."""
+        """Return the value of a numeric source."""
         value = self.value(source)
         return value if isinstance(value, (int, float)) else None
 
     def text(self, source: str) -> str | None:
-        """The text of a value of an enumeration, of which a signal has the number or the text."""
+        """Return the text of an enumeration, even if the signal has no texts."""
         value = self.value(source)
         if isinstance(value, (int, float)):
             return VALUES[source].names.get(int(value), str(int(value)))
         return value
 
     def is_known(self, group: Group) -> bool:
-        """True while any value of a group is available, flags apart."""
+        """Return True while a value of a group is available. Flags do not count."""
         return any(self.view.values[at] is not None for at in self.of_group[group])
 
     @property
     def link(self) -> str | None:
-        """The link state's name; None where it is not available.
+        """The link state's name. None if it is not available.
 
-        It has its own message, which comes up to a cycle later than values after a gap: while there are values the link is good.
+        The link state has its own message. After a gap that message is up to a cycle later than
+        live values, so the link counts as good while live values are available.
         """
         link = self.text("link_state")
-        is_old = link is not None and normalize(link) not in ("ok", "degraded")
-        return (
-            VALUES["link_state"].names[LinkState.OK]
-            if is_old and self.is_known(Group.LIVE)
-            else link
-        )
+        is_bad = link is not None and normalize(link) not in ("ok", "degraded")
+        if is_bad and self.is_known(Group.LIVE):
+            return VALUES["link_state"].names[LinkState.OK]
+        return link
 
     @property
     def state(self) -> str | None:
         """The operating state's name, or its number if it has none."""
         value = self._first("operating_state", "operating_state_raw")
-        if isinstance(value, (int, float)):
-            number, states = int(value), self.protocol.states
-            return states[number].text if number in states else f"state {number}"
-        return value
+        if not isinstance(value, (int, float)):
+            return value
+        number = int(value)
+        state = self.protocol.states.get(number)
+        return f"state {number}" if state is None else state.text
 
     @property
     def device(self) -> str | None:
         """The device's name as its maker writes it, or its number if it has none."""
-        value, names = self._first("device", "device_raw"), self.protocol.devices
+        value = self._first("device", "device_raw")
+        names = self.protocol.devices
         if isinstance(value, (int, float)):
             return names.get(int(value), f"device {int(value)}")
         if value is None:
             return None
-        alike = (name for name in names.values() if normalize(name) == normalize(value))
-        return next(alike, value)
+        for name in names.values():
+            if normalize(name) == normalize(value):
+                return name
+        return value
 
     @property
     def firmware(self) -> str | None:
-        """Main and sub version, as "1.14"."""
-        main, sub = self.number("firmware_main"), self.number("firmware_sub")
-        return None if main is None or sub is None else f"{main:.0f}.{sub:.0f}"
+        """Main and sub version, for example "1.14". None if one of them is not available."""
+        main = self.number("firmware_main")
+        sub = self.number("firmware_sub")
+        if main is None or sub is None:
+            return None
+        return f"{main:.0f}.{sub:.0f}"
 
     def flags(self, word: str) -> list[Alarm] | None:
-        """The set bits of an error word; None while it is not available.
+        """Return the bits that are set in an error word. None while it is not available.
 
-        Flags have no code for "not available": they count while another value of their group is known.
+        The word may have a signal, or each of its bits may have one. A flag has no code
+        for "not available", so the flags are valid while another value of their group is available.
+        If the DBC has no other value of the group, only set bits prove that the flags are valid.
         """
-        group, bits, values = _WORDS[word], self._bits[word], self.view.values
-        has_others, whole = bool(self.of_group[group]), self.number(word)
-        is_set = {bit: values[at] for bit, at in bits.items() if at is not None}
-        if (has_others and not self.is_known(group)) or {whole, *is_set.values()} == {None}:
+        group = _WORDS[word]
+        bits = self._bits[word]
+        whole = self.number(word)
+        flags = {bit: self.view.values[at] for bit, at in bits.items() if at is not None}
+        if whole is None and all(value is None for value in flags.values()):
+            return None
+        has_other_values = bool(self.of_group[group])
+        if has_other_values and not self.is_known(group):
             return None
         number = int(whole or 0)
-        found: list[Alarm] = [bit for bit in bits if number >> bit & 1 or is_set.get(bit) == 1]
-        for bit in range(32) if number else ():
-            if number >> bit & 1 and bit not in bits:
-                meaning = f"bit {bit} of {word}, which has no name"
-                found.append(Flag(f"bit{bit}", Severity.WARNING, meaning))
-        return found if has_others else found or None
+        found: list[Alarm] = [bit for bit in bits if number >> bit & 1 or flags.get(bit) == 1]
+        for position in range(32):
+            if number >> position & 1 and position not in bits:
+                meaning = f"bit {position} of {word}, which has no name"
+                found.append(Flag(f"bit{position}", Severity.WARNING, meaning))
+        if not found and not has_other_values:
+            return None
+        return found
 
     def _first(self, *sources: str) -> Value:
-        """The first value that is available."""
-        return next((value for value in map(self.value, sources) if value is not None), None)
+        """Return the first value that is available."""
+        for source in sources:
+            value = self.value(source)
+            if value is not None:
+                return value
+        return None

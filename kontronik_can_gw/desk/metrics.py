@@ -1,6 +1,7 @@
-"""Metrics for Prometheus from the status file of a gateway; prometheus_client makes the text and serves it.
+"""Serves metrics for Prometheus, made from the status file of a gateway.
 
-What is not available is left out. A gateway that does not run has no metrics: the answer is 503, so Prometheus's own ``up`` is 0.
+prometheus_client renders and serves them. Values that are not available are left out. If the
+gateway does not run, the answer is 503, so that Prometheus's own metric ``up`` is 0.
 """
 
 import re
@@ -28,10 +29,10 @@ from kontronik_can_gw.runtime.snapshot import name_in_words
 
 Document = Mapping[str, Any]
 Sample = tuple[str, float | None, dict[str, object]]
-"""Name without prefix, value, labels. Counters are those whose names end in _total."""
+"""Name without prefix, value, labels. A name that ends in _total is a counter."""
 
 REQUEST_S = 5.0
-"""Maximum silence of a client."""
+"""Longest time that a client may be silent."""
 _LOOPBACK = re.compile(r"(localhost|127(\.[0-9]{1,3}){3}|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 _UNITS: Mapping[str, tuple[str, float]] = {
     "V": ("_volts", 1),
@@ -46,15 +47,16 @@ _UNITS: Mapping[str, tuple[str, float]] = {
     "1/min": ("_revolutions_per_second", 1 / 60),
     "": ("", 1),
 }
-"""Unit to base unit and factor."""
+"""For our units: suffix with the base unit, and factor to it."""
 _NAMES = {
-    "cell_count": "cells",  # promtool keeps _count for summaries
+    "cell_count": "cells",  # promtool reserves the ending _count for summaries
     "energy_used": "energy_used_joules_total",
     "motor_run_time": "motor_run_time_seconds_total",
     "bytes": "received_bytes",
     "live": "live_frames",
     "info": "info_frames",
 }
+"""Names of metrics that differ from the name in the document."""
 _GATEWAY = {
     "uptime_seconds": "process.uptime_s",
     "process_resident_memory_bytes": "process.rss_bytes",
@@ -77,7 +79,7 @@ _ESC = {
     "esc_losses_total": "losses",
     "esc_data_age_seconds": "data_age_ms",
 }
-"""Metrics that are a value of the document as it stands, and its place."""
+"""Metrics with a value of the document, and its place."""
 _WORDS = {
     "operating_error": ("errors", "warnings", "statuses"),
     "selftest_error": ("selftest_errors",),
@@ -86,21 +88,29 @@ _WORDS = {
 
 
 def families(document: Document, age_s: float) -> list[Metric]:
-    """All metrics of a document. KeyError, TypeError or ValueError where it is damaged."""
+    """Return all metrics of a document of this age.
+
+    Raises KeyError, TypeError or ValueError if the document is damaged.
+    """
     found: dict[str, Metric] = {}
     for name, value, labels in _samples(document, age_s):
-        if value is not None:
+        if value is None:
+            continue
+        full_name = f"kontronik_{name}"
+        if full_name not in found:
             kind = "counter" if name.endswith("_total") else "gauge"
-            full, text = f"kontronik_{name}", name.replace("_", " ")
-            metric = found.setdefault(full, Metric(full.removesuffix("_total"), text, kind))
-            # a file's name may be no UTF-8
-            plain = {k: str(v).encode("utf-8", "replace").decode() for k, v in labels.items()}
-            metric.add_sample(full, plain, float(value))
+            text = name.replace("_", " ")
+            found[full_name] = Metric(full_name.removesuffix("_total"), text, kind)
+        # A file's name is not always valid UTF-8.
+        texts = {k: str(v).encode("utf-8", "replace").decode() for k, v in labels.items()}
+        found[full_name].add_sample(full_name, texts, float(value))
     return list(found.values())
 
 
 def _samples(document: Document, age_s: float) -> Iterator[Sample]:
-    can, store, recording = document["can"], document["store"], document["recording"]
+    can = document["can"]
+    store = document["store"]
+    recording = document["recording"]
     yield "build_info", 1, {"version": document["version"]}
     yield "snapshot_age_seconds", round(age_s, 3), {}
     for name, place in _GATEWAY.items():
@@ -118,54 +128,67 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
         yield from _esc(esc, document["units"])
     for node in document["nodes"]:
         if node["node_id"] is not None:
-            of = {"esc": node["esc"], "node_id": node["node_id"]}
-            yield from _states("canopen_node_state", NmtState, node["state"], of)
-            yield "canopen_pdos_sent_total", node["pdos_sent"], of
+            labels = {"esc": node["esc"], "node_id": node["node_id"]}
+            yield from _states("canopen_node_state", NmtState, node["state"], labels)
+            yield "canopen_pdos_sent_total", node["pdos_sent"], labels
 
 
 def _esc(esc: Document, units: Mapping[str, str]) -> Iterator[Sample]:
-    """What is known of an ESC's line, what it measures in base units, and its error bits."""
-    of = {"esc": esc["name"]}
+    """Yield the samples of an ESC: its line, its values in base units, its error bits."""
+    labels: dict[str, object] = {"esc": esc["name"]}
     for name, place in _ESC.items():
         value = _at(esc, place)
-        yield name, value / 1000 if value is not None and place.endswith("_ms") else value, of
-    yield from _states("esc_link_state", LinkState, esc["link"], of)
+        if value is not None and place.endswith("_ms"):
+            value /= 1000
+        yield name, value, labels
+    yield from _states("esc_link_state", LinkState, esc["link"], labels)
     about = {key: esc[key] or "" for key in ("layout", "device", "variant", "firmware")}
-    yield "esc_info", None if esc["device"] is None else 1, of | about
+    yield "esc_info", None if esc["device"] is None else 1, labels | about
     for kind, count in esc["port"]["line_errors"].items():
-        yield "esc_port_line_errors_total", count, of | {"kind": kind}
+        yield "esc_port_line_errors_total", count, labels | {"kind": kind}
     for key, count in esc["counters"].items():
-        yield f"esc_{_NAMES.get(key, key)}_total", count, of
+        yield f"esc_{_NAMES.get(key, key)}_total", count, labels
     for name, unit in units.items():
-        value, (base, factor) = esc["values"][name], _UNITS[unit]
-        yield _NAMES.get(name, f"{name}{base}"), None if value is None else value * factor, of
+        value = esc["values"][name]
+        base, factor = _UNITS[unit]
+        if value is not None:
+            value *= factor
+        yield _NAMES.get(name, f"{name}{base}"), value, labels
+    yield from _error_bits(esc, labels)
+
+
+def _error_bits(esc: Document, labels: dict[str, object]) -> Iterator[Sample]:
+    """Yield a sample for each bit of the error words that are available: 1 if it is set."""
     bits = protocol_named(esc.get("protocol")).errors
     for word, keys in _WORDS.items():
         lists = [esc[key] for key in keys]
-        if None in lists:  # the word is not known
+        if None in lists:  # the word is not available
             continue
-        is_set = {name for names in lists for name in names}
-        known = {bit.text: bit.severity.value for bit in bits.get(f"{word}s", ())}
-        for error, severity in (dict.fromkeys(sorted(is_set), "error") | known).items():
-            yield word, error in is_set, of | {"error": error, "severity": severity}
+        set_names = {name for names in lists for name in names}
+        severities = dict.fromkeys(sorted(set_names), "error")
+        severities |= {bit.text: bit.severity.value for bit in bits.get(f"{word}s", ())}
+        for error, severity in severities.items():
+            yield word, error in set_names, labels | {"error": error, "severity": severity}
 
 
-def _states(name: str, kind: type[Any], now: str, labels: dict[str, object]) -> Iterator[Sample]:
-    """A sample for each state that there is: 1 for the present one."""
-    for state in kind:
+def _states(name: str, states: type[Any], now: str, labels: dict[str, object]) -> Iterator[Sample]:
+    """Yield a sample for each possible state: 1 for the present state, else 0."""
+    for state in states:
         word = name_in_words(state.name)
         yield name, word == now, labels | {"state": word}
 
 
 def _at(part: Any, place: str) -> float | None:
-    """The value at a place such as "port.open"; None below a part that is null."""
+    """Return the value at a place such as "port.open". None if it or a part above it is null."""
     for key in place.split("."):
-        part = None if part is None else part[key]
+        if part is None:
+            return None
+        part = part[key]
     return part  # type: ignore[no-any-return]
 
 
 class _Collected:
-    """Metrics that are made already, as prometheus_client takes them."""
+    """Finished metrics in the form that prometheus_client accepts."""
 
     def __init__(self, metrics: list[Metric]) -> None:
         self.collect = lambda: metrics
@@ -175,25 +198,26 @@ class _Handler(WSGIRequestHandler):
     timeout = REQUEST_S
 
     def log_message(self, *_: object) -> None:
-        """A log of all requests is of no use."""
+        """Log nothing: a log of all requests is useless."""
 
 
 def server_of(
     look: Callable[[int], Seen], host: str, port: int, clock: Callable[[], int] = time.monotonic_ns
 ) -> WSGIServer:
-    """Return a server of the metrics of one gateway at an address. RunError if it cannot listen there.
+    """Return a server of the metrics of one gateway. Raises RunError if it cannot listen.
 
     ``look`` returns the gateway's status at a monotonic time.
     """
 
     def answer(environ: dict[str, Any], start: Callable[..., Any]) -> Iterable[bytes]:
-        status, seen = "503 Service Unavailable", look(clock())
+        status = "503 Service Unavailable"
+        seen = look(clock())
         file = seen.file
         reason = seen.sentence
         if seen.document is not None:
             reason = f"{file}: {reason}"
         if _LOOPBACK.fullmatch(environ.get("HTTP_HOST", "")) is None:
-            # no web page may have a browser ask (DNS rebinding)
+            # Refuses requests that a web page causes a browser to send (DNS rebinding).
             status = "403 Forbidden"
             reason = "only for this machine: the Host header must name localhost"
         elif seen.document is not None and seen.code != NOT_RUNNING:
@@ -201,8 +225,8 @@ def server_of(
                 found = families(seen.document, max(0, seen.age_s or 0))
                 registry = CollectorRegistry(auto_describe=False)
                 registry.register(_Collected(found))
-                made: Iterable[bytes] = make_wsgi_app(registry)(environ, start)
-                return made
+                body: Iterable[bytes] = make_wsgi_app(registry)(environ, start)
+                return body
             except MALFORMED:
                 reason = f"{file}: {FOREIGN}"
         start(status, [("Content-Type", "text/plain; charset=utf-8")])
@@ -212,7 +236,7 @@ def server_of(
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
         def handle_error(self, *_: object) -> None:
-            """A client that ends early or never comes to an end is no fault of ours."""
+            """Log nothing: clients that disconnect early or never finish are not our fault."""
 
     try:
         return make_server(host, port, answer, Server, _Handler)

@@ -1,7 +1,7 @@
 """Simulated ESCs on pseudo terminals, which a gateway opens like serial ports.
 
-A real ESC must never be sent a byte (its line has an ASCII mode in which parameters can be written). So everything that a gateway sends,
-echo included, is counted in ``PtyEsc.received``.
+Nothing may ever be sent to a real ESC, because its line has an ASCII mode in which parameters can
+be written. ``PtyEsc.received`` therefore counts every byte that a gateway sends, including echo.
 """
 
 import os
@@ -17,20 +17,23 @@ from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
 
 
 class PtyEsc:
-    """The ESC's end of a pseudo terminal, as context manager. The gateway opens ``path``, or the symbolic link ``link``.
+    """The ESC's end of a pseudo terminal, as context manager.
 
-    An existing symbolic link at ``link`` is replaced, anything else there is a RunError. The link is removed at close.
+    The gateway opens ``path``, or the symbolic link ``link``. An existing symbolic link at ``link``
+    is replaced. Anything else there raises RunError. ``close`` removes the link.
     """
 
     def __init__(self, link: str | Path | None = None) -> None:
         self.dropped_bytes = 0
-        """Bytes dropped because nobody read and the terminal was full."""
+        """Bytes dropped because the terminal was full."""
         self.received = 0
-        """Number of bytes from the gateway. Must stay 0."""
+        """Number of bytes from the gateway. It must stay 0."""
         self.first_received = b""
-        """The first of them, at most 64."""
-        self.frames = self.intact = 0
-        """Frames of ``run``, and those that were accepted and are not damaged."""
+        """The first 64 bytes from the gateway."""
+        self.frames = 0
+        """Frames that ``run`` has sent."""
+        self.intact = 0
+        """Frames that ``run`` has sent completely and without flipped bits."""
         self._link: Path | None = None
         try:
             self._master, self._slave = os.openpty()
@@ -53,18 +56,24 @@ class PtyEsc:
         return self._master
 
     def write(self, data: bytes) -> bool:
-        """Send without blocking. If not everything was accepted, count the rest in ``dropped_bytes`` and return False."""
+        """Send without blocking. Returns True if the terminal accepted all bytes.
+
+        The other bytes are dropped and counted in ``dropped_bytes``.
+        """
         if not data:
             return True
         try:
-            taken = os.write(self._master, data)
+            accepted = os.write(self._master, data)
         except BlockingIOError:
-            taken = 0
-        self.dropped_bytes += len(data) - taken
-        return taken == len(data)
+            accepted = 0
+        self.dropped_bytes += len(data) - accepted
+        return accepted == len(data)
 
     def check(self) -> int:
-        """Read what the gateway sent since the last call; return the number of bytes. Other than 0 is a fault of the gateway."""
+        """Read the bytes that the gateway has sent since the last call, and return their number.
+
+        A number other than 0 is a fault of the gateway.
+        """
         total = 0
         try:
             while data := os.read(self._master, 4096):
@@ -76,15 +85,19 @@ class PtyEsc:
         return total
 
     def close(self) -> None:
-        """Remove the link if it is still ours, close the terminal. May be called again."""
+        """Remove the link if it still leads to this terminal, and close the terminal.
+
+        Another call does nothing.
+        """
         if self._link is not None:
             if self._link.is_symlink() and str(self._link.readlink()) == self.path:
                 self._link.unlink(missing_ok=True)
             self._link = None
         if self._master >= 0:
-            os.close(self._slave)  # open until now, so that readers can come and go
+            os.close(self._slave)  # held open so that a gateway can open and close it repeatedly
             os.close(self._master)
-            self._master = self._slave = -1
+            self._master = -1
+            self._slave = -1
 
     def __enter__(self) -> Self:
         return self
@@ -100,10 +113,11 @@ def run(
     stop: Callable[[], bool] = lambda: False,
     on_received: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Send in real time, all ESCs in this one thread.
+    """Send the frames of all ESCs in real time, in this thread.
 
-    Ends when all frames due before ``seconds`` were sent, or ``stop()`` is true (asked at least each 100 ms). The simulations'
-    time 0 is the call's time. ``on_received`` gets the index of an ESC that received bytes.
+    Ends when all frames that are due before ``seconds`` were sent, or when ``stop()`` returns True.
+    It is called at least every 100 ms. The time of this call is time 0 of the simulations.
+    ``on_received`` gets the index of an ESC that received bytes.
     """
     origin_ns = time.monotonic_ns()
     end_ns = None if seconds is None else round(seconds * SECOND_NS)
@@ -112,36 +126,50 @@ def run(
     for index, (_, terminal) in enumerate(escs):
         index_of[terminal.fileno()] = index
         poller.register(terminal, select.POLLIN)
-    over = False
-    while not over:
+    is_last_round = False
+    while not is_last_round:
         now_ns = time.monotonic_ns() - origin_ns
         if end_ns is not None and now_ns >= end_ns:
-            now_ns, over = end_ns - 1, True
-        over = over or stop()
+            now_ns = end_ns - 1
+            is_last_round = True
+        elif stop():
+            is_last_round = True
         for esc, terminal in escs:
-            for sent in esc.frames_until(now_ns) if esc.next_ns <= now_ns else ():
-                terminal.frames += 1
-                terminal.intact += terminal.write(sent.wire) and sent.intact
-        # At least 1 ms, so that frames due within it share a round: 64 ESCs cost no more rounds than 10.
+            if esc.next_ns <= now_ns:
+                _send_frames(esc, terminal, now_ns)
+        # Waits for at least 1 ms, so that frames due within it share a round. 64 ESCs then need no
+        # more rounds than 10.
         due_ns = min((esc.next_ns for esc, _ in escs), default=now_ns + SECOND_NS)
         until_ns = min(due_ns, now_ns + SECOND_NS // 10)
         if end_ns is not None:
             until_ns = min(until_ns, end_ns)
-        for fd, _ in poller.poll(0 if over else max((until_ns - now_ns) / 1e6, 1)):
-            if escs[index_of[fd]][1].check():
-                on_received(index_of[fd])
+        wait_ms = 0.0 if is_last_round else max((until_ns - now_ns) / 1e6, 1)
+        for fd, _ in poller.poll(wait_ms):
+            index = index_of[fd]
+            if escs[index][1].check():
+                on_received(index)
+
+
+def _send_frames(esc: SimulatedEsc, terminal: PtyEsc, now_ns: int) -> None:
+    for sent in esc.frames_until(now_ns):
+        terminal.frames += 1
+        is_accepted = terminal.write(sent.wire)
+        if is_accepted and sent.intact:
+            terminal.intact += 1
 
 
 def _set_raw(fd: int) -> None:
-    """No echo, no line discipline, no translation: bytes pass as on a UART."""
+    """Switch off echo, line discipline and translation, so that bytes pass as on a UART."""
     mode = termios.tcgetattr(fd)
-    mode[0] = mode[1] = mode[3] = 0
+    mode[0] = 0
+    mode[1] = 0
+    mode[3] = 0
     mode[2] |= termios.CS8 | termios.CREAD | termios.CLOCAL
     termios.tcsetattr(fd, termios.TCSANOW, mode)
 
 
 def _make_link(link: Path, target: str) -> Path:
-    """Put the symbolic link in place; return it as an absolute path, since the directory may change later."""
+    """Create the symbolic link and return its absolute path, because the directory may change."""
     link = link.absolute()
     try:
         if not link.is_symlink() and link.exists():
