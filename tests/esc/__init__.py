@@ -1,1 +1,4 @@
-"""Tests of kontronik_can_gw.esc.kontronik. sheet.py and reference.py are the second opinion: they import nothing of the package."""
+"""Tests of kontronik_can_gw.esc.
+
+sheet.py and reference.py are independent of the tested package: they import nothing of it.
+"""

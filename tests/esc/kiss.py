@@ -1,7 +1,8 @@
-"""KISS/BLHeli32 serial telemetry: the recipe for another ESC protocol. 115200 8N1, ten bytes big-endian without a header.
+"""KISS/BLHeli32 serial telemetry, as an example of another ESC protocol.
 
-Temperature (°C), voltage (10 mV), current (10 mA), charge (mAh), electrical speed (100 1/min), CRC-8 of polynomial 07h. Frames are apart
-by a gap: what follows an error is dropped up to the next one.
+115200 8N1. A frame is ten bytes, big-endian, without a header: temperature (°C), voltage (10 mV),
+current (10 mA), charge (mAh), electrical speed (100 1/min), CRC-8 with polynomial 07h. A gap
+separates two frames. After an error, bytes are dropped up to the next gap.
 """
 
 import struct
@@ -16,7 +17,7 @@ FORM = FrameForm(length=10)
 
 @dataclass
 class Counters:
-    """What a stream held."""
+    """Counts of one stream."""
 
     bytes: int = 0
     live: int = 0
@@ -34,7 +35,9 @@ class Counters:
         old = since or Counters()
         if self.live > old.live:
             return None
-        return "bytes but no frame" if self.bytes > old.bytes else "no bytes"
+        if self.bytes > old.bytes:
+            return "bytes but no frame"
+        return "no bytes"
 
 
 class Kiss:
@@ -44,7 +47,9 @@ class Kiss:
         self.counters = Counters()
         self._pending = b""
         self._lost = False
+        """True from an error to the next gap."""
         self._last_ns = 0
+        """Time of the last read."""
 
     @property
     def pending(self) -> int:
@@ -65,8 +70,8 @@ class Kiss:
                 break
             temperature, voltage, current, charge, speed = _BODY.unpack(frame[:9])
             offset = self.counters.bytes - len(self._pending)
-            data_of_it = (temperature, voltage, current, charge, speed * 100)
-            found.append(Reading(FORM, offset, data_of_it))
+            data = (temperature, voltage, current, charge, speed * 100)
+            found.append(Reading(FORM, offset, data))
             self._pending = self._pending[FORM.length :]
             self.counters.live += 1
         if self._lost:
@@ -84,17 +89,19 @@ class Kiss:
 
 
 def crc8(data: bytes) -> int:
-    """0 over a frame with its CRC."""
+    """Return the CRC. Over a frame with its CRC it is 0."""
     crc = 0
     for byte in data:
         crc ^= byte
         for _ in range(8):
-            crc = crc << 1 ^ (0x107 if crc & 0x80 else 0)
+            crc <<= 1
+            if crc & 0x100:
+                crc ^= 0x107
     return crc
 
 
 def frame(temperature: int, voltage: int, current: int, charge: int, speed: int) -> bytes:
-    """The bytes of a frame, of its raw values."""
+    """Return the bytes of a frame with these raw values."""
     body = _BODY.pack(temperature, voltage, current, charge, speed)
     return body + bytes((crc8(body),))
 

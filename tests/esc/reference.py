@@ -1,7 +1,9 @@
-"""Brute force: what a stream holds, written from the definition. Imports nothing of the package under test.
+"""Finds the frames of a stream by brute force, from their definition.
 
-A frame is a header of four bytes, one of four forms (length, covered bytes, place of the CRC) and a CRC-32 that fits. The frames
-of a stream are found earliest start first, without overlap; of two forms that fit at one start, the shorter.
+Imports nothing of the tested package. A frame has a header of four bytes, one of four forms
+(length, covered bytes, position of the CRC) and a matching CRC-32. The search begins at the
+earliest position and finds no overlapping frames. If two forms match at one position, the shorter
+one counts.
 """
 
 import random
@@ -15,15 +17,19 @@ LONGEST_OF = {b"KODL": 40, b"KODI": 44}
 SHORTEST_FIRST = sorted(FORM_ROWS, key=lambda row: row.length)
 LONG_RUNS = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
 COUNTED = [
-    *("live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds"),
-    *(
-        "dropped_noise",
-        "dropped_crc",
-        "dropped_unknown_kind",
-        "dropped_incomplete",
-        "long_run_bytes",
-        "longer_crcs",
-    ),
+    "live_v4",
+    "live_legacy",
+    "info_v4",
+    "info_legacy",
+    "headers",
+    "crc_errors",
+    "unknown_kinds",
+    "dropped_noise",
+    "dropped_crc",
+    "dropped_unknown_kind",
+    "dropped_incomplete",
+    "long_run_bytes",
+    "longer_crcs",
 ]
 
 
@@ -37,7 +43,7 @@ _TABLE = [_shift_eight(byte) for byte in range(256)]
 
 
 def crc32(data: bytes) -> int:
-    """CRC-32 (ISO-HDLC): reflected polynomial 0xEDB88320, start and final XOR all ones; by a table."""
+    """Return the CRC-32 (ISO-HDLC): polynomial EDB88320h, start and final XOR all ones."""
     remainder = 0xFFFFFFFF
     for byte in data:
         remainder = remainder >> 8 ^ _TABLE[(remainder ^ byte) & 0xFF]
@@ -49,7 +55,7 @@ def form_row(kind: str, layout: str) -> FormRow:
 
 
 def seal(row: FormRow, middle: bytes) -> bytes:
-    """A valid frame: header, the bytes between header and CRC, CRC."""
+    """Return a valid frame with these bytes between header and CRC."""
     assert len(middle) == row.crc_at - 4
     frame = row.header + middle
     return frame + crc32(frame[: row.covered]).to_bytes(4, "little")
@@ -81,7 +87,7 @@ class Found(NamedTuple):
 
 
 def frames_of(stream: bytes) -> list[Found]:
-    """All frames of the whole stream, by trying every form at every byte."""
+    """Return all frames of the whole stream, by trying every form at every byte."""
     found = []
     at = 0
     while at < len(stream):
@@ -95,7 +101,7 @@ def frames_of(stream: bytes) -> list[Found]:
 
 
 def _gaps(size: int, found: Iterable[Found]) -> list[tuple[int, int]]:
-    """Begin and end of the stretches before, between and behind the frames."""
+    """Return begin and end of the stretches before, between and after the frames."""
     gaps = []
     begin = 0
     for frame in found:
@@ -105,7 +111,10 @@ def _gaps(size: int, found: Iterable[Found]) -> list[tuple[int, int]]:
 
 
 def counters_of(stream: bytes) -> dict[str, int]:
-    """What must have been counted once the whole stream was fed and flushed, classified byte by byte."""
+    """Return the counters that are correct after the whole stream was fed and flushed.
+
+    Every byte is classified by itself.
+    """
     found = frames_of(stream)
     size = len(stream)
     count = dict.fromkeys(COUNTED, 0)
@@ -113,7 +122,10 @@ def counters_of(stream: bytes) -> dict[str, int]:
         count[f"{frame.kind}_{frame.layout}"] += 1
         count["headers"] += 1
     for begin, end in _gaps(size, found):
-        failed_until = incomplete_until = unknown_until = cut_until = begin
+        failed_until = begin
+        incomplete_until = begin
+        unknown_until = begin
+        cut_until = begin
         for at in range(begin, end):
             header = stream[at : at + 4]
             if header in LONGEST_OF:
@@ -152,12 +164,14 @@ def counters_of(stream: bytes) -> dict[str, int]:
 
 
 def certain_at(stream: bytes) -> list[int]:
-    """For each frame of the stream: how many bytes must have come before no continuation could take it away.
+    """Return, for each frame, the number of received bytes after which the frame is certain.
 
-    That is its last byte; or later where a header in front of it, outside any frame, still waits for its longest form.
+    That is the frame's end. It is later if a header before it, outside any frame, could still
+    become a frame of its longest form.
     """
     moments = []
-    moment = begin = 0
+    moment = 0
+    begin = 0
     for frame in frames_of(stream):
         moment = max(moment, frame.end)
         for at in range(begin, frame.offset):
@@ -169,12 +183,14 @@ def certain_at(stream: bytes) -> list[int]:
 
 @cache
 def ambiguous(kind: str) -> bytes:
-    """A synthetic V4 frame that also fits as a legacy frame: 2 (live) or 3 (info) bytes shorter.
+    """Return a synthetic V4 frame whose beginning is a valid legacy frame.
 
-    The legacy CRC lies where V4 has its reserved bytes and the beginning of its CRC. The legacy CRC does not cover the last fields,
-    so they are free to be tried until the V4 CRC begins with the end of the legacy CRC.
+    The legacy frame is 2 (live) or 3 (info) bytes shorter. Its CRC is in the place of V4's reserved
+    bytes and the beginning of V4's CRC, and does not cover the last fields. So the search tries
+    values of the last fields until the V4 CRC begins with the end of the legacy CRC.
     """
-    legacy, v4 = form_row(kind, "legacy"), form_row(kind, "v4")
+    legacy = form_row(kind, "legacy")
+    v4 = form_row(kind, "v4")
     for number in range(1 << 24):
         digits = number.to_bytes(4, "little")
         free = legacy.crc_at - legacy.covered

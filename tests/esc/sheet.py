@@ -1,22 +1,26 @@
-"""The sheet typed a second time, by hand, from the description of the wire: imports nothing of the package under test.
+"""The sheet, typed a second time by hand from the description of the wire.
 
-Offsets are written out here (the package derives its own), so a row that slips in either list shows as a difference.
+Imports nothing of the tested package. Offsets are written out here, while the package derives them.
+So a misplaced row in either list is found.
 """
 
 from typing import NamedTuple
 
 
 class Field(NamedTuple):
-    """One field: offset of its first byte, struct code, unit, how many steps make one unit."""
+    """One field of a frame."""
 
     name: str
     offset: int
+    """Position of its first byte."""
     code: str
+    """struct code of its type."""
     unit: str
     steps: int = 1
+    """Number of steps that make one unit."""
 
 
-# Grouped by four bytes of the wire from here on; the sheet states BEC current and voltage in mA and mV, published are A and V.
+# The sheet has BEC current and voltage in mA and mV. They are published in A and V.
 LIVE_FIELDS = [
     Field("electrical_speed", 4, "I", "1/min"),
     Field("battery_voltage", 8, "H", "V", 100),
@@ -68,7 +72,7 @@ TYPE_RANGES = {
     "I": (0, 4_294_967_295),
 }
 
-# Stated ranges in steps; where the description of the wire states none, none is listed.
+# Ranges in steps, as far as the description of the wire states them.
 STATED_RANGES = {
     "battery_voltage": (0, 10_000),
     "battery_current": (-10_000, 10_000),
@@ -133,11 +137,13 @@ OPERATING_STATES = {
 
 
 class Bit(NamedTuple):
-    """One bit of an error word: the words its name or meaning must hold, and its class where the sheet tells it."""
+    """One bit of an error word."""
 
     number: int
     words: tuple[str, ...]
+    """Words that its name or meaning must contain."""
     severity: str | None = None
+    """Its class, or None if the sheet does not state it."""
 
 
 OPERATING_BITS = [
@@ -189,7 +195,8 @@ SELFTEST_BITS = [
     Bit(18, ("eeprom", "version"), "error"),
 ]
 
-# Recorded from a JIVE PRO 120, firmware 1.14, idle: the legacy layout. All other vectors in these tests are synthetic.
+# Recorded from an idle JIVE PRO 120, firmware 1.14, in the legacy layout. All other frames in these
+# tests are synthetic.
 RECORDED_LIVE = bytes.fromhex(
     "4B4F444C 00000000 8A09 0000 0000 0000 0000 0000 581F E903 00 00 1D 20 00000200 0C 00 39234C14"
 )

@@ -1,4 +1,4 @@
-"""Byte streams for the deframer's tests, all synthetic but the two recorded frames."""
+"""Byte streams for the deframer's tests. All are synthetic except the two recorded frames."""
 
 import random
 
@@ -15,17 +15,17 @@ FRAGMENTS = [*b"K KO KOD KODL KODI KODK KODX KOKO KKOD KODKODI \0 \xff".split(b"
 
 
 def form_of(row: FormRow) -> Form:
-    """The package's form of a row of the sheet."""
+    """Return the package's form for a row of the sheet."""
     return next(form for form in FORMS if form.name == f"{row.kind}_{row.layout}")
 
 
 def decoded(form: Form, buffer: bytes, at: int = 0) -> Data:
-    """The fields of a frame of this form; nothing is checked."""
+    """Return the fields of a frame of this form without any check."""
     return form.data_type(*form.unpack_fields(buffer, at))
 
 
 def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: random.Random) -> bytes:
-    """Two frames, both valid, the second beginning ``shared`` bytes before the first ends: the first takes the bytes."""
+    """Return two valid frames that share the last ``shared`` bytes of the first."""
     start = first.length - shared
     assert 4 <= start <= first.covered - 4
     body = bytearray(source.randbytes(first.crc_at - 4))
@@ -38,7 +38,7 @@ def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: rando
 
 
 def random_piece(source: random.Random) -> bytes:
-    """A piece of a stream: frames most of the time, else what hurts a deframer."""
+    """Return a piece of a stream: often a valid frame, else bytes that are hard for a deframer."""
     row = source.choice(FORM_ROWS)
     frame = random_frame(row, source)
     choice = source.randrange(16)
@@ -51,9 +51,9 @@ def random_piece(source: random.Random) -> bytes:
     if choice == 8:  # truncated, at either end
         cut = source.randrange(1, len(frame))
         return source.choice([frame[:cut], frame[cut:]])
-    if choice == 9:  # a whole frame behind a header that is none
+    if choice == 9:  # a whole frame after a false header
         return source.choice([b"KODL", b"KODI"]) + source.randbytes(source.randrange(0, 40)) + frame
-    if choice == 10:  # headers behind headers
+    if choice == 10:  # headers in a row
         return source.choice([b"KODL", b"KODI", b"KOD"]) * source.randrange(1, 12)
     if choice == 11:
         shared = source.randrange(8, 32)
@@ -73,7 +73,7 @@ def random_piece(source: random.Random) -> bytes:
 
 
 def damaged(stream: bytes, source: random.Random, times: int) -> bytes:
-    """The stream with bytes lost, bits flipped and bytes inserted."""
+    """Return the stream with some bytes lost, bits flipped and bytes inserted."""
     result = bytearray(stream)
     for _ in range(times):
         at = source.randrange(len(result) + 1)
@@ -93,7 +93,7 @@ def random_stream(source: random.Random, pieces: int) -> bytes:
 
 
 def random_chunks(stream: bytes, source: random.Random) -> list[bytes]:
-    """The stream cut anywhere, empty chunks included."""
+    """Cut the stream at random positions. Some chunks are empty."""
     largest = source.choice([2, 5, 40, 100])
     chunks = []
     at = 0

@@ -1,4 +1,7 @@
-"""A field put in front of all others of a live frame moves no other value, object or frame: nobody knows a field by its position."""
+"""A new first field of the live frame changes no other value, object or frame.
+
+So no code depends on the position of a field.
+"""
 
 import json
 import shutil
@@ -66,7 +69,7 @@ def _shown(folder: Path) -> dict[str, Any]:
     return found
 
 
-def test_a_field_in_front_of_all_others_moves_nothing(tmp_path: Path) -> None:
+def test_new_first_field_changes_no_other_value(tmp_path: Path) -> None:
     copy = shutil.copytree(
         PACKAGE, tmp_path / "kontronik_can_gw", ignore=shutil.ignore_patterns("__pycache__")
     )

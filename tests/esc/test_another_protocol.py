@@ -1,4 +1,7 @@
-"""The recipe for another ESC protocol: kiss.py goes through the whole gateway, beside a KONTRONIK ESC, without a change of the package."""
+"""Another ESC protocol works in the whole gateway without a change of the package.
+
+An ESC with the protocol of kiss.py runs beside a KONTRONIK ESC.
+"""
 
 import re
 import termios
@@ -50,7 +53,10 @@ def kiss_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Flight:
-    """Both ESCs send ten times a second; the newest message of each id as cantools reads it, None for a code."""
+    """Two ESCs that send ten times a second, and the newest message of each id.
+
+    cantools decodes the messages. A code is None.
+    """
 
     def __init__(self, **options: Any) -> None:
         config = parse(MIXED, "mixed.toml")
@@ -77,7 +83,7 @@ FRAME = frame(20, 2_400, 1_234, 55, 210)
 OLD = encode(LiveData(electrical_speed=9_000, battery_voltage=2_500, battery_current=-5), Layout.V4)
 
 
-def test_both_protocols_reach_the_bus_side_by_side() -> None:
+def test_values_of_both_protocols_are_sent() -> None:
     flight = Flight()
     for _ in range(361):
         flight.send(OLD, frame(-7, 2_400, 1_234, 55, 210))
@@ -86,7 +92,7 @@ def test_both_protocols_reach_the_bus_side_by_side() -> None:
         "KissBatteryCurrent": pytest.approx(12.3),  # 12.34 A in steps of 0.1 A
         "KissMotorSpeed": 3_000,
         "KissPowerStageTemperature": -7,
-        "KissBecVoltage": pytest.approx(655.35),  # FFFFh: KISS has none
+        "KissBecVoltage": pytest.approx(655.35),  # FFFFh: KISS does not have it
         "KissEnergyUsed": pytest.approx(2.96),  # 24 V by 12.34 A for 36 s
         "KissLinkState": LinkState.OK,
         "KissLayout": 1,
@@ -102,7 +108,7 @@ def test_both_protocols_reach_the_bus_side_by_side() -> None:
     assert flight.seen["OldBatteryVoltage"] == 25.0
 
 
-def test_who_reads_the_bus_takes_no_flag_that_the_protocol_has_not_for_a_good_sign() -> None:
+def test_missing_flag_is_not_read_as_no_error() -> None:
     loaded = Flight().loaded
     reader = SignalReader(loaded.layout)
     column = [(each.source, each.esc) for each in reader.columns].index(("undervoltage", 1))
@@ -118,13 +124,13 @@ def test_who_reads_the_bus_takes_no_flag_that_the_protocol_has_not_for_a_good_si
     ("missing", "value"),
     [("electrical_speed", "motor_run_time"), ("battery_current", "energy_used")],
 )
-def test_what_cannot_be_known_without_a_field_is_not_supplied(missing: str, value: str) -> None:
+def test_value_whose_field_is_missing_is_not_supplied(missing: str, value: str) -> None:
     fields = tuple(field for field in KISS.fields if field.name != missing)
     assert values_of(KISS)[value].supplied
     assert not values_of(replace(KISS, fields=fields))[value].supplied
 
 
-def test_node_status_and_tables_show_what_there_is_and_nothing_else() -> None:
+def test_node_status_and_tables_show_only_supplied_values() -> None:
     flight = Flight(canopen=shipped_canopen([1, 2]))
     flight.send(OLD, FRAME)
     gateway, esc = flight.gateway, flight.gateway.escs[1]
@@ -135,7 +141,7 @@ def test_node_status_and_tables_show_what_there_is_and_nothing_else() -> None:
         assert read is not None
         with suppress(SdoAbort):
             found[sub] = read(flight.now)
-    # 1/min, 10 mV, 0.1 A, mAh, °C by the sub-indices of the EDS; nothing else
+    # Sub-indices of the EDS for speed, voltage, current, charge and temperature, and no others.
     assert there(found) == {1: 21_000, 2: 2_400, 3: 123, 6: 55, 12: 20}
 
     port = PortFacts("kiss", "/dev/zero", open=True)
@@ -162,12 +168,12 @@ def test_node_status_and_tables_show_what_there_is_and_nothing_else() -> None:
 
 
 def there(values: dict[Any, Any]) -> dict[Any, Any]:
-    """Those that are available."""
+    """Return the values that are available."""
     return {name: value for name, value in values.items() if value is not None}
 
 
 def test_a_capture_names_the_protocol() -> None:
-    """One of 0.5.0 has none: the first."""
+    """A capture of version 0.5.0 does not name one, so the first protocol is used."""
     escs = tuple(parse(MIXED, "mixed.toml").escs)
     setup = CaptureSetup(escs, ("a", "b"), None, DbcConfig(), False, None)
     assert CaptureSetup.of(setup.header()).escs == escs
@@ -176,7 +182,7 @@ def test_a_capture_names_the_protocol() -> None:
     assert [esc.protocol for esc in CaptureSetup.of(old).escs] == ["kontronik", "kontronik"]
 
 
-def test_its_line_is_set_without_parity() -> None:
+def test_line_is_set_without_parity() -> None:
     with PtyEsc() as esc, closing(SerialPort(esc.path, KISS)) as port:
         flags, speed = (termios.tcgetattr(port.fileno())[at] for at in (2, 4))
     assert not flags & termios.PARENB
@@ -190,6 +196,6 @@ def test_its_line_is_set_without_parity() -> None:
         ({"protocol": "kis"}, "'kis' is not known here. Did you mean kiss?"),
     ],
 )
-def test_what_its_configuration_cannot_have_is_refused(wrong: dict[str, str], said: str) -> None:
+def test_invalid_key_of_its_configuration_is_refused(wrong: dict[str, str], said: str) -> None:
     with pytest.raises(UserError, match=re.escape(said)):
         parse(MIXED | {"esc": [{"port": "/dev/null"} | wrong]}, "mixed.toml")

@@ -1,6 +1,6 @@
-"""Fields, names and frame bytes, held against sheet.py, which was typed a second time from the description of the wire.
+"""Fields, names and frame bytes, compared with sheet.py.
 
-Recorded frames are named so; every other vector here is synthetic.
+Frames whose names contain RECORDED are recorded. All others are synthetic.
 """
 
 import struct
@@ -49,7 +49,7 @@ RECORDED: dict[bytes, LiveData | InfoData] = {
         max_bec_temperature=33,
     ),
 }
-"""In steps of the sheet."""
+"""The recorded values in steps of the sheet."""
 form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
 
 
@@ -59,14 +59,14 @@ def fields_of(row: FormRow) -> tuple[DataType, list[Field]]:
 
 
 def frame_in(wire: bytes) -> Frame:
-    """The frame of bytes that are one."""
+    """Return the only frame in these bytes."""
     (found,) = Deframer().feed(wire)
     assert (found.offset, found.form.length) == (0, len(wire))
     return found
 
 
 @pytest.mark.parametrize(("wire", "data"), RECORDED.items(), ids=["live", "info"])
-def test_a_recorded_frame_is_that_of_the_stated_values(wire: bytes, data: Data) -> None:
+def test_recorded_frame_has_the_stated_values(wire: bytes, data: Data) -> None:
     found = frame_in(wire)
     assert (found.layout, type(found.data), found.data) == (Layout.LEGACY, type(data), data)
     assert encode(data, Layout.LEGACY) == wire
@@ -75,7 +75,7 @@ def test_a_recorded_frame_is_that_of_the_stated_values(wire: bytes, data: Data) 
 @form_rows
 @settings(deadline=None, max_examples=75, database=None)
 @given(choice=st.data())
-def test_all_raw_values_survive_the_round_trip_whatever_is_in_the_reserved_bytes(
+def test_raw_values_survive_a_round_trip_with_any_reserved_bytes(
     row: FormRow, choice: st.DataObject
 ) -> None:
     data_type, fields = fields_of(row)
@@ -102,7 +102,7 @@ def test_all_raw_values_survive_the_round_trip_whatever_is_in_the_reserved_bytes
         (sheet.RECORDED_INFO, 36, "max_bec_temperature"),
     ],
 )
-def test_an_altered_unprotected_byte_is_delivered_and_suspect_where_no_such_state_exists(
+def test_changed_unprotected_byte_is_delivered_and_maybe_suspect(
     frame: bytes, offset: int, name: str
 ) -> None:
     for value in range(256):
@@ -113,7 +113,7 @@ def test_an_altered_unprotected_byte_is_delivered_and_suspect_where_no_such_stat
     assert not frame_in(encode(LiveData(operating_state=255), Layout.V4)).is_suspect
 
 
-def test_a_field_has_the_type_unit_and_step_of_the_sheet_and_the_device_that_lacks_it() -> None:
+def test_field_has_type_unit_step_and_absence_of_the_sheet() -> None:
     for data, fields in ((LiveData, sheet.LIVE_FIELDS), (InfoData, sheet.INFO_FIELDS)):
         for (name, row), field in zip(rows(data).items(), fields, strict=True):
             found = name, row.wire, row.unit, row.per_unit, row.type_range
@@ -122,7 +122,7 @@ def test_a_field_has_the_type_unit_and_step_of_the_sheet_and_the_device_that_lac
             assert row.not_on == ({3} if name in ("bec_current", "max_bec_current") else set())
 
 
-def test_devices_and_states_have_the_names_of_the_sheet_and_no_others() -> None:
+def test_devices_and_states_have_exactly_the_names_of_the_sheet() -> None:
     assert KONTRONIK.devices == sheet.DEVICES
     states = {number: state.text for number, state in KONTRONIK.states.items()}
     assert states == sheet.OPERATING_STATES
@@ -134,7 +134,7 @@ def test_devices_and_states_have_the_names_of_the_sheet_and_no_others() -> None:
     [(OperatingError, sheet.OPERATING_BITS), (SelfTestError, sheet.SELFTEST_BITS)],
     ids=["operating", "selftest"],
 )
-def test_an_error_bit_means_what_the_sheet_says(names: type[ErrorBit], bits: list[Bit]) -> None:
+def test_error_bit_has_the_meaning_of_the_sheet(names: type[ErrorBit], bits: list[Bit]) -> None:
     for found, bit in zip(names, bits, strict=True):
         text = f"{found.text} {found.meaning}".lower()
         assert found.value == bit.number
@@ -146,7 +146,7 @@ def test_an_error_bit_means_what_the_sheet_says(names: type[ErrorBit], bits: lis
     assert bit_texts(0xFFFFFFFF, names) == texts
 
 
-def test_parts_of_a_word_are_read_by_name_and_written_together() -> None:
+def test_parts_of_a_word_are_read_separately_and_written_together() -> None:
     for device, variant, word in ((3, 120, 0x0C78), (63, 1023, 0xFFFF), (1, 0, 0x400)):
         assert device_and_variant(device, variant) == word
         info = InfoData(device_and_variant=word)

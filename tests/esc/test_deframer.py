@@ -1,4 +1,7 @@
-"""Byte stream -> frames, held against the brute force of reference.py. Streams are synthetic but for the two recorded frames."""
+"""The deframer, compared with the brute-force search of reference.py.
+
+The streams are synthetic except for the two recorded frames.
+"""
 
 import random
 import zlib
@@ -22,7 +25,7 @@ PROPERTY = settings(deadline=None, max_examples=100, database=None)
 
 
 def run(chunks: Iterable[bytes]) -> tuple[list[Frame], Deframer]:
-    """Feed and flush; after every step each byte must be accounted for and no more than 43 be held."""
+    """Feed and flush. After every step each byte must be counted, and at most 43 may be held."""
     deframer = Deframer()
     frames: list[Frame] = []
     fed = 0
@@ -49,7 +52,7 @@ def one_by_one(stream: bytes) -> list[bytes]:
 
 
 def described(frames: Iterable[Frame], stream: bytes) -> list[tuple[int, str, str, bytes]]:
-    """Frames in the words of the reference; the data encoded again must give the fields' bytes."""
+    """Describe frames as the reference does. Their encoded data must give the fields' bytes."""
     result = []
     for frame in frames:
         raw = stream[frame.offset : frame.offset + frame.form.length]
@@ -71,7 +74,7 @@ def state_of(deframer: Deframer) -> tuple[dict[str, int], int]:
     return deframer.counters.as_dict(), deframer.pending
 
 
-# ---- against the brute force
+# ---- comparison with the brute-force search
 
 
 @settings(PROPERTY, max_examples=300)
@@ -80,19 +83,17 @@ def state_of(deframer: Deframer) -> tuple[dict[str, int], int]:
 @example(b"KOD", 0)
 @example(b"KODKODL", 0)
 @example(b"KODI" + bytes(37), 0)
-def test_a_stream_gives_what_brute_force_finds_however_it_is_cut(stream: bytes, seed: int) -> None:
+def test_frames_are_those_of_the_brute_force_search_in_any_chunks(stream: bytes, seed: int) -> None:
     check_against_the_reference(stream, random.Random(seed))
 
 
-# ---- when a frame comes out
+# ---- the moment at which a frame is returned
 
 
 @PROPERTY
 @given(stream=streams, seed=seeds)
-def test_frames_counters_and_pending_at_every_moment_depend_on_the_bytes_alone(
-    stream: bytes, seed: int
-) -> None:
-    """A frame comes out as soon as no continuation could take it away, and what was counted by then is the same however it was cut."""
+def test_state_at_every_moment_depends_on_the_bytes_alone(stream: bytes, seed: int) -> None:
+    """A frame is returned as soon as it is certain. Counters do not depend on the chunks."""
     by_byte = Deframer()
     states, moments = [state_of(by_byte)], []
     for number, byte in enumerate(one_by_one(stream), start=1):
@@ -108,12 +109,12 @@ def test_frames_counters_and_pending_at_every_moment_depend_on_the_bytes_alone(
         assert state_of(by_chunk) == states[fed]
 
 
-# ---- flush, and what may be fed
+# ---- flush, and types of input
 
 
 @PROPERTY
 @given(parts=st.lists(streams, max_size=4), seed=seeds)
-def test_after_a_flush_the_deframer_is_as_new(parts: list[bytes], seed: int) -> None:
+def test_deframer_is_like_new_after_flush(parts: list[bytes], seed: int) -> None:
     source = random.Random(seed)
     deframer = Deframer()
     total = dict.fromkeys(Counters().as_dict(), 0)
@@ -144,7 +145,7 @@ HOSTILE = (
 
 @pytest.mark.parametrize("unit", HOSTILE, ids=lambda unit: repr(unit[:9]))
 @pytest.mark.parametrize("cut", [one_by_one, lambda stream: [stream]], ids=["bytes", "whole"])
-def test_the_work_on_hostile_input_is_linear(
+def test_work_on_hostile_input_is_linear(
     unit: bytes, cut: Callable[[bytes], list[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calculated: list[int] = []
@@ -200,9 +201,7 @@ BEFORE = (
 
 
 @pytest.mark.parametrize(("expected", "received"), DIAGNOSES)
-def test_what_was_received_without_a_frame_since_a_moment_has_a_diagnosis(
-    expected: str, received: list[bytes]
-) -> None:
+def test_bytes_without_a_frame_have_a_diagnosis(expected: str, received: list[bytes]) -> None:
     for before, stream in product(BEFORE, received):
         deframer = Deframer()
         since = deframer.counters.copy()

@@ -1,4 +1,4 @@
-"""The simulated ESC: what it sends is well-formed and plausible, the same for the same seed, and as faulty as asked for."""
+"""The simulated ESC: plausible data, the same bytes for the same seed, the requested faults."""
 
 import itertools
 
@@ -52,9 +52,7 @@ any_options = st.builds(
 
 @given(options=any_options, seed=st.integers())
 @settings(max_examples=60, deadline=None)
-def test_whatever_the_profile_every_frame_decodes_to_what_was_meant(
-    options: EscOptions, seed: int
-) -> None:
+def test_every_frame_of_any_profile_decodes_to_its_data(options: EscOptions, seed: int) -> None:
     frames = SimulatedEsc(options, seed=seed).frames_until(100 * options.period_ns)
     found = received(frames)
     assert [frame.data for frame in found] == [sent.data for sent in frames]
@@ -64,9 +62,7 @@ def test_whatever_the_profile_every_frame_decodes_to_what_was_meant(
 
 @given(cuts=st.lists(st.integers(0, 20 * S), max_size=20), seed=st.integers(0, 5))
 @settings(max_examples=8, deadline=None)
-def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(
-    cuts: list[int], seed: int
-) -> None:
+def test_same_seed_gives_same_bytes_for_any_spacing_of_calls(cuts: list[int], seed: int) -> None:
     options = EscOptions(faults=Faults(flipped_bits=0.001, dropout=Dropout(S, 3 * S)))
     esc = SimulatedEsc(options, seed=seed)
     pieces = [esc.frames_until(cut) for cut in [*sorted(cuts), 20 * S]]
@@ -75,7 +71,7 @@ def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(
 
 
 @pytest.mark.parametrize("device", Device)
-def test_the_flight_is_physically_plausible(device: Device) -> None:
+def test_flight_is_physically_plausible(device: Device) -> None:
     sent = SimulatedEsc(EscOptions(device=device)).frames_until(101 * S)
     flight = [each.data for each in sent if isinstance(each.data, LiveData)]
     assert all(1800 <= live.battery_voltage <= 2580 for live in flight)
@@ -92,14 +88,12 @@ def test_the_flight_is_physically_plausible(device: Device) -> None:
     kind = "battery_current" if device is Device.JIVEPRO else "motor_current"
     held = max(getattr(live, kind) for live in flight)
     assert held <= flight[-1].peak_current <= held * 1.2
-    assert flight[-1].electrical_speed == 0  # the peak is held though the motor stands
+    assert flight[-1].electrical_speed == 0  # the peak is held although the motor is at rest
 
 
 @pytest.mark.parametrize(("layout", "covered"), [(Layout.V4, 36), (Layout.LEGACY, 32)])
-def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(
-    layout: Layout, covered: int
-) -> None:
-    """In the legacy layout, besides, those with flips that its CRC does not cover."""
+def test_receiver_finds_exactly_the_intact_frames(layout: Layout, covered: int) -> None:
+    """In the legacy layout, frames with flipped bits outside the CRC are found as well."""
     options = EscOptions(layout=layout, faults=Faults(flipped_bits=0.001))
     frames = SimulatedEsc(options).frames_until(60 * S)
     intact = [sent.data for sent in frames if sent.intact]
@@ -111,7 +105,7 @@ def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(
     assert all(data in rest for data in intact)  # in order
 
 
-def test_error_bits_are_set_when_asked_and_another_device_powers_up_in_its_own_layout() -> None:
+def test_requested_error_bits_and_swapped_devices_are_sent() -> None:
     errors = (
         ErrorWindow(OperatingError.UNDERVOLTAGE, 5 * S, 2 * S),
         ErrorWindow(OperatingError.BEC_OVERCURRENT, 6 * S),

@@ -1,6 +1,6 @@
-"""EscStream with time handed in: link, freshness, derived values, deadlines. All frames here are synthetic.
+"""EscStream: link, freshness, derived values, deadlines. All frames are synthetic.
 
-Losses, frame rate, and what is forgotten of another device or layout: the golden flights (tests/golden).
+The golden flights (tests/golden) test losses, frame rate, and the change of a device or layout.
 """
 
 import random
@@ -56,20 +56,20 @@ def esc(**known: int) -> EscStream:
 
 
 def read(telemetry: EscStream, data: bytes, now: int, since: int | None = None) -> int:
-    """Bytes that came after ``since``, or just now: the port was empty a moment ago. The events of all frames."""
+    """Pass bytes that arrived after ``since``, by default just now. Return all events."""
     events = telemetry.expire(now)
     return reduce(or_, telemetry.receive_each(data, now, now if since is None else since), events)
 
 
 def alive(now: int = SECOND) -> EscStream:
-    """An ESC whose first live frame was read at ``now``."""
+    """Return an ESC whose first live frame was read at ``now``."""
     telemetry = esc()
     read(telemetry, live(), now)
     return telemetry
 
 
 def stream(telemetry: EscStream, begin: int, seconds: float, extra: bytes = b"") -> int:
-    """Frames each 10 ms, with what the runtime does beside: ``advance`` at each deadline. Returns the last time."""
+    """Pass a frame every 10 ms, and call ``advance`` at each deadline. Return the last time."""
     now = begin
     while now < begin + seconds * SECOND:
         while telemetry.next_deadline() <= now:
@@ -89,7 +89,7 @@ def stream(telemetry: EscStream, begin: int, seconds: float, extra: bytes = b"")
         *((0, 4, LinkState.OK), (0, 5, LinkState.DEGRADED)),  # 9 % and 11 % of the bytes
     ],
 )
-def test_crc_errors_or_dropped_bytes_in_a_second_degrade_the_link_and_a_clean_second_mends_it(
+def test_bad_second_degrades_the_link_and_clean_second_restores_it(
     broken: int, noise: int, state: LinkState
 ) -> None:
     telemetry = alive(SECOND)
@@ -102,8 +102,8 @@ def test_crc_errors_or_dropped_bytes_in_a_second_degrade_the_link_and_a_clean_se
 
 
 @pytest.mark.parametrize("seen", [False, True])
-def test_a_lost_port_is_an_error_until_it_is_open_again(seen: bool) -> None:
-    """And no frame is put together from before and after."""
+def test_lost_port_is_an_error_until_it_is_reopened(seen: bool) -> None:
+    """Bytes from before and after the loss do not form a frame."""
     telemetry = esc()
     if seen:
         read(telemetry, info() + live(), SECOND)
@@ -128,9 +128,7 @@ def test_a_lost_port_is_an_error_until_it_is_open_again(seen: bool) -> None:
 
 
 @pytest.mark.parametrize(("gap", "taken"), [(TIMEOUT, True), (TIMEOUT + 1, False)])
-def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(
-    gap: int, taken: bool
-) -> None:
+def test_frame_with_a_first_byte_older_than_the_time_out_is_dropped(gap: int, taken: bool) -> None:
     telemetry = esc()
     frame = live()
     read(telemetry, NOISE + frame[:1], SECOND)
@@ -141,9 +139,9 @@ def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(
     assert telemetry.live.electrical_speed == 3
 
 
-def test_frames_found_when_old_bytes_are_given_up_are_counted_as_late_and_not_shown() -> None:
+def test_frames_in_old_bytes_are_counted_as_late_and_not_shown() -> None:
     telemetry = esc(timeout_ns=100 * MS)
-    # whole, but the header in front could still be a frame of 44 bytes
+    # The frame is complete, but the header before it could still begin a frame of 44 bytes.
     hidden = b"KODI" + live(5, Layout.LEGACY)
     read(telemetry, hidden, SECOND)
     assert telemetry.live is None
@@ -151,7 +149,7 @@ def test_frames_found_when_old_bytes_are_given_up_are_counted_as_late_and_not_sh
     assert (telemetry.live, telemetry.late_frames) == (None, 1)
 
 
-def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire() -> None:
+def test_bytes_of_one_read_get_their_times_on_the_wire() -> None:
     telemetry = esc()
     read(telemetry, live(1) + live(2) + live(3) + NOISE, SECOND)
     assert telemetry.live is not None
@@ -161,17 +159,18 @@ def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire(
     assert telemetry.energy_mw_ns == 2 * 40 * NS_PER_BYTE * 2400 * 100
 
 
-# --- arrival: what is known of when bytes came
+# --- arrival of bytes
 
 WIRE = 39 * NS_PER_BYTE
-"""From the first byte of a live frame to its last."""
+"""Time from the first byte of a live frame to its last."""
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["interval not known yet", "100 Hz"])
 @pytest.mark.parametrize("noise", [0, 1], ids=["a frame alone", "with another byte"])
 @pytest.mark.parametrize(
     ("waited", "bound", "shown"),
-    # before the read nothing had come; the frame's end came at the earliest; its age as shown where the interval is known
+    # Time since the port was empty, since the earliest end of the frame, and age shown if the
+    # interval is known.
     [
         (0, 0, 0),
         (2 * MS, 0, 0),
@@ -182,7 +181,7 @@ WIRE = 39 * NS_PER_BYTE
         (TIMEOUT + WIRE + 1, None, None),
     ],
 )
-def test_time_outs_count_from_when_bytes_can_have_come_and_ages_do_beyond_an_interval(
+def test_time_outs_and_old_ages_count_from_the_earliest_arrival(
     known: bool, noise: int, waited: int, bound: int | None, shown: int | None
 ) -> None:
     telemetry = esc()
@@ -202,7 +201,7 @@ def test_time_outs_count_from_when_bytes_can_have_come_and_ages_do_beyond_an_int
     assert telemetry.live is None
 
 
-def test_an_info_frame_is_late_by_its_own_time_out() -> None:
+def test_info_frame_is_late_after_its_own_time_out() -> None:
     telemetry = alive()
     length = (len(info()) - 1) * NS_PER_BYTE
     for now, waited in ((30 * SECOND, INFO_TIMEOUT_NS), (60 * SECOND, INFO_TIMEOUT_NS + SECOND)):
@@ -215,7 +214,7 @@ def test_an_info_frame_is_late_by_its_own_time_out() -> None:
 # --- derived values
 
 
-def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight() -> None:
+def test_energy_and_run_time_agree_with_an_independent_integration() -> None:
     telemetry = esc()
     watt_seconds = run_seconds = 0.0
     sent = SimulatedEsc(EscOptions(info_every=0), seed=3).frames_until(60 * SECOND)
@@ -233,7 +232,7 @@ def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight()
     assert 30 < run_seconds < 50
 
 
-def test_energy_is_not_counted_over_a_gap_and_is_kept_over_a_loss() -> None:
+def test_energy_does_not_count_in_a_gap_and_survives_a_loss() -> None:
     telemetry = alive(SECOND)
     read(telemetry, live(), SECOND + 100 * MS)
     kept = telemetry.energy_mw_ns
@@ -253,7 +252,10 @@ GAPS = (0, 1, MS, 10 * MS, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1)
 
 
 def chunks_of(seed: int) -> list[tuple[bytes, int]]:
-    """Bytes with the times of their reads: frames of both layouts, damaged ones, noise, cut anywhere, gaps of all sizes."""
+    """Return chunks of bytes with the times of their reads.
+
+    They contain frames of both layouts, damaged frames and noise, with gaps of all sizes.
+    """
     source = random.Random(seed)
     out = random_stream(source, source.randrange(1, 20))
     cuts = sorted(source.choices(range(len(out) + 1), k=source.randrange(40)))
@@ -265,8 +267,11 @@ def chunks_of(seed: int) -> list[tuple[bytes, int]]:
 
 
 def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[Data]:
-    """By brute force: the live frames of which each byte was read within the time-out before the last one, and that within
-    the time-out before ``now``."""
+    """Return the live frames that may be shown at ``now``, by brute force.
+
+    All bytes of such a frame were read within the time-out before its last byte, and that byte was
+    read within the time-out before ``now``.
+    """
     whole = b"".join(piece for piece, _ in timed)
     read_at = [when for piece, when in timed for _ in piece]
     found = []
@@ -281,9 +286,7 @@ def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[Data]:
 
 @settings(max_examples=75, deadline=None)
 @given(st.integers(0, 2**32), st.booleans())
-def test_what_is_shown_was_received_within_the_time_out_whatever_comes(
-    seed: int, advance: bool
-) -> None:
+def test_shown_data_was_received_within_the_time_out(seed: int, advance: bool) -> None:
     telemetry = esc()
     timed = chunks_of(seed)
     for n, (piece, now) in enumerate(timed):
@@ -304,10 +307,10 @@ def test_what_is_shown_was_received_within_the_time_out_whatever_comes(
 
 @settings(max_examples=75, deadline=None)
 @given(st.integers(0, 2**32))
-def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_deadlines(
+def test_next_deadline_is_never_late_and_nothing_expires_before_it(
     seed: int,
 ) -> None:
-    """An EscStream that is advanced at its deadlines only shows, at any time, what one advanced all the time shows."""
+    """An EscStream advanced only at its deadlines equals one that is advanced all the time."""
     seldom, often = esc(), esc()
     source = random.Random(seed)
 
@@ -329,4 +332,4 @@ def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_dead
         often.advance(between)
         same()
         if between > now:
-            break  # from here on time would run backwards for one of them
+            break  # otherwise time would run backwards for one of them
