@@ -1,7 +1,8 @@
-"""An independent reckoning of what a signal must hold, and a maker of random DBC layouts and random telemetry.
+"""Computes raw values of signals independently, and makes random DBC layouts and telemetry.
 
-Nothing here uses the package's tables of fields, units or positions: they are typed again from the telemetry sheet, here and in
-tests/esc/sheet.py, and bits are counted one by one. The package is used only to make telemetry objects out of encoded frames.
+Nothing here uses the package's tables of fields, units or positions. They are typed again from the
+telemetry sheet, here and in tests/esc/sheet.py, and bits are counted one by one. The package is used
+only to make telemetry objects from encoded frames.
 """
 
 import math
@@ -27,7 +28,7 @@ from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatu
 
 
 def bit_places(start: int, length: int, little: bool) -> list[tuple[int, int]]:
-    """(byte, bit in the byte) of each bit of a signal, the least significant first."""
+    """Return (byte, bit in the byte) of each bit of a signal, the least significant first."""
     if little:
         return [divmod(start + n, 8) for n in range(length)]
     first = start // 8 * 8 + 7 - start % 8  # in the order of transmission
@@ -35,7 +36,7 @@ def bit_places(start: int, length: int, little: bool) -> list[tuple[int, int]]:
 
 
 def put(data: bytearray, raw: int, start: int, length: int, little: bool) -> None:
-    """Write a raw value bit by bit; negative ones in two's complement."""
+    """Write a raw value bit by bit, a negative one as two's complement."""
     for number, (byte, bit) in enumerate(bit_places(start, length, little)):
         if raw % (1 << length) >> number & 1:
             data[byte] |= 1 << bit
@@ -48,14 +49,18 @@ def get(data: bytes, start: int, length: int, little: bool, signed: bool = False
     return raw - (1 << length) if signed and raw >> length - 1 else raw
 
 
-# --- what can be published, typed from the sheet ------------------------------------------------------------------------
+# --- values to publish, typed from the sheet ----------------------------------------------------------------------------
 
 Reader = Callable[[EscTelemetry, GatewayStatus, int], "int | Fraction | None"]
 
 
 @dataclass(frozen=True)
 class Known:
-    """A source as the oracle knows it: unit, how to read it in that unit (None: not available), names of its numbers."""
+    """The oracle's own description of a source.
+
+    It has the unit, a function that reads it in that unit (None: not available), and the names of
+    its numbers.
+    """
 
     unit: str
     read: Reader
@@ -92,7 +97,7 @@ JIVEPRO = 3
 
 
 def _of(part: str, reckon: Callable[[EscTelemetry, Any], "int | Fraction | None"]) -> Reader:
-    """What is reckoned of an ESC's ``live`` or ``info`` data; not available without it."""
+    """Return a function that computes a value from ``live`` or ``info`` data, if it is available."""
 
     def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | Fraction | None:
         data = getattr(esc, part)
@@ -102,7 +107,7 @@ def _of(part: str, reckon: Callable[[EscTelemetry, Any], "int | Fraction | None"
 
 
 def _fields(part: str, fields: Sequence[sheet.Field]) -> dict[str, Known]:
-    """Fields whose number is the value."""
+    """Return the sources of fields whose number is the value."""
     spelled = str.maketrans({"µ": "u", "°": "deg"})
 
     def reader(name: str, steps: int) -> Reader:
@@ -200,15 +205,18 @@ UNITS: dict[str, list[tuple[str, str, str]]] = {
              ("K|Kelvin|degK|Unit_Kelvi", "1", "273.15"), ("F|degF|°F|Fahrenheit", "9/5", "32")],
     "": [("|-|1|count|counts|Cnt|#|Unit_None|number", "1", "0")],
 }  # fmt: skip
-"""By unit of a source spellings of units, factor and shift: value in the other = value * factor + shift."""
+"""For the unit of a source, other units with factor and shift.
+
+The value in the other unit is value * factor + shift.
+"""
 
 
-# --- a signal and what it must hold -------------------------------------------------------------------------------------
+# --- a signal and its correct raw value ---------------------------------------------------------------------------------
 
 
 @dataclass
 class Sig:
-    """A signal as it is written into the DBC. Numbers that stand in the file are decimal texts."""
+    """A signal as it is written into the DBC. Numbers in the file are decimal texts."""
 
     name: str
     start: int
@@ -258,7 +266,7 @@ class Sig:
         if self.start_value is not None:
             return self.start_value
         if self.length == 1:
-            return 0  # the default of the file's GenSigStartValue: a flag has nothing better
+            return 0  # the file's default of GenSigStartValue, because a flag has no code
         return self.range[0] if self.signed else self.range[1]
 
     @property
@@ -268,7 +276,7 @@ class Sig:
 
     @property
     def limits(self) -> tuple[int, int]:
-        """Smallest and largest raw value that is a value."""
+        """Smallest and greatest raw value that is not a code."""
         low, high = self.range
         factor, offset = Fraction(self.factor), Fraction(self.offset)
         least, most = Fraction(self.minimum), Fraction(self.maximum)
@@ -283,7 +291,7 @@ class Sig:
         return low, high
 
     def physical(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction | None:
-        """The value in the signal's unit."""
+        """Return the value in the signal's unit."""
         value = KNOWN[self.source].read(esc, gateway, now)
         return (
             None
@@ -292,7 +300,7 @@ class Sig:
         )
 
     def right(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int:
-        """The raw value that is right: the nearest, halves up."""
+        """Return the correct raw value: the nearest one, halves up."""
         known, value = KNOWN[self.source], self.physical(esc, gateway, now)
         if value is None:
             return self.not_available
@@ -309,7 +317,10 @@ class Sig:
         return raw if low <= raw <= high and not looks_like_none else self.error
 
     def float_is_right(self, raw: int, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> bool:
-        """True if the IEEE 754 bits are the value within the rounding of a double and of the type; NaN for not available."""
+        """Return True if the IEEE 754 bits are correct, within the rounding of double and type.
+
+        NaN is correct for a value that is not available.
+        """
         kind = "f" if self.length == 32 else "d"
         sent: float = struct.unpack("<" + kind, raw.to_bytes(self.length // 8, "little"))[0]
         value = self.physical(esc, gateway, now)
@@ -325,7 +336,7 @@ class Sig:
 
 
 def plain(name: str) -> str:
-    """Letters and digits in lower case."""
+    """Return the letters and digits in lower case."""
     return "".join(c for c in name.lower() if c.isalnum())
 
 
@@ -350,7 +361,7 @@ class Msg:
         return [*sorted(pages)] if pages else [None]
 
     def page_of(self, number: int | None) -> list[Sig]:
-        """The signals that stand in a frame of this page."""
+        """Return the signals in a frame of this page."""
         return [s for s in self.signals if not s.mux.startswith("m") or s.mux == f"m{number}"]
 
 
@@ -365,7 +376,7 @@ BA_DEF_DEF_ "GenSigStartValue" 0;"""
 
 
 def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
-    """The messages as a DBC. ``more`` goes behind the attribute definitions."""
+    """Return the messages as a DBC. ``more`` is added after the attribute definitions."""
     messages = list(messages)
     lines = ['VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Gateway Logger Other\n']
     for message in messages:
@@ -391,14 +402,14 @@ def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
 
 
 def read(text: str) -> Database:
-    """A DBC as cantools reads it at its strictest."""
+    """Parse a DBC with cantools in its strict mode."""
     database = cantools.database.load_string(text, "dbc", strict=True)
     assert isinstance(database, Database)
     return database
 
 
 def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:
-    """What ``[dbc.bind]`` has to say about them."""
+    """Return the bindings that the messages need in ``[dbc.bind]``."""
     return {
         f"{message.name}.{signal.name}": signal.bind
         for message in messages
@@ -420,13 +431,13 @@ def pascal(source: str) -> str:
 
 
 def spelled(rng: random.Random, text: str) -> str:
-    """A name as people write it."""
+    """Return a name in a random style: lower case, upper case, with or without underscores."""
     ways = [text, text.upper(), text.lower(), text.replace("_", ""), f"{text[:2]}_{text[2:]}"]
     return rng.choice(ways)
 
 
 class LayoutMaker:
-    """Makes random messages whose signals are bound to random sources of the ESCs."""
+    """Makes random messages with signals that are bound to random sources of the ESCs."""
 
     def __init__(self, rng: random.Random, escs: Sequence[EscSettings], fd: bool = True) -> None:
         self.rng, self.escs, self.fd = rng, escs, fd
@@ -434,7 +445,7 @@ class LayoutMaker:
         self.count = 0
 
     def message(self) -> Msg:
-        """One message with 1 to 8 signals."""
+        """Make one message with 1 to 8 signals."""
         rng = self.rng
         self.count += 1
         extended = rng.random() < 0.3
@@ -454,7 +465,7 @@ class LayoutMaker:
                 message.signals.append(Sig("Selector", selector[0], width, selector[1], mux="M"))
                 used: set[tuple[int, int]] = set()
                 for page in rng.sample(range(1 << width), min(1 << width, rng.randint(1, 3))):
-                    taken = set(common)  # pages may lie over each other
+                    taken = set(common)  # pages may overlap
                     for _ in range(rng.randint(1, 3)):
                         self._add(message, taken, f"m{page}")
                     used |= taken
@@ -557,7 +568,7 @@ class LayoutMaker:
 
 
 def random_integer(rng: random.Random, low: int, high: int) -> int:
-    """Ends and neighbours of zero often, anything else else."""
+    """Return a limit or a neighbour of zero often, otherwise any integer in the range."""
     if rng.random() < 0.3:
         return rng.choice(
             [v for v in (low, low + 1, -1, 0, 1, 99, 100, high - 1, high) if low <= v <= high]
@@ -588,7 +599,10 @@ def random_info(rng: random.Random) -> InfoData:
 def random_escs(
     rng: random.Random, settings: Sequence[EscSettings], now: int
 ) -> tuple[list[EscStream], int]:
-    """ESCs that were fed random frames: some up, some stale, some with info, some never seen. And the time after that."""
+    """Return ESCs that received random frames, and the time after that.
+
+    Some are up, some are stale, some have info, and some never received anything.
+    """
     escs = [EscStream(each, now) for each in settings]
     for _ in range(rng.randint(0, 3)):
         for esc in escs:

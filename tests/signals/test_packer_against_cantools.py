@@ -1,4 +1,4 @@
-"""The packers against cantools and against an oracle that counts bits one by one, over thousands of random layouts."""
+"""The packers agree with cantools and with an oracle that counts bits, in random layouts."""
 
 import math
 import os
@@ -36,7 +36,7 @@ ESCS = (
 )
 FILES = int(os.environ.get("PACKER_FILES", "110"))
 MESSAGES = 30
-"""Each file holds so many messages: 110 files are 3300 layouts."""
+"""Messages in each file. 110 files have 3300 layouts."""
 ROUNDS = 3
 
 
@@ -46,7 +46,7 @@ State = tuple[Sequence[EscTelemetry], GatewayStatus, int]
 def check_frame(
     message: Msg, page: int | None, data: bytes, database: Database, state: State
 ) -> None:
-    """One frame against the oracle, and against what cantools reads in it."""
+    """Compare one frame with the oracle, and with the values that cantools decodes."""
     escs, gateway, now = state
     expected_bytes = bytearray(message.length)
     theirs = database.get_message_by_name(message.name)
@@ -81,14 +81,14 @@ def same(a: Any, b: Any) -> bool:
     return bool(a == b) or (isinstance(b, float) and math.isnan(b) and math.isnan(a))
 
 
-def test_a_ratio_beyond_a_double_is_infinite() -> None:
+def test_ratio_beyond_a_double_is_infinite() -> None:
     assert ratio(-(10**400), 3) == float("-inf")
     assert ratio(10**400, 3) == float("inf")
     assert ratio(1, 4) == 0.25
 
 
 @pytest.mark.parametrize("seed", range(FILES))
-def test_every_random_layout_is_packed_as_the_oracle_and_cantools_say(seed: int) -> None:
+def test_random_layout_is_packed_as_oracle_and_cantools_expect(seed: int) -> None:
     rng = random.Random(seed)
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
@@ -112,5 +112,5 @@ def test_every_random_layout_is_packed_as_the_oracle_and_cantools_say(seed: int)
                 check_frame(message, page, frame.data, database, (escs, gateway, now))
 
 
-def test_the_oracle_knows_every_source_and_no_other() -> None:
+def test_oracle_has_exactly_the_sources_of_the_package() -> None:
     assert set(KNOWN) == set(VALUES)

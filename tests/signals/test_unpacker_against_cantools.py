@@ -1,4 +1,4 @@
-"""The unpackers against cantools over random layouts and random frames, and what a listener takes for fresh."""
+"""The unpackers agree with cantools in random layouts, and values expire in a listener."""
 
 import math
 import random
@@ -22,7 +22,7 @@ from kontronik_can_gw.signals.unpacker import SignalReader
 
 
 def wanted(plan: SignalPlan, raw: Any, bits: int) -> Any:
-    """The value that cantools' raw number means."""
+    """Return the value for the raw number that cantools decodes."""
     codes = (plan.not_available, plan.error)
     if plan.is_float:
         is_none = bits in codes or raw != raw
@@ -38,7 +38,7 @@ def wanted(plan: SignalPlan, raw: Any, bits: int) -> Any:
 
 
 @pytest.mark.parametrize("seed", range(1000, 1020))
-def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) -> None:
+def test_random_frames_are_decoded_as_cantools_does(seed: int) -> None:
     rng = random.Random(seed)
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
@@ -73,7 +73,7 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
                 bits = get(bytes(data), place.start, place.length, place.little)
                 expected = wanted(own, raws[name], bits)
                 if value is None and own.length == 1 and expected is not None:
-                    # the others of its ESC's frame say that there was none
+                    # The other values of the same UART frame are not available either.
                     beside = [planned[n] for n, v in got.items() if v is None and n != name]
                     assert any(s.length > 1 and same_frame(s, own) for s in beside)
                 elif isinstance(expected, float) and isinstance(value, float):
@@ -85,15 +85,15 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
 
 
 def same_frame(one: SignalPlan, other: SignalPlan) -> bool:
-    """Whether both come with the same page and the same frame of an ESC."""
+    """Return True if both are on the same page and from the same kind of UART frame of an ESC."""
     assert one.source is not None
     assert other.source is not None
     mine, its = (one.page, one.esc, one.source.group), (other.page, other.esc, other.source.group)
     return mine == its
 
 
-def test_an_error_code_beside_them_does_not_hide_flags() -> None:
-    """Undervoltage at a voltage that does not fit: the flag is what matters then."""
+def test_error_code_of_another_signal_does_not_hide_flags() -> None:
+    """If the voltage does not fit, the flag for undervoltage matters most."""
     reader = SignalReader(layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout)
     flag = next(n for n, column in enumerate(reader.columns) if column.name == "Undervoltage")
     rows = {(254, 254, 0x81): 1, (254, 255, 0x80): 1, (255, 255, 0x80): None, (12, 12, 30): 1}
@@ -105,7 +105,7 @@ def test_an_error_code_beside_them_does_not_hide_flags() -> None:
 
 
 def view_of(*messages: tuple[str, int, str]) -> View:
-    """A view of messages with one signal each: name, cycle in ms, send type."""
+    """Return a view of messages with one signal each, given by name, cycle in ms, send type."""
     made = [
         Msg(f"M{number}", 100 + number, 8, [Sig(name, 0, 16, maximum="65533")])
         for number, (name, _, _) in enumerate(messages)
@@ -122,7 +122,7 @@ def value(view: View, source: str) -> Any:
     return dict(zip((c.source for c in view.reader.columns), view.values, strict=True))[source]
 
 
-def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer() -> None:
+def test_slow_message_is_fresh_for_three_of_its_cycles() -> None:
     view = view_of(("losses", 5000, "Cyclic"), ("variant", 0, "OnChange"))
     for when in range(0, 60, 5):
         view.take(100, b"\1" * 8, when * SECOND)
@@ -137,7 +137,7 @@ def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer() -> None
     assert value(view, "variant") is None
 
 
-def test_what_comes_with_telemetry_is_fresh_for_a_second() -> None:
+def test_event_message_is_fresh_for_a_second() -> None:
     view = view_of(("battery_voltage", 0, "Event"), ("losses", 100, "Cyclic"))
     view.take(100, b"\1" * 8, 0)
     for when in range(0, 2000, 100):
