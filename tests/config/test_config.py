@@ -1,6 +1,6 @@
-"""The configuration: each key, the shipped example, the JSON Schema against the parser.
+"""The configuration: each key, the shipped example, JSON Schema and parser compared.
 
-Each kind of mistake, with its line: tests/golden/commands/refused_config.txt.
+tests/golden/commands/refused_config.txt has the message of each kind of mistake.
 """
 
 import json
@@ -34,23 +34,23 @@ KEYS: dict[str, dict[str, Any]] = {
     }
     for table, described in schema()["properties"].items()
 }
-"""What the schema says of each key; with defaults and ranges it is in docs/reference/configuration.md."""
+"""The schema of each key. docs/reference/configuration.md is made from the same rows."""
 
 
 def tables(table: str = "", key: str = "", value: object = None) -> dict[str, Any]:
-    """The least configuration, with one key more."""
+    """Return the smallest valid configuration with one more key."""
     made: dict[str, Any] = {"esc": [{"port": "/dev/ttyUSB0"}]}
     if table == "esc":
         made["esc"][0][key] = value
     elif table:
         made[table] = {key: value}
-    if (table, key) == ("dbc", "enabled"):  # something must be sent
+    if (table, key) == ("dbc", "enabled"):  # at least one output must be enabled
         made["canopen"] = {"enabled": True}
     return made
 
 
 def taken(table: str, key: str, value: object) -> Any:
-    """What the parser makes of one key."""
+    """Return the value in use for one key."""
     config = parse(tables(table, key, value), "a.toml")
     return getattr(config.esc[0] if table == "esc" else getattr(config, table), key)
 
@@ -65,7 +65,7 @@ def problems(given_tables: Any) -> list[str]:
 # --- each key
 
 
-def test_some_values_mean_others() -> None:
+def test_value_in_use_differs_from_the_value_written() -> None:
     for text in ("9.8", "98/10", "9.8/10", "1/3", "007", "1/1000"):
         numerator, _, denominator = text.partition("/")
         assert taken("esc", "gear", text) == Fraction(numerator) / Fraction(denominator or 1)
@@ -84,7 +84,7 @@ def test_some_values_mean_others() -> None:
         ("[::1]:65535", "::1", 65_535, 65_535),
     ],
 )
-def test_the_port_of_a_broker_is_that_of_mqtt_unless_it_is_given(
+def test_broker_has_the_usual_port_unless_it_is_given(
     text: str, host: str, plain: int, encrypted: int
 ) -> None:
     for tls, port in ((False, plain), (True, encrypted)):
@@ -93,7 +93,7 @@ def test_the_port_of_a_broker_is_that_of_mqtt_unless_it_is_given(
     assert parse(tables(), "a.toml").mqtt.address is None
 
 
-def test_node_ids_count_on_from_the_base_unless_an_esc_has_its_own() -> None:
+def test_node_ids_count_from_the_base_unless_an_esc_has_one() -> None:
     canopen: dict[str, Any] = {"enabled": True, "node_id": 10}
     escs: list[dict[str, Any]] = [{"port": f"p{n}"} for n in range(4)]
     made = {"canopen": canopen, "esc": escs}
@@ -122,7 +122,7 @@ def test_bindings_may_be_quoted_dotted_or_nested(text: str) -> None:
 
 
 def escs(*entries: dict[str, Any]) -> dict[str, Any]:
-    """ESCs with ports that differ."""
+    """Return ESCs with different ports."""
     return {"esc": [{"port": f"p{n}"} | entry for n, entry in enumerate(entries)]}
 
 
@@ -134,13 +134,13 @@ OTHERS: list[tuple[dict[str, Any], list[str]]] = [
     ({"canopen": {"node_id": 127, "eds": "none.eds"}, "esc": [{"port": "a"}] * 2},
      ["esc[2].port", "esc[2]: its node-ID would be 128", "none.eds: cannot be read", BAD_DBC]),
     ({"can": {"channel": "/dev/null"}, "esc": [{"port": "/dev/null"}]}, ["is the port of esc1", BAD_DBC]),
-    # the rest depends on what a table says
+    # The rest depends on the tables.
     ({"dbc": {"file": "my.dbc", "noode": 1}, "esc": [{"port": "a"}] * 2}, ["noode", "esc[2].port"]),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("made", "expected"), OTHERS)
-def test_mistakes_of_every_file_come_together(
+def test_mistakes_of_every_file_are_reported_together(
     tmp_path: Path, made: dict[str, Any], expected: list[str]
 ) -> None:
     (tmp_path / "my.dbc").write_text(DBC)
@@ -164,7 +164,7 @@ def rows_of(table: dict[str, Any]) -> str:
 # --- keys of earlier versions
 
 
-def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(
+def test_removed_key_is_a_warning_with_place_and_replacement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(REMOVED_KEYS, "can.queue", "Leave it out.")
@@ -192,12 +192,12 @@ def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(
 
 
 def uncommented() -> str:
-    """The example with each line uncommented that is a key or the head of a table."""
+    """Return the example with all keys and table heads uncommented."""
     commented = r'(?m)^#(?=\[|"?[A-Za-z_.0-9]+"? = )'
     return re.sub(commented, "", EXAMPLE.read_text(encoding="utf-8"))
 
 
-def test_the_shipped_example_is_valid_and_has_every_key_of_every_table(tmp_path: Path) -> None:
+def test_shipped_example_is_valid_and_has_every_key(tmp_path: Path) -> None:
     assert load(EXAMPLE).esc[0].pole_pairs == 7
     text = uncommented()
     assert not re.search(r"^#\S", text, re.MULTILINE)
@@ -211,7 +211,7 @@ def test_the_shipped_example_is_valid_and_has_every_key_of_every_table(tmp_path:
     assert set(KEYS) == set(made)
 
 
-# --- the schema against the parser
+# --- schema and parser compared
 
 VALIDATOR = jsonschema.Draft202012Validator(schema())
 
@@ -223,7 +223,7 @@ def accepted(made: Any) -> Config | None:
         return None
 
 
-def test_every_key_of_the_schema_is_described_and_its_default_is_the_parsers() -> None:
+def test_schema_describes_every_key_with_the_default_of_the_parser() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
     config = parse(tables(), "folder/a.toml")
     assert config.dbc_path == shipped("dbc/kontronik_esc.dbc") and config.dbc_path.is_file()
@@ -255,11 +255,11 @@ TAKEN: dict[tuple[str, str], list[Any]] = {
     ("dbc", "send_type"): [{"No": "Event"}],
     ("can", "options"): [{"ttyBaudrate": 115200, "host": "a b", "x": 0.5, "y": True}],
 }
-"""Of keys that take neither any text nor a number of a range."""
+"""Values of keys that accept neither any text nor any number in a range."""
 
 
 def given(table: str, key: str) -> list[tuple[bool | None, Any]]:
-    """Values of a key, and whether they are taken; None: that is for the schema to say."""
+    """Return values of a key, and whether they are accepted. None: the schema decides."""
     values: list[Any] = [
         *(0, 1, -1, 7, 127, 128, 200, 10_000, 10**30, 0.0005, 0.001, 0.5, 9.8, 1000.5, -0.5),
         *("", " ", "x", "1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1", ".5", "+1", "-1", "٣"),
@@ -277,21 +277,21 @@ def given(table: str, key: str) -> list[tuple[bool | None, Any]]:
     return found
 
 
-def test_the_schema_and_the_parser_take_the_same_as_it_is_and_it_is_written_as_toml() -> None:
-    """But for what a schema cannot say: the range of a gear written as text, and names that are ambiguous."""
+def test_schema_and_parser_accept_the_same_and_toml_is_equal() -> None:
+    """A schema cannot express the range of a gear as text, or ambiguous names."""
     for table, keys in KEYS.items():
         for key in (*keys, "x"):
             for is_taken, value in given(table, key):
                 made = tables(table, key, deepcopy(value))
-                config, place = accepted(made), f"{table}.{key} = {value!r}"
+                config = accepted(made)
+                place = f"{table}.{key} = {value!r}"
                 assert is_taken in (None, config is not None), place
                 if place != "esc.name = 'max'":
                     assert VALIDATOR.is_valid(made) == (config is not None), place
                 if config is not None:
-                    found = getattr(
-                        config.esc[0] if table == "esc" else getattr(config, table), key
-                    )
-                    if key not in ("gear", "messages", "bind"):  # which mean others
+                    in_table = config.esc[0] if table == "esc" else getattr(config, table)
+                    found = getattr(in_table, key)
+                    if key not in ("gear", "messages", "bind"):  # their values change in use
                         assert found == value and type(found) is type(value), place
                     check_toml(config)
     kinds: list[Any] = [{}, [], 1, "x", [{}], [1], [{"port": "a"}, {"port": "b"}], [{}, {}]]
@@ -300,13 +300,13 @@ def test_the_schema_and_the_parser_take_the_same_as_it_is_and_it_is_written_as_t
 
 
 def check_toml(config: Config) -> None:
-    """The effective configuration as TOML is read back equal."""
+    """Check that the effective configuration as TOML is equal when it is read again."""
     text = as_toml(config)
     again = parse(tomllib.loads(text), config.file)
     assert again == config and as_toml(again) == text
 
 
-def test_any_text_is_written_as_toml() -> None:
+def test_any_text_can_be_written_as_toml() -> None:
     odd = ('a"b', "C:\\x", "a\nb", "\t\x01\x1f\x7f\x85", "ü€😀", "'''", '"""', "#", "a = [b]")
     for text in odd:
         made = {"bind": {text: text}, "file": text, "units": {text: "V"}, "e2e_data_ids": {text: 1}}
@@ -317,11 +317,11 @@ def test_any_text_is_written_as_toml() -> None:
     check_toml(parse(tomllib.loads(uncommented()), str(EXAMPLE)))
 
 
-def test_what_only_the_parser_can_refuse_is_known() -> None:
+def test_values_that_only_the_parser_refuses_are_known() -> None:
     only_parser = [
         tables("esc", "gear", "1/0"),
-        tables("esc", "pole_pairs", 7.0),  # to JSON 7.0 is a whole number, to TOML it is a float
-        tables("esc", "name", "a\n"),  # "$" of Python's expressions, which an editor's do not share
+        tables("esc", "pole_pairs", 7.0),  # a whole number in JSON, a float in TOML
+        tables("esc", "name", "a\n"),  # "$" also matches before a line end, but only in Python
         tables("dbc", "bind", {"a": math.inf}),  # JSON has no infinity
     ]
     assert [VALIDATOR.is_valid(made) for made in only_parser] == [True] * 4
@@ -330,7 +330,7 @@ def test_what_only_the_parser_can_refuse_is_known() -> None:
 
 @hypothesis.settings(max_examples=50)
 @hypothesis.given(st.binary(max_size=200))
-def test_no_content_of_a_file_makes_anything_but_a_user_error(
+def test_any_content_of_a_file_raises_at_most_a_user_error(
     tmp_path_factory: Any, content: bytes
 ) -> None:
     file = tmp_path_factory.getbasetemp() / "any.toml"

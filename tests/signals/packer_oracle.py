@@ -1,8 +1,8 @@
 """Computes raw values of signals independently, and makes random DBC layouts and telemetry.
 
 Nothing here uses the package's tables of fields, units or positions. They are typed again from the
-telemetry sheet, here and in tests/esc/sheet.py, and bits are counted one by one. The package is used
-only to make telemetry objects from encoded frames.
+telemetry sheet, here and in tests/esc/sheet.py, and bits are counted one by one. The package is
+used only to make telemetry objects from encoded frames.
 """
 
 import math
@@ -24,7 +24,7 @@ from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 
-# --- bits, counted one by one -------------------------------------------------------------------------------------------
+# --- bits, counted one by one
 
 
 def bit_places(start: int, length: int, little: bool) -> list[tuple[int, int]]:
@@ -49,7 +49,7 @@ def get(data: bytes, start: int, length: int, little: bool, signed: bool = False
     return raw - (1 << length) if signed and raw >> length - 1 else raw
 
 
-# --- values to publish, typed from the sheet ----------------------------------------------------------------------------
+# --- values to publish, typed from the sheet
 
 Reader = Callable[[EscTelemetry, GatewayStatus, int], "int | Fraction | None"]
 
@@ -97,7 +97,7 @@ JIVEPRO = 3
 
 
 def _of(part: str, reckon: Callable[[EscTelemetry, Any], "int | Fraction | None"]) -> Reader:
-    """Return a function that computes a value from ``live`` or ``info`` data, if it is available."""
+    """Return a function that computes a value from ``live`` or ``info`` data, or returns None."""
 
     def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | Fraction | None:
         data = getattr(esc, part)
@@ -211,7 +211,7 @@ The value in the other unit is value * factor + shift.
 """
 
 
-# --- a signal and its correct raw value ---------------------------------------------------------------------------------
+# --- a signal and its correct raw value
 
 
 @dataclass
@@ -418,7 +418,7 @@ def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:
     }
 
 
-# --- random layouts -----------------------------------------------------------------------------------------------------
+# --- random layouts
 
 FACTORS = [
     "1", "1", "1", "0.1", "0.01", "0.001", "0.5", "2", "5", "-1", "-0.1", "0.25", "0.0625", "100", "3", "0.3", "-7",
@@ -564,7 +564,7 @@ class LayoutMaker:
         signal.minimum, signal.maximum = str(least), str(most)
 
 
-# --- random telemetry ---------------------------------------------------------------------------------------------------
+# --- random telemetry
 
 
 def random_integer(rng: random.Random, low: int, high: int) -> int:
