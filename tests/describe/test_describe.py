@@ -1,4 +1,7 @@
-"""The description is complete and true, as cantools and canopen read the same files; whatever they hold is shown as text."""
+"""The description agrees with cantools and canopen, which read the same files.
+
+Any text in these files is shown as plain text.
+"""
 
 import json
 from itertools import pairwise
@@ -45,14 +48,14 @@ port = "/dev/ttyUSB1"
 
 
 def text_of(*words: object) -> str:
-    """What ``describe`` prints; it must not have anything to say."""
+    """Return the output of ``describe``, which must not write to standard error."""
     done = run("describe", *words)
     assert (done.code, done.err) == (0, ""), done.err
     return done.out
 
 
 def configuration(folder: Path, text: str) -> Path:
-    """A file with this configuration on the virtual interface."""
+    """Write a configuration on the virtual interface and return its path."""
     file = folder / "gateway.toml"
     file.write_text(f'[can]\ninterface = "virtual"\n{text}')
     return file
@@ -66,7 +69,7 @@ def facts_of(*words: object) -> Facts:
 
 @pytest.fixture(scope="module")
 def facts() -> Facts:
-    """The description of what is shipped."""
+    """Return the description of the shipped files."""
     return facts_of()
 
 
@@ -82,7 +85,7 @@ OTHERS = [*LINK_STATES.values(), *CAN_STATES.values(), *GATEWAY_STATES.values()]
 
 
 @pytest.mark.parametrize("kind", [OperatingError, SelfTestError, STATES, GatewayError, OTHERS])
-def test_each_error_and_state_has_a_meaning_of_its_own_and_a_remedy(kind: Any) -> None:
+def test_error_and_state_have_a_unique_meaning_and_a_remedy(kind: Any) -> None:
     assert [list(LINK_STATES), list(CAN_STATES), list(GATEWAY_STATES)] == [
         list(states) for states in (LinkState, CanState, GatewayState)
     ]
@@ -94,7 +97,7 @@ def test_each_error_and_state_has_a_meaning_of_its_own_and_a_remedy(kind: Any) -
 # --- tables, as JSON
 
 
-def test_messages_and_signals_are_those_that_cantools_reads(facts: Facts) -> None:
+def test_messages_and_signals_agree_with_cantools(facts: Facts) -> None:
     database = cantools.database.load_file(DBC)
     assert isinstance(database, cantools.database.Database)
     told = {message["name"]: message for message in facts["messages"]}
@@ -137,7 +140,7 @@ def test_messages_and_signals_are_those_that_cantools_reads(facts: Facts) -> Non
             assert found["meaning"].startswith(signal.comment)
 
 
-def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
+def test_objects_agree_with_canopen(facts: Facts) -> None:
     dictionary: Any = canopen.import_od(str(EDS), node_id=0)
     told = {row["object"]: row for row in facts["objects"]}
     variables: dict[str, Any] = {
@@ -163,7 +166,7 @@ def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
         assert found["name"].startswith(item.name) and found["name"].endswith(variable.name)
 
 
-def test_the_node_has_the_cob_ids_and_pdos_that_canopen_computes(facts: Facts) -> None:
+def test_cob_ids_and_pdos_agree_with_canopen(facts: Facts) -> None:
     ids = {row["cob_id"] for row in facts["cob-ids"] if row["node"] == "esc1, 1"}
     assert {0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x601, 0x701} <= ids
     dictionary: Any = canopen.import_od(str(EDS), node_id=1)
@@ -180,7 +183,7 @@ def test_the_node_has_the_cob_ids_and_pdos_that_canopen_computes(facts: Facts) -
         assert [text.split()[0] for text in pdo["mapped"]] == named
 
 
-def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
+def test_emergencies_are_the_bits_enabled_in_the_eds(facts: Facts) -> None:
     told = facts["emergencies"]
     of_esc = {e["byte3"]: e for e in told if e["byte3"] != "FFh"}
     dictionary: Any = canopen.import_od(str(EDS))
@@ -205,7 +208,7 @@ def test_each_value_has_a_meaning_and_its_objects(facts: Facts) -> None:
     assert told["undervoltage"]["meaning"] == OperatingError.UNDERVOLTAGE.meaning
 
 
-def test_of_two_escs_each_has_its_signals_and_cob_ids(tmp_path: Path, facts: Facts) -> None:
+def test_two_escs_have_their_own_signals_and_cob_ids(tmp_path: Path, facts: Facts) -> None:
     two = facts_of("-c", configuration(tmp_path, TWO_ESCS))
     voltages = [row for row in two["signals"] if row["shows"] == "battery_voltage"]
     assert [(row["esc"], row["message"], row["signal"]) for row in voltages] == [
@@ -225,11 +228,11 @@ def test_of_two_escs_each_has_its_signals_and_cob_ids(tmp_path: Path, facts: Fac
     assert {row["use"] for row in waits["cob-ids"]} == {"NMT", "LSS"}
 
 
-# --- the document, read back by a parser that knows nothing of us
+# --- the document, read by an independent parser
 
 
 def texts_of(markdown_text: str) -> dict[str, list[str]]:
-    """The texts of a document by the tag that they stand in; none may hold markup."""
+    """Return the texts of a document by their tag. Raises if a text contains markup."""
     found: dict[str, list[str]] = {}
     parser = MarkdownIt("commonmark").enable("table").enable("strikethrough")
     for opening, token in pairwise(parser.parse(markdown_text)):
@@ -267,8 +270,8 @@ words = st.one_of(texts, markup)
 @example("#", "x ##", "# x")
 @example("_a_", "a_b_c", "\\|")
 @example("&lt;", "<!--", "]]>")
-def test_any_text_comes_back_as_it_is(title: str, paragraph: str, cell: str) -> None:
-    """Of a DBC or EDS that holds markup, too."""
+def test_any_text_is_read_back_unchanged(title: str, paragraph: str, cell: str) -> None:
+    """The text of a DBC or EDS may contain markup."""
     named = [{"one": "x", "head": f"H {title}"}, {"one": "x", "head": "H"}]
     rows = [{"one": cell}, {"one": "y"}]
     tables = [Table(f"T {title}", [paragraph], rows), Table("B", [], named, by="head")]

@@ -1,4 +1,7 @@
-"""examples/grafana: every expression of dashboard and alerts finds something in a real Prometheus that scrapes a real `metrics`."""
+"""examples/grafana: a real Prometheus that scrapes `metrics` finds every expression.
+
+The expressions are those in dashboard and alerts.
+"""
 
 import json
 import re
@@ -35,7 +38,7 @@ pytestmark = pytest.mark.extended
 
 
 class Prometheus:
-    """A server that scrapes one target each second, on a port of its own choice."""
+    """A Prometheus server that scrapes one target every second."""
 
     def __init__(self, folder: Path, target: str) -> None:
         job = {"job_name": "kontronik", "scrape_interval": "1s"}

@@ -1,4 +1,7 @@
-"""The metrics as Prometheus reads them, what is answered for a good, a missing, a stale and a damaged status file, and to whom."""
+"""The metrics as Prometheus reads them, and the server's answers.
+
+Its status file may be good, missing, stale or damaged.
+"""
 
 import json
 import re
@@ -41,7 +44,7 @@ def metrics(document: dict[str, Any]) -> str:
 
 
 def families(document: dict[str, Any]) -> dict[str, Metric]:
-    """By name as it is written, ``_total`` included."""
+    """Return the metrics by name, including ``_total``."""
     text = metrics(document)
     found = list(text_string_to_metric_families(text))
     names = [family.name + ("_total" if family.type == "counter" else "") for family in found]
@@ -70,7 +73,7 @@ def document() -> dict[str, Any]:
     return with_nodes(bench.document(ports=ports, can=can, store=StoreFacts(1, "disk full")))
 
 
-def test_names_have_the_prefix_counters_end_in_total_and_prometheus_own_tool_has_no_complaint(
+def test_names_have_the_prefix_and_pass_the_tool_of_prometheus(
     document: dict[str, Any],
 ) -> None:
     for name, family in families(document).items():
@@ -116,7 +119,7 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
     assert value(document, "kontronik_store_failed") == 1
 
 
-def test_what_is_not_available_is_left_out() -> None:
+def test_unavailable_value_is_left_out() -> None:
     bench = Bench(2)
     bench.run(2)
     bench.silent.add(0)
@@ -133,13 +136,11 @@ def test_what_is_not_available_is_left_out() -> None:
     assert 'kontronik_esc_info{esc="esc1"' not in text
     assert not re.search("nan|none|null", text, re.IGNORECASE)
     assert value(document, "kontronik_esc_losses_total", esc="esc1") == 1
-    assert "kontronik_canopen_node_state" not in text  # there are no nodes
+    assert "kontronik_canopen_node_state" not in text  # without nodes
     assert "kontronik_store" not in text
 
 
-def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_when_it_is_set() -> (
-    None
-):
+def test_error_bits_have_a_severity_and_unknown_ones_are_shown_if_set() -> None:
     bench = Bench(1)
     bench.run(3)
     errors = LiveData(operating_errors=1 << OperatingError.OVERVOLTAGE | 1 << 30)
@@ -169,7 +170,7 @@ class Clock:
 
 @pytest.fixture
 def clock(document: dict[str, Any]) -> Clock:
-    """At first the document is half a second old."""
+    """Return a clock at which the document is half a second old."""
     made = Clock()
     made.now = document["monotonic_ns"] + SECOND // 2
     return made
@@ -177,7 +178,7 @@ def clock(document: dict[str, Any]) -> Clock:
 
 @pytest.fixture
 def port(file: Path, clock: Clock) -> Iterator[int]:
-    """Of a server, chosen by the system."""
+    """Start a server and return its port, which the system chooses."""
     with metrics_module.server_of(
         partial(look_at, file), "127.0.0.1", 0, lambda: clock.now
     ) as made:
@@ -189,14 +190,14 @@ def port(file: Path, clock: Clock) -> Iterator[int]:
 
 
 def ask(port: int, path: str = "/metrics", **headers: str) -> tuple[int, str, str]:
-    """Status, content type and text of an answer."""
+    """Return status, content type and text of an answer."""
     with closing(HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
         connection.request("GET", path, headers=headers)
         answer = connection.getresponse()
         return answer.status, answer.headers["Content-Type"], answer.read().decode()
 
 
-def test_the_newest_metrics_are_fetched_as_prometheus_does(
+def test_newest_metrics_are_served_to_prometheus(
     port: int, file: Path, clock: Clock, document: dict[str, Any]
 ) -> None:
     for accept in ("*/*", "application/openmetrics-text;version=1.0.0", "a/b;version=x;;=,"):
@@ -223,13 +224,13 @@ def test_the_newest_metrics_are_fetched_as_prometheus_does(
         (403, ["example.com", "localhost.example.com", "127.0.0.1.example.com", "10.0.0.1", ""]),
     ],
 )
-def test_a_page_that_has_its_own_name_lead_here_is_refused(
+def test_request_with_a_foreign_host_name_is_refused(
     port: int, status: int, hosts: list[str]
 ) -> None:
     assert [ask(port, Host=host)[0] for host in hosts] == [status] * len(hosts)
 
 
-def test_a_damaged_file_is_one_line_and_never_a_traceback(
+def test_damaged_file_is_one_line_without_a_traceback(
     port: int, file: Path, document: dict[str, Any], capfd: pytest.CaptureFixture[str]
 ) -> None:
     text = json.dumps(document)
@@ -244,7 +245,7 @@ def test_a_damaged_file_is_one_line_and_never_a_traceback(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
+def test_clients_that_never_finish_delay_no_other_and_are_closed(
     port: int, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address = ("127.0.0.1", port)
@@ -277,7 +278,7 @@ def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
         (("mqtt", "--broker", "x"), "paho", "MQTT needs paho-mqtt>=2. ", "mqtt"),
     ],
 )
-def test_without_the_library_the_command_that_installs_it_is_named(
+def test_missing_library_is_reported_with_the_command_that_installs_it(
     monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], package: str, said: str, extra: str
 ) -> None:
     for module in list(sys.modules):
@@ -287,7 +288,7 @@ def test_without_the_library_the_command_that_installs_it_is_named(
     assert refused(1, *words) == said + f"Install it: {install_command(EXTRAS[extra])}"
 
 
-def test_it_serves_the_file_of_a_configuration_on_this_machine_until_sigterm(
+def test_command_serves_the_configured_file_until_sigterm(
     tmp_path: Path, port: int, file: Path
 ) -> None:
     text = '[[esc]]\nport = "/dev/ttyS0"\n[statistics]\nfile = '

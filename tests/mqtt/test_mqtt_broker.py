@@ -1,4 +1,7 @@
-"""The client and ``kontronik-can-gw mqtt`` against a real mosquitto, subscribers that are not ours, and brokers that speak rubbish."""
+"""The client and ``kontronik-can-gw mqtt`` with a real mosquitto and independent subscribers.
+
+Some brokers here send garbage.
+"""
 
 import contextlib
 import os
@@ -36,7 +39,7 @@ ONLINE = "k/test/online"
 
 
 def free_port() -> int:
-    """A port that nobody listens on, below those that the kernel gives to connections."""
+    """Return an unused port below the range from which the kernel chooses ports."""
     while True:
         port = random.randrange(20_000, 30_000)
         with socket.socket() as probe, contextlib.suppress(OSError):
@@ -45,7 +48,7 @@ def free_port() -> int:
 
 
 class Mosquitto:
-    """A broker with a configuration of its own, that can be stopped and started again on the same port."""
+    """A broker that can be stopped and started again on the same port."""
 
     def __init__(
         self, folder: Path, lines: str = "allow_anonymous true\n", port: int | None = None
@@ -66,7 +69,7 @@ class Mosquitto:
             return probe.connect_ex(("127.0.0.1", self.port)) == 0
 
     def freeze(self, frozen: bool) -> None:
-        """Let it stand still, as one that is overloaded."""
+        """Stop or continue the process. A stopped broker is like an overloaded one."""
         self._process.send_signal(signal.SIGSTOP if frozen else signal.SIGCONT)
 
     def stop(self) -> None:
@@ -83,7 +86,7 @@ def broker(tmp_path: Path) -> Iterator[Mosquitto]:
 
 
 class Subscriber:
-    """paho, as somebody else uses it."""
+    """A subscriber that uses paho directly."""
 
     def __init__(self, port: int, topic: str) -> None:
         self.heard: list[paho.MQTTMessage] = []
@@ -97,7 +100,7 @@ class Subscriber:
         assert subscribed.wait(PATIENCE)
 
     def wait(self, topic: str, payload: bytes | None = None) -> paho.MQTTMessage:
-        """The first message of a topic (with this payload), as soon as it has come."""
+        """Wait for the first message of a topic, with this payload if given, and return it."""
 
         def found() -> list[paho.MQTTMessage]:
             heard = [message for message in list(self.heard) if message.topic == topic]
@@ -132,13 +135,13 @@ def to(port: int) -> MqttConfig:
 
 
 def waiting(client: MqttClient) -> int:
-    """Number of messages that are not sent yet."""
+    """Return the number of messages that are not sent yet."""
     handed = sum(not mqtt_client._is_done(info) for info in client._handed.values())
     return len(client._waiting) + handed
 
 
 def turning(client: MqttClient, condition: Callable[[], object]) -> None:
-    """Call ``turn`` as the command does, until something holds."""
+    """Call ``turn`` as the command does, until the condition is true."""
 
     def holds() -> object:
         client.turn(time.monotonic_ns())
@@ -147,7 +150,7 @@ def turning(client: MqttClient, condition: Callable[[], object]) -> None:
     wait_for(holds, lambda: client.problem)
 
 
-def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosquitto) -> None:
+def test_newest_message_of_a_topic_waits_and_lasting_ones_are_first(broker: Mosquitto) -> None:
     client = MqttClient(to(broker.port), "test", ONLINE)
     for number in range(1000):
         client.offer(Publication("k/test/state", b"%d" % number))
@@ -170,8 +173,8 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
     ]
 
 
-def test_a_broker_that_takes_nothing_makes_nothing_pile_up(broker: Mosquitto) -> None:
-    """It stands still: what waits is replaced, what then comes is new, and the end comes in time."""
+def test_memory_is_bounded_while_the_broker_accepts_nothing(broker: Mosquitto) -> None:
+    """While the broker is stopped, waiting messages are replaced. The client ends in time."""
     sent: list[bytes] = []
     client = MqttClient(to(broker.port), "test", ONLINE)
     with Subscriber(broker.port, "k/test/state") as heard:
@@ -186,7 +189,7 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(broker: Mosquitto) ->
         broker.freeze(True)
         for _ in range(100):
             offer()
-        assert waiting(client) <= 3  # "online"; a state is with paho, and the newest waits
+        assert waiting(client) <= 3  # "online", one state with paho, the newest waiting
         broker.freeze(False)
         turning(client, lambda: not waiting(client))
         heard.wait("k/test/state", sent[-1])
@@ -195,11 +198,11 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(broker: Mosquitto) ->
         broker.freeze(True)
         for _ in range(100):
             offer()
-        client.stop(0.3)  # it returns though nothing is taken
+        client.stop(0.3)  # returns although the broker accepts nothing
         broker.freeze(False)
 
 
-def test_rubbish_instead_of_an_answer_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_client_continues_after_an_answer_that_is_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt_client, "MIN_PAUSE_S", 0.01)
     monkeypatch.setattr(mqtt_client, "MAX_PAUSE_S", 0.1)
     rng = random.Random(1)
@@ -210,7 +213,7 @@ def test_rubbish_instead_of_an_answer_ends_nothing(monkeypatch: pytest.MonkeyPat
         with socket.create_server(("127.0.0.1", 0)) as listener:
             listener.settimeout(PATIENCE)
             with connecting(to(listener.getsockname()[1])) as client:
-                for _ in range(2):  # it tries again
+                for _ in range(2):  # the client tries again
                     with listener.accept()[0] as connection:
                         connection.recv(4096)
                         connection.sendall(answer)
@@ -221,7 +224,7 @@ def openssl(*words: object) -> None:
     subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
 
 
-def test_tls_with_an_authority_of_ones_own_and_certificates_that_do_not_fit(tmp_path: Path) -> None:
+def test_tls_with_an_own_authority_and_with_wrong_certificates(tmp_path: Path) -> None:
     authority, secret = tmp_path / "authority.pem", tmp_path / "authority.key"
     new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
     openssl("req", "-x509", *new, "-subj", "/CN=authority", "-keyout", secret, "-out", authority)
@@ -239,7 +242,7 @@ def test_tls_with_an_authority_of_ones_own_and_certificates_that_do_not_fit(tmp_
     try:
         with connecting(right) as client:
             turning(client, lambda: client.problem == "")
-            # more than a record of TLS, and than the kernel takes at once
+            # larger than a TLS record, and than the kernel accepts at once
             client.offer(Publication("k/tls/big", b"x" * 300_000, lasting=True))
             turning(client, lambda: not waiting(client))
         wrong: list[tuple[dict[str, Any], str]] = [
@@ -255,14 +258,14 @@ def test_tls_with_an_authority_of_ones_own_and_certificates_that_do_not_fit(tmp_
         broker.stop()
 
 
-# --- the command, on a bus that is quiet
+# --- the command, on a bus without frames
 
 Live = Callable[..., GatewayProcess]
 
 
 @pytest.fixture
 def live(tmp_path: Path) -> Iterator[Live]:
-    """Starts the program for a gateway of this name."""
+    """Return a function that starts the program for a gateway with this name."""
     started = []
 
     def start(name: str, address: str, more: str = "") -> GatewayProcess:
@@ -276,7 +279,7 @@ def live(tmp_path: Path) -> Iterator[Live]:
         each.kill()
 
 
-def test_the_broker_keeps_online_and_offline_and_the_service_manager_is_reported(
+def test_state_is_retained_and_reported_to_the_service_manager(
     live: Live, broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said, state = "", "kontronik/sd/online"
@@ -298,7 +301,7 @@ def test_the_broker_keeps_online_and_offline_and_the_service_manager_is_reported
     assert said.startswith("READY=1")
 
 
-def test_the_last_will_says_offline_where_it_was_killed(live: Live, broker: Mosquitto) -> None:
+def test_last_will_is_offline_after_a_kill(live: Live, broker: Mosquitto) -> None:
     state = "kontronik/killed/online"
     program = live("killed", broker.address)
     with Subscriber(broker.port, state) as heard:
@@ -309,7 +312,7 @@ def test_the_last_will_says_offline_where_it_was_killed(live: Live, broker: Mosq
         assert heard.wait(state, b"offline").retain
 
 
-def test_a_broker_that_comes_late_goes_and_comes_again(live: Live, tmp_path: Path) -> None:
+def test_broker_that_starts_late_stops_and_starts_again(live: Live, tmp_path: Path) -> None:
     port = free_port()
     program = live("late", f"127.0.0.1:{port}")
     program.wait_for_line(f"MQTT broker 127.0.0.1:{port}: cannot be reached: Connection refused")
@@ -321,19 +324,19 @@ def test_a_broker_that_comes_late_goes_and_comes_again(live: Live, tmp_path: Pat
         broker.start()
         with Subscriber(port, "kontronik/late/#") as heard:
             heard.wait("kontronik/late/online", b"online")
-            heard.wait("kontronik/late/esc1/available", b"offline")  # the broker had lost it
+            heard.wait(
+                "kontronik/late/esc1/available", b"offline"
+            )  # the broker lost its retained messages
             heard.wait("kontronik/late/esc1/state")
         program.wait_for_line(": connected, after")
-        assert program.log.count("Connection refused") <= 3  # not one line an attempt
+        assert program.log.count("Connection refused") <= 3  # not a line for each attempt
         assert program.end() == 0
     finally:
         broker.stop()
     assert "Traceback" not in program.log
 
 
-def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
-    live: Live, tmp_path: Path
-) -> None:
+def test_wrong_password_is_logged_once_and_a_new_one_is_used(live: Live, tmp_path: Path) -> None:
     users, secret = tmp_path / "users", written(tmp_path / "password", "wrong donkey\nmore\n")
     command = ["mosquitto_passwd", "-b", "-c", str(users), "boat", "right horse"]
     subprocess.run(command, check=True, capture_output=True)

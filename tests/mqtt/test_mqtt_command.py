@@ -1,4 +1,4 @@
-"""``kontronik-can-gw mqtt`` without a broker: each mistake is one line with the remedy."""
+"""``kontronik-can-gw mqtt`` without a broker: each mistake is one line with a remedy."""
 
 import errno
 from pathlib import Path
@@ -28,14 +28,14 @@ def configuration(folder: Path, mqtt: str) -> Path:
         (HERE, ["--interface", "socketcan", "--channel", "no0"], 1, "no0"),
     ],
 )  # fmt: skip
-def test_each_mistake_is_one_line_with_the_remedy(
+def test_mistake_is_one_line_with_a_remedy(
     mqtt: str, words: list[str], code: int, said: str, tmp_path: Path
 ) -> None:
     written(tmp_path / "empty", "\nx")
     assert said in refused(code, "mqtt", "-c", configuration(tmp_path, mqtt), *words)
 
 
-def test_a_machine_without_loopback_is_one_line_with_the_remedy(
+def test_missing_loopback_is_one_line_with_a_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def unreachable(_: object) -> NoReturn:

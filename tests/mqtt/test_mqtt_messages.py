@@ -1,4 +1,7 @@
-"""What is published and when, without a broker: JSON against cantools, times handed in, discovery by Home Assistant's rules."""
+"""Content and timing of messages, without a broker.
+
+JSON is compared with values that cantools decodes. Discovery follows Home Assistant's rules.
+"""
 
 import json
 import re
@@ -44,7 +47,7 @@ Published = list[tuple[int, Publication]]
 
 
 def run(made: Publisher, frames: Timed, until_s: float, step_ns: int = STEP_NS) -> Published:
-    """Hand the frames over in their time, asking for messages at each step."""
+    """Pass the frames at their times, and collect the messages at each step."""
     published: Published = []
     waiting = iter([*frames, (1 << 62, frames[-1][1])] if frames else [])
     following = next(waiting, None)
@@ -69,7 +72,10 @@ def snake(signal: str, prefix: str) -> str:
 
 
 def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any]:
-    """Source and value after these frames, as cantools reads them; not available is None."""
+    """Return the values after these frames by source, as cantools decodes them.
+
+    A value that is not available is None.
+    """
     found: dict[str, Any] = {}
     for _, frame in frames:
         decoded = database.decode_message(frame.can_id, frame.data)
@@ -81,11 +87,11 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
     return found
 
 
-# --- what is in it
+# --- content
 
 
 @pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
-def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str, ...]) -> None:
+def test_json_has_each_value_as_cantools_decodes_it(names: tuple[str, ...]) -> None:
     bus = layout_of(names)
     database = read(copies_text(bus.database, [*bus.copies().values()]))
     frames = flight(bus, 12)
@@ -101,14 +107,14 @@ def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str
             value = found[source]
             is_float = isinstance(value, float)
             assert value == (pytest.approx(wanted[source]) if is_float else wanted[source]), source
-        # every signal is there, but for flags (they are lists) and values that are not the ESC's
+        # Every signal is included except flags, which are in lists, and values of the gateway.
         signals = {c.source for c in SignalReader(bus.layout).columns if c.esc == index}
         assert compared == signals - flags
         assert found["electrical_speed"] > 0
         assert found["firmware"] == "4.17"
 
 
-def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
+def test_errors_have_name_severity_meaning_and_set_problem() -> None:
     bits = (
         OperatingError.UNDERVOLTAGE,
         OperatingError.POWER_STAGE_OVERTEMP_WARNING,
@@ -123,7 +129,7 @@ def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
     assert found["problem"] is True
 
 
-# --- when
+# --- timing
 
 
 @settings(max_examples=40, deadline=None)
@@ -131,8 +137,8 @@ def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
     rate=st.one_of(st.floats(0.01, 20), st.sampled_from([0.01, 0.5, 1.0, 3.0, 20.0])),
     steps=st.lists(st.integers(1, 3000), min_size=30, max_size=200),
 )
-def test_the_rate_is_held_whenever_it_is_asked(rate: float, steps: list[int]) -> None:
-    """Nothing changes: one message in each period in which it is asked, at the first time."""
+def test_rate_does_not_depend_on_the_times_of_calls(rate: float, steps: list[int]) -> None:
+    """Without a change, there is one message in each period, at the first call in it."""
     made = publisher("esc1", rate=rate)
     period, first = round(SECOND_NS / rate), SECOND_NS // 2
     now, told = 0, []
@@ -150,7 +156,7 @@ def test_the_rate_is_held_whenever_it_is_asked(rate: float, steps: list[int]) ->
 
 
 def changes(published: Published, key: str) -> list[tuple[int, Any]]:
-    """When a value became another one in what was published."""
+    """Return time and new value of each change of a key in the published messages."""
     found: list[tuple[int, Any]] = []
     for now, state in states(published):
         if not found or found[-1][1] != state[key]:
@@ -158,8 +164,8 @@ def changes(published: Published, key: str) -> list[tuple[int, Any]]:
     return found
 
 
-def test_what_is_notable_is_reported_at_once_however_slow_the_rate_and_a_speed_is_not() -> None:
-    """An error from 3 to 4 s, the motor from 6 s, a silent line from 9 s on."""
+def test_only_notable_changes_are_published_at_once() -> None:
+    """There is an error from 3 to 4 s. The motor runs after 6 s. The line is silent after 9 s."""
     window = ErrorWindow(OperatingError.OVERVOLTAGE, 3 * SECOND_NS, SECOND_NS)
     start = Phase("off", 5, 0, OperatingState.MotorOff, 0)
     profile = (start, Phase("go", 90, 60, OperatingState.Forward, 5))
@@ -172,16 +178,16 @@ def test_what_is_notable_is_reported_at_once_however_slow_the_rate_and_a_speed_i
         assert 0 <= told - happened <= 0.2 * SECOND_NS + 2 * STEP_NS
     kinds = changes(published, "motor")
     assert [kind for _, kind in kinds] == ["idle", "run", None]
-    assert abs(kinds[1][0] - 6 * SECOND_NS) <= 0.25 * SECOND_NS  # a second of power-up first
+    assert abs(kinds[1][0] - 6 * SECOND_NS) <= 0.25 * SECOND_NS  # after a second of power-up
     lost = next(now for now, found in states(published) if found["link_state"] == "Lost")
-    assert lost - 9 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway itself waits for the time-out
+    assert lost - 9 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway's own time-out is included
     assert len(states(published)) <= 10
     topic = TOPICS.of("esc1", "available")
     assert [m.payload for _, m in published if m.topic == topic] == [b"online", b"offline"]
     assert not any(m.retain for _, m in published if m.topic.endswith("/state"))
 
 
-def test_an_esc_without_live_values_in_the_dbc_is_available_by_what_there_is() -> None:
+def test_esc_without_live_values_is_available_with_any_value() -> None:
     bus = layout_of(["esc1"])
     messages = tuple(each for each in bus.layout.messages if each.name == "EscLink")
     lean = replace(bus, layout=replace(bus.layout, messages=messages))
@@ -190,7 +196,7 @@ def test_an_esc_without_live_values_in_the_dbc_is_available_by_what_there_is() -
     assert [m.payload for _, m in published if m.topic == topic] == [b"online"]
 
 
-def test_what_comes_and_goes_is_bounded() -> None:
+def test_rate_of_notable_changes_is_limited() -> None:
     windows = tuple(
         ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS)
         for start in range(0, 20 * SECOND_NS, 60 * MS)
@@ -203,7 +209,7 @@ def test_what_comes_and_goes_is_bounded() -> None:
     assert min(gaps) >= MIN_PAUSE_NS
 
 
-def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -> None:
+def test_silent_gateway_is_offline_after_three_seconds() -> None:
     bus = layout_of(["esc1"])
     frames = [entry for entry in flight(bus, 10) if not 4 * SECOND_NS < entry[0] < 9 * SECOND_NS]
     published = run(publisher("esc1"), frames, 10)
@@ -224,7 +230,7 @@ def test_a_message_has_its_time_in_utc() -> None:
 
 # --- Home Assistant
 
-# From Home Assistant's documentation of sensors: units and state classes that go with a device class.
+# Units and state classes of each device class, from Home Assistant's documentation of sensors.
 ANY = {"measurement", "total", "total_increasing"}
 DEVICE_CLASSES: dict[str | None, tuple[set[str | None], set[str | None]]] = {
     "voltage": ({"V", "mV", "µV"}, {"measurement"}),
@@ -243,7 +249,7 @@ COMPONENT_KEYS = {
 }  # fmt: skip
 
 
-def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_the_state() -> None:
+def test_every_entity_is_valid_and_shows_a_key_of_the_state() -> None:
     frames = flight(layout_of(["left", "right"]), 3)
     published = run(publisher("left", "right", discovery="ha"), frames, 3)
     ids: list[str] = []
@@ -272,7 +278,7 @@ def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_
     assert len(ids) == len(set(ids)) > 100
 
 
-def test_an_esc_is_announced_when_it_is_heard_and_again_when_it_is_known() -> None:
+def test_esc_is_announced_when_heard_and_again_when_identified() -> None:
     bus = layout_of(["esc1"])
     columns = SignalReader(bus.layout).columns
     info = {c.key for c in columns if c.source in ("device", "firmware_main")}
