@@ -94,7 +94,7 @@ class RecordConfig:
 
     directory: str | None = key(TEXT, None,
         "folder of the captures, relative to this configuration; 'state' is a folder captures in the service's "
-        "state folder (default: nothing is recorded but by `run --record`)")
+        "state folder (default: only `run --record` records)")
     part_mb: int = key(integer(1, 4000), 64, "begin another file at this size in megabytes")
     part_minutes: int = key(integer(1, 10_000), 60,
         "begin another file after this time in minutes")
@@ -106,7 +106,7 @@ class RecordConfig:
 
 @dataclass(frozen=True)
 class MqttConfig:
-    """What ``kontronik-can-gw mqtt`` publishes, and where."""
+    """Broker, topics and rate of ``kontronik-can-gw mqtt``."""
 
     broker: str | None = key(BROKER, None,
         "MQTT broker, as broker.example or 192.168.1.5:1883 (default port 1883, with TLS 8883)")
@@ -123,7 +123,7 @@ class MqttConfig:
         "file with the password on its first line, relative to this configuration")
     gateway: str | None = key(LEVEL, None,
         "name of this gateway in the topics (default: the host name)")
-    topic: str = key(TOPIC, "kontronik", "what all topics begin with")
+    topic: str = key(TOPIC, "kontronik", "first part of all topics")
     rate: float = key(number(0.01, 20), 1.0, "state messages of each ESC in a second")
     retain: bool = key(BOOLEAN, False, "let the broker keep the last state message of each ESC")
     discovery: str | None = key(TOPIC, None,
@@ -159,9 +159,9 @@ class EscConfig:
     node_id: int | None = key(NODE_ID, None,
         "CANopen node-ID of this ESC; 255: waits for LSS (default: counted on from canopen.node_id)")
     device: str | None = key(choice_of(device_names), None,
-        "the device that belongs here; another one is reported (CANopen EMCY 7510h)")
+        "expected device; another one is reported (CANopen EMCY 7510h)")
     protocol: str = key(choice_of(protocol_names), PROTOCOLS[0].name,
-        "what the ESC's telemetry line speaks")
+        "protocol of the ESC's telemetry line")
 
     @property
     def settings(self) -> EscSettings:

@@ -43,7 +43,7 @@ class DbcConfig:
     on_loss: str = key(choice("not_available", "silent"), "not_available",
         "without telemetry: 'not_available' sends values marked as such, 'silent' stops messages with an ESC's values")
     flags_on_loss: int | None = key(integer(0, 1), None,
-        "what flags without NotAvailable in their value table hold without telemetry "
+        "value without telemetry of flags that have no NotAvailable in their value table "
         "(default: their own GenSigStartValue, else 0)")
     base_id: int | None = key(integer(0, _CAN_ID_MAX), None,
         "move the messages so that the lowest id is this")
@@ -56,7 +56,7 @@ class DbcConfig:
     units: Mapping[str, str] = key(meanings(units.names()), {},
         "unit text of the DBC = the unit that it means")
     send_type: Mapping[str, str] = key(meanings(tuple(SEND_TYPES)), {},
-        "GenMsgSendType of the DBC = what it means")
+        "GenMsgSendType of the DBC = its meaning")
 
     @property
     def silent_on_loss(self) -> bool:
@@ -82,7 +82,7 @@ class CanopenConfig:
     cia402_mirrors: bool = key(BOOLEAN, True,
         "show the objects 6000h..67FFh (speed, DC link voltage, error code) that generic drive tools know")
     store: str | None = key(TEXT, None,
-        "folder of what masters store (default: the service's state folder; else for root /var/lib/kontronik-can-gw, "
+        "folder of the parameters that masters store (default: the service's state folder; else for root /var/lib/kontronik-can-gw, "
         "for others ~/.local/state/kontronik-can-gw)")
 
 
@@ -101,13 +101,13 @@ class DronecanConfig:
     rate_hz: int = key(integer(1, 200), 50,
         "esc.Status of each ESC in a second while its telemetry is fresh; ArduPilot needs 10")
     extended_hz: int = key(integer(0, 200), 0,
-        "esc.StatusExtended (throttle, duty, error bits) of each ESC in a second; 0: none, for it cannot say that a value is unknown")
+        "esc.StatusExtended (throttle, duty, error bits) of each ESC in a second; 0: none, because it cannot mark a value as unknown")
     rpm: str = key(choice("motor", "output", "electrical"), "motor",
         "speed that is sent: of the 'motor' (ArduPilot, PX4), of the 'output' of the gear, 'electrical' (Betaflight)")
     negative_rpm: bool = key(BOOLEAN, True,
         "rpm is negative while the motor turns backward, as the DSDL requires; false: never negative")
     health: str = key(choice("gateway", "esc"), "gateway",
-        "what the node's health says: with 'esc' errors of an ESC and lost telemetry too, and ArduPilot does not arm then")
+        "source of the node's health: 'esc' includes errors of an ESC and lost telemetry, with which ArduPilot does not arm")
     log_messages: bool = key(BOOLEAN, True,
         "send errors of an ESC that begin and end as LogMessage, with the remedy")
 # fmt: on

@@ -202,14 +202,14 @@ class Text(NamedTuple):
 # fmt: off
 LINK_STATES: Mapping[LinkState, Text] = {
     LinkState.NEVER_SEEN: Text(
-        "nothing has come since the start",
+        "nothing was received since the start",
         "Switch the ESC on. Check the cable and the telemetry setting of the ESC. A KOSMIK sends after one throttle pulse."),
     LinkState.SEARCHING: Text(
-        "bytes come, but no good frame yet",
-        "If it stays: the ESC may be set to another protocol, or the line is disturbed. The log and decode say what it looks like."),
-    LinkState.OK: Text("good frames come"),
-    LinkState.DEGRADED: Text("good frames come, and many CRC errors or dropped bytes with them", GatewayError.CRC_RATE.remedy),
-    LinkState.LOST: Text("good frames came, and come no more", GatewayError.TELEMETRY_LOST.remedy),
+        "bytes are received, but no valid frame yet",
+        "If it stays: the ESC may be set to another protocol, or the line is disturbed. The log and decode show the probable cause."),
+    LinkState.OK: Text("valid frames are received"),
+    LinkState.DEGRADED: Text("valid frames are received, with many CRC errors or dropped bytes", GatewayError.CRC_RATE.remedy),
+    LinkState.LOST: Text("valid frames were received, but not any longer", GatewayError.TELEMETRY_LOST.remedy),
     LinkState.PORT_ERROR: Text("the serial port cannot be opened or read", GatewayError.PORT_GONE.remedy),
 }
 CAN_STATES: Mapping[CanState, Text] = {
@@ -219,15 +219,15 @@ CAN_STATES: Mapping[CanState, Text] = {
     CanState.ERROR_PASSIVE: Text("works, with many errors on the bus", GatewayError.CAN_PASSIVE.remedy),
     CanState.BUS_OFF: Text(
         "switched off by errors on the bus: no frame can leave",
-        f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0 somebody has to restart the interface."),
+        f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0, restart the interface by hand."),
     CanState.DOWN: Text(
         "the CAN interface is down or missing: no frame can leave",
-        "Plug the adapter in, set the interface up. kontronik-can-gw doctor names the command."),
+        "Plug the adapter in, set the interface up. kontronik-can-gw doctor shows the command."),
 }
 GATEWAY_STATES: Mapping[GatewayState, Text] = {
     GatewayState.STARTING: Text("opens its ports and the CAN interface"),
-    GatewayState.RUNNING: Text("at work"),
-    GatewayState.STOPPING: Text("about to end"),
+    GatewayState.RUNNING: Text("running"),
+    GatewayState.STOPPING: Text("shutting down"),
     GatewayState.REPLAY: Text("the values come from a recording, not from an ESC"),
 }
 # fmt: on
@@ -270,7 +270,7 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
     ]
 
 
-_VALUES = "What a signal of a DBC of your own can be bound to, by its name or under [dbc.bind]; the signal's unit may be another."
+_VALUES = "Signals of your own DBC can be bound to these values, by name or under [dbc.bind]. Their unit may differ."
 
 
 def place(index: int, sub: int) -> str:
