@@ -70,8 +70,8 @@ class Kiss:
                 break
             temperature, voltage, current, charge, speed = _BODY.unpack(frame[:9])
             offset = self.counters.bytes - len(self._pending)
-            data = (temperature, voltage, current, charge, speed * 100)
-            found.append(Reading(FORM, offset, data))
+            steps = (temperature, voltage, current, charge, speed * 100)
+            found.append(Reading(FORM, offset, steps))
             self._pending = self._pending[FORM.length :]
             self.counters.live += 1
         if self._lost:
