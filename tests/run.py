@@ -56,7 +56,7 @@ STEPS = {
     "tools": f"{PYTEST} -m 'extended or rights' --ignore=tests/vcan {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
     "qemu": FAULTS.format("qemu"),
-    "soak": FAULTS.format("soak") + " --minutes=60",
+    "soak": FAULTS.format("soak") + " --minutes=240",
     "hour": "python tests/hour/hour_programme.py",
     "put-in": "python tests/mutants/put_in_faults.py",
     "wheels": "python tests/native/wheels.py {scratch}",

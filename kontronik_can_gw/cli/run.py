@@ -183,8 +183,8 @@ def _parameter_store(folder: Path) -> "ParameterStore":
 def settle_memory() -> None:
     """Give back what the start needed, and freeze all present objects, so that garbage collections never scan them again.
 
-    The hot path makes no reference cycles (tests/runtime/test_garbage.py), so later collections only scan the young generation; a full
-    collection runs only here, at the start.
+    The hot path makes no reference cycles (tests/runtime/test_garbage.py), so later collections only scan the young generations. Full
+    collections, which free what the interpreter keeps of freed objects, run here and once a minute (runtime/housekeeping.py).
     """
     from kontronik_can_gw.native.load import give_back
 

@@ -1,5 +1,6 @@
 """What the loop does now and then, not with each frame: line errors, sums of the log, captures' reports, statistics, signs of life."""
 
+import gc
 import logging
 import time
 from collections.abc import Sequence
@@ -31,6 +32,12 @@ MAX_LATE_NS = SECOND // 2
 """The loop is woken for a round only if the round is late by this much: usually something else wakes the loop before."""
 PROCESS_NS = 10 * SECOND
 """How often the process's resources are asked for: that costs more than the rest of a round."""
+COLLECT_NS = 60 * SECOND
+"""Interval of full garbage collections, which take less than a millisecond.
+
+CPython keeps up to 2 000 freed tuples of each size for later use, some MB in all, and frees them only in a full collection. None runs by
+itself (cli/run.py, ``settle_memory``). The objects of the start are frozen, so that a collection does not visit them.
+"""
 STATUS_NS = SECOND
 """The service manager is given a line at most this often."""
 
@@ -63,6 +70,7 @@ class Housekeeping:
         self._program = program
         self._alive_due = 0 if notifier.watchdog_ns is not None else None
         self._notify_due = 0
+        self._collect_due: int | None = None
         self._process, self._process_due = ProcessFacts(), 0
         self._node_states: list[tuple[int, NmtState]] = []
 
@@ -76,9 +84,18 @@ class Housekeeping:
         self.follow_recorder(now)
         self.publish(now)
         self._notify(now)
+        self._collect(now)
         self.wake_due = self.due + MAX_LATE_NS
         if (due := self._alive_due) is not None and due > now:  # else something is stuck
             self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
+
+    def _collect(self, now: int) -> None:
+        """Free what the interpreter keeps of freed objects, once a minute."""
+        if self._collect_due is not None and now >= self._collect_due:
+            gc.collect()
+            self._collect_due = None
+        if self._collect_due is None:
+            self._collect_due = now + COLLECT_NS
 
     def publish(self, now: int) -> None:
         """Hand the statistics' thread what a document is made of, if it is time."""

@@ -28,6 +28,7 @@ import qemu_faults  # noqa: F401
 import serial_faults  # noqa: F401
 from fault_report import FAILED, PAGE, Fault, Report, in_order, put
 from harness import Bench
+from memory_slope import Sample, faults_in, slope_kib_per_hour
 
 PROJECT = Path(__file__).resolve().parents[2]
 REPORT = "report.json"
@@ -97,7 +98,10 @@ def run_one(bench: Bench, fault: Fault, rounds: Sequence[object], report: Report
 
 
 def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> None:
-    """Faults until then, of those that the same gateway process lives through; then its memory, descriptors and threads."""
+    """Faults until then, of those that the same gateway process lives through; then its memory, descriptors and threads.
+
+    The memory is judged by its growth and, after an hour or more, by its slope.
+    """
     faults = [
         fault
         for fault in in_order()
@@ -106,6 +110,7 @@ def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> 
     row = report.of(SOAK)
     bench.said_instead = "comes and goes"  # as a port does here: it has no line each time
     before = bench.gateway.figures()
+    samples: list[Sample] = []
     while time.monotonic() < end:
         fault = generator.choice(faults)
         time.sleep(generator.uniform(0.5, 3))
@@ -113,6 +118,9 @@ def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> 
             before = bench.gateway.figures()
         row.injected += 1
         run_one(bench, fault, [generator.choice(fault.rounds)], report)
+        samples.append(Sample(time.monotonic(), bench.gateway.figures()["rss"]))
+    row.notes += faults_in(samples)
+    print(f"memory: {slope_kib_per_hour(samples):.0f} KiB an hour, {len(samples)} samples")
     row.notes += bench.gateway.growth(before, MAX_GROWTH_KIB)
     row.recovered = 0 if row.notes else row.injected
     print(row.told, bench.gateway.figures())

@@ -11,6 +11,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from fault_report import FAILED, FAULTS, GOOD, PAGE, Report, Row, in_order, put, shown
 from harness import Bench
+from memory_slope import HOUR_S, Sample, faults_in, slope_kib_per_hour
 from programme import PROJECT, conclude
 from qemu_adapter import SerialAdapter
 
@@ -117,3 +118,25 @@ def test_rows_that_were_run_take_the_place_of_older_ones_whatever_they_show() ->
     line = f"| {fault} | 3 | 3 | 0.10 s (limit 2 s) | 1 | 0 | failed |"
     assert shown(after) == shown(before) | {fault: line}
     assert put(before, Report()) == before
+
+
+@pytest.mark.parametrize(
+    ("kib_per_hour", "hours", "is_good"),
+    [(0, 4, True), (100, 4, True), (160, 4, False), (12_000, 4, False), (12_000, 0.9, True)],
+)
+def test_memory_is_judged_by_its_slope(kib_per_hour: float, hours: float, is_good: bool) -> None:
+    """Pages come and go; what a run takes at its beginning does not count."""
+    samples = []
+    for second in range(0, round(hours * HOUR_S), 20):
+        first = 4000 if second > 600 else second * 6
+        noise = second * 7919 % 300
+        rss = 27_000 + first + noise + kib_per_hour * second / HOUR_S
+        samples.append(Sample(second, round(rss)))
+    assert (faults_in(samples) == []) == is_good
+    late = [each for each in samples if each.seconds > 600]
+    assert slope_kib_per_hour(late) == pytest.approx(kib_per_hour, rel=0.02, abs=15)
+
+
+def test_the_slope_of_few_samples_is_none() -> None:
+    assert slope_kib_per_hour([]) == slope_kib_per_hour([Sample(1, 2)]) == 0
+    assert faults_in([]) == []

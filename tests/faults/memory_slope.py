@@ -1,0 +1,45 @@
+"""Judges resident memory by its slope over time, because a limit of its growth misses what grows slowly."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+HOUR_S = 3600
+MAX_KIB_PER_HOUR = 128
+"""Four hours may add 0.5 MB. The free lists that grew with recording, CANopen and DroneCAN added 3.3 MB in a quarter of an hour."""
+MIN_HOURS = 1
+"""A shorter run tells nothing: memory is given back in pages, and faults take some for a while."""
+_WARM_UP = 0.25
+"""Part of the run that does not count: caches and buffers reach their sizes."""
+
+
+class Sample(NamedTuple):
+    """Resident memory at a time."""
+
+    seconds: float
+    rss_kib: int
+
+
+def slope_kib_per_hour(samples: Sequence[Sample]) -> float:
+    """The slope of the straight line that fits best (least squares); 0 for less than two samples."""
+    count = len(samples)
+    if count < 2:
+        return 0.0
+    mean_time = sum(each.seconds for each in samples) / count
+    mean_rss = sum(each.rss_kib for each in samples) / count
+    spread = sum((each.seconds - mean_time) ** 2 for each in samples)
+    common = sum((each.seconds - mean_time) * (each.rss_kib - mean_rss) for each in samples)
+    return common / spread * HOUR_S
+
+
+def faults_in(samples: Sequence[Sample]) -> list[str]:
+    """What is wrong with the memory of a run, in words; empty for a run that is shorter than ``MIN_HOURS``."""
+    if not samples:
+        return []
+    begin, end = samples[0].seconds, samples[-1].seconds
+    if end - begin < MIN_HOURS * HOUR_S:
+        return []
+    settled = [each for each in samples if each.seconds >= begin + _WARM_UP * (end - begin)]
+    slope = slope_kib_per_hour(settled)
+    if slope <= MAX_KIB_PER_HOUR:
+        return []
+    return [f"memory grows by {slope:.0f} KiB an hour"]

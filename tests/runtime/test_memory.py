@@ -1,0 +1,105 @@
+"""Memory does not grow with what a gateway receives: counts of allocations, whatever the speed of the machine is."""
+
+import gc
+import sys
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+import wire_world
+from capture_bench import made
+from wire_world import World, loop_in, run
+
+from kontronik_can_gw.config.keys import RecordConfig
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.runtime.housekeeping import COLLECT_NS
+from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+from kontronik_can_gw.runtime.recorder import Recorder
+
+LIVE_EACH = 20 * MS
+EVENTS_A_SECOND = 2 * (SECOND // LIVE_EACH + 1)
+"""Live and info frames of two ESCs."""
+ONCE = 60
+"""Blocks that are allocated once, whenever that happens: a number above 256, a list that grows."""
+
+
+class Everything:
+    """Two ESCs with CANopen nodes and DroneCAN, recorded, in a world without a clock."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, folder: Path) -> None:
+        setup, layout = made(2, True, dronecan={"enabled": True, "node_id": 42})
+        self.world = world = World(2)
+        self.recorder = Recorder(folder, RecordConfig(), clock=world.clock)
+        patch.setattr(wire_world, "Gateway", partial(RecordedGateway, self.recorder.put))
+        further = [each.make for each in setup.outputs]
+        canopen = setup.canopen
+        self.loop = loop_in(world, patch, setup.escs, layout, canopen, further=further)
+        self.loop._housekeeping._recorder = self.recorder
+        self.loop.open()
+        self.loop.begin()
+        self.count = 0
+
+    def pass_second(self) -> None:
+        """Values, and an error bit, change. What the world itself keeps is dropped."""
+        world, begin = self.world, self.world.now
+        for wire in world.wires:
+            del wire.arrivals[: wire._read], wire._bytes[: wire._read]
+            wire._read = 0
+            wire.looks.clear()
+            for at in range(begin, begin + SECOND, LIVE_EACH):
+                self.count += 1
+                errors = (self.count // 37 % 2) << 20
+                live = LiveData(electrical_speed=self.count % 90_000, operating_errors=errors)
+                self._put(wire, encode(live, WireLayout.V4), at)
+            self._put(wire, encode(InfoData(), WireLayout.V4), begin + SECOND - 5 * MS)
+        world.bus.sent.clear()
+        del world.looks[:-2]
+        run(self.loop, world, begin + SECOND)
+        self.recorder._work([])  # what the thread does
+
+    def _put(self, wire: wire_world.Wire, data: bytes, at: int) -> None:
+        wire.put(data, [at + (n + 1) * wire_world.NS_PER_BYTE for n in range(len(data))])
+
+
+@pytest.fixture
+def settled() -> Iterator[None]:
+    """As the program does it at its start: no full collection by itself."""
+    gc.collect()
+    gc.freeze()
+    before = gc.get_threshold()
+    gc.set_threshold(before[0], before[1], (1 << 31) - 1)
+    yield
+    gc.set_threshold(*before)
+    gc.unfreeze()
+
+
+@pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
+def test_a_thousand_events_leave_no_allocation(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, settled: None, core_language: str
+) -> None:
+    """From the collection of one minute to that of the next, with recording, CANopen and DroneCAN."""
+    del settled, core_language
+    it = Everything(monkeypatch, tmp_path)
+    collected: list[int] = []
+    collect = gc.collect
+
+    def counted() -> int:
+        found = collect()
+        collected.append(sys.getallocatedblocks())
+        return found
+
+    monkeypatch.setattr(gc, "collect", counted)
+    for _ in range(3 * COLLECT_NS // SECOND + 3):
+        it.pass_second()
+    sent = it.loop.gateway.status.sent_frames
+    it.loop.close()
+    assert sent > 10_000
+    assert len(collected) == 3, "one a minute"
+    thousands = COLLECT_NS // SECOND * EVENTS_A_SECOND // 1000
+    assert thousands >= 6
+    growth = collected[2] - collected[1]
+    assert growth < ONCE, f"{growth} blocks in {thousands} 000 events"
