@@ -41,8 +41,8 @@ the DBC (-c, --dbc) and never sends a frame. SOURCE is the name of an interface,
 such as vcan0. Without it the configuration names the interface, or it is can0.
 
 SOURCE can also be a recording, which is played in real time: a capture (.kcap),
-a file of UART bytes, or a CAN log (candump .log, .asc, .blf, .trc, .mf4). A file
-that has the name of an interface is opened as ./NAME. A recording may be a pipe:
+a file of UART bytes, or a CAN log (candump .log, .asc, .blf, .trc, .mf4). Write
+./NAME for a file that has the name of an interface. A recording may be a pipe:
 ssh BOARD candump -L can0 | kontronik-can-gw monitor -
 
 keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it,

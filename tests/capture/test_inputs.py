@@ -21,7 +21,7 @@ from kontronik_can_gw.desk.recordings.inputs import (
     Input,
     open_input,
 )
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 
@@ -83,7 +83,7 @@ def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
     bench = plain_run(1)
     with pytest.raises(UserError, match="has no captures"):
         open_input(tmp_path)
-    with pytest.raises(RunError, match="no such file"):
+    with pytest.raises(UserError, match="no such file"):
         open_input(tmp_path / "nothing")
     capture(tmp_path / "20260101T000000Z-aaaaaa-0000.kcap", bench.setup, bench.entries)
     capture(tmp_path / "20260102T000000Z-bbbbbb-0000.kcap", bench.setup, bench.entries, run="b")

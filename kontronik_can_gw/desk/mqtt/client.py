@@ -120,7 +120,7 @@ class MqttClient:
     def _use_tls(self) -> None:
         """Use the certificates of the configuration. Raises OSError, with the files, if they are unusable."""
         config = self._config
-        files = [config.ca_file, config.cert_file, config.key_file]
+        files = (config.ca_file, config.cert_file, config.key_file)
         try:
             # Without this password, a key with a passphrase would ask for it on the terminal.
             self._client.tls_set(*files, keyfile_password="")
