@@ -70,6 +70,14 @@ def two(_: Path) -> contextlib.AbstractContextManager[Bench]:
     return bench_of(prefix=WITHOUT_OVERRIDE)
 
 
+def everything(folder: Path) -> contextlib.AbstractContextManager[Bench]:
+    """``two`` with recording and DroneCAN."""
+    record = f'[record]\ndirectory = "{folder / "captures"}"\nkeep_mb = 20\nmin_free_mb = 1\n'
+    return bench_of(
+        prefix=WITHOUT_OVERRIDE, more=record + "[dronecan]\nenabled = true\nnode_id = 100\n"
+    )
+
+
 def eight(_: Path) -> contextlib.AbstractContextManager[Bench]:
     """Slow ones: feeder and judge have the processor, too."""
     layouts = (Layout.V4, Layout.LEGACY)

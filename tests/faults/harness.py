@@ -167,6 +167,7 @@ class Bench:
     """Everything that runs around one gateway.
 
     ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen``: with a node for each ESC.
+    ``more``: further tables of the configuration.
     """
 
     said_instead: str | None = None
@@ -181,6 +182,7 @@ class Bench:
         *,
         slack_ns: int = 60 * MS,
         canopen: bool = True,
+        more: str = "",
         store: Path | None = None,
         prefix: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
@@ -193,7 +195,7 @@ class Bench:
         self.config = self.folder / "gateway.toml"
         self.prefix = tuple(prefix)
         self.environment = dict(environment or {})
-        self.config.write_text(self._configuration(canopen))
+        self.config.write_text(self._configuration(canopen) + more)
         self.watch = BusWatch(watched, table, self.escs, slack_ns=slack_ns).start()
         self.feeder = Feeder(self.escs).start()
         self._gateway: Gateway | None = None
