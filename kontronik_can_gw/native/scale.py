@@ -2,6 +2,7 @@
 
 import math
 import struct
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
@@ -26,7 +27,8 @@ END_OF_TIME = 1 << 61
 _LIMIT = 1 << 63
 _MAX_DIGITS = 15
 """Digits that a factor of a DBC has at most."""
-_MAX_POWER = 100
+_SMALLEST, _LARGEST = Fraction(sys.float_info.min), Fraction(sys.float_info.max)
+_MAX_POWER = 330
 """A factor that fits is searched within this power of ten."""
 
 
@@ -128,6 +130,8 @@ def _fitting_factor(
     coarser = [first * 10**power for power in range(1, _MAX_POWER)]
     finer = [first / 10**power for power in range(1, _MAX_POWER)]
     for factor in (*map(Fraction, rounded), *coarser, *finer):
+        if not _SMALLEST <= abs(factor) <= _LARGEST:
+            continue  # no factor of a DBC, which is a float
         ratio = signal.factor / factor
         other = replace(
             signal,
@@ -137,7 +141,7 @@ def _fitting_factor(
         )
         try:
             set_one(type(row).from_buffer_copy(row), other, value)
-        except NotInCore:
+        except (NotInCore, OverflowError):
             continue
         return f" Factor {_decimal(factor)} fits"
     return ""

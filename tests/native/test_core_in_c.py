@@ -89,6 +89,21 @@ def test_a_factor_of_many_digits_is_in_c_and_gives_the_same_frames(
         assert len(python) == 1
 
 
+@pytest.mark.parametrize("kind", ["", "SIG_VALTYPE_ 256 S : 1;"])
+@pytest.mark.parametrize("offset", ["0", "1e9"])
+@pytest.mark.parametrize("factor", ["1e-300", "-5e-324", "1e30", "0.00000012345678"])
+def test_a_factor_of_any_size_is_refused_with_one_that_fits(
+    factor: str, offset: str, kind: str
+) -> None:
+    text = f'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n SG_ S : 0|32@1- ({{}},{offset}) [0|0] "" X\n{kind}\n'
+    escs = [EscSettings("esc1")]
+    with pytest.raises(NotInCore) as found:
+        Tables(compiled(text.format(factor), bind={"S": "output_speed"}), escs)
+    said = re.search(r"leaves 6[34] bits\. Factor (\S+) fits", str(found.value))
+    assert said is not None, str(found.value)
+    Tables(compiled(text.format(said[1]), bind={"S": "output_speed"}), escs)
+
+
 def test_a_factor_that_leaves_64_bits_is_named_with_one_that_fits() -> None:
     """``output_speed`` is divided by pole pairs and gear, which may be large."""
     text = 'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n SG_ S : 0|32@1+ ({},0) [0|0] "" X\n'
