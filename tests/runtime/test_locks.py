@@ -25,12 +25,12 @@ NODES = [f"{CHANNEL}: CANopen node {number}" for number in (5, 6, 7)]
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of this test alone."""
+    """Return the lock folder of this test alone. Any user may create it."""
     path = tmp_path / "run" / "kontronik-can-gw" / "lock"
     monkeypatch.setattr(folders, "RUN", tmp_path / "run")
     monkeypatch.setattr(folders, "TEMPORARY", tmp_path / "tmp")
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
-    path.parent.parent.mkdir()
+    path.parent.mkdir(parents=True)
     return path
 
 
@@ -110,7 +110,7 @@ def test_what_cannot_be_locked_is_reported_once_and_done_without(
         for name in NODES:
             (folder / file_name(name)).symlink_to(tmp_path / "other")
     else:
-        folder.parent.touch()
+        folder.touch()
     said: list[str] = []
     mine = Locks(said.append)
     assert mine.hold(NODES[:1]) == mine.hold(NODES) == []
