@@ -4,8 +4,8 @@ import codecs
 import re
 import unicodedata
 
-_CTRL_Z = re.compile(r"[\s\x1a]*\x1a\s*\Z")
-"""The end of a file as DOS editors mark it."""
+_CTRL_Z = re.compile(r"[\s\x1a]*\x1a[\s\0\x1a]*\Z")
+"""The end of a file as DOS editors mark it, also with the padding of a block after it."""
 _PLAIN_LETTERS = {"\u00b5": "u", "\u03bc": "u", "\u00b0": "deg", "\u00df": "ss"}
 
 

@@ -4,6 +4,7 @@
 writes.
 """
 
+import contextlib
 from collections.abc import Callable
 
 from kontronik_can_gw.config.keys import CanConfig
@@ -78,7 +79,8 @@ class CanOpener:
     def _work(self, items: list[CanPort | None]) -> None:
         for port in items:
             if port is not None:
-                port.close()
+                with contextlib.suppress(Exception):  # whatever a driver raises: the next is served
+                    port.close()
             elif not self._is_closed:
                 result = self._open()
                 if self._is_closed:

@@ -310,6 +310,7 @@ LATIN = SHIPPED.replace(
         pytest.param(SHIPPED.replace("\r\n", "\n").encode(), id="LF line ends"),
         pytest.param(SHIPPED.encode() + b"\x1a", id="Ctrl-Z"),
         pytest.param(SHIPPED.encode() + b"\r\n\x1a\r\n", id="Ctrl-Z on a line"),
+        pytest.param(SHIPPED.encode() + b"\x1a\r\n\0\0", id="Ctrl-Z and padding"),
         pytest.param(LATIN.encode("latin-1"), id="Latin-1"),
         pytest.param(LATIN.encode("utf-8"), id="UTF-8"),
         pytest.param(LATIN.encode("utf-8-sig").replace(b"\r\n", b"\r") + b"\x1a", id="all at once"),

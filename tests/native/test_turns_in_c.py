@@ -395,3 +395,17 @@ hold_ups = test_hold_ups.test_whatever_holds_the_process_up_values_end_in_time_a
 for seed in range(3):
     hold_ups.hypothesis.inner_test(seed, 60, 10, 0.05, seed % 2, seed % 3)
 """
+
+
+def test_nothing_is_handed_to_the_kernel_in_bus_off_by_turns_in_c(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    turns = InC(monkeypatch)
+    turns.feed(LiveData(electrical_speed=speed) for speed in range(300))
+    turns.run(1)
+    turns.bus.state = CanState.BUS_OFF
+    turns.loop.can.controller.follow(turns.bus, turns.world.now)
+    sent_before = len(turns.bus.sent)
+    assert sent_before > 0
+    turns.run(2)
+    assert len(turns.bus.sent) == sent_before

@@ -39,15 +39,15 @@ LIMITS: dict[str, dict[str, float]] = {
         "starred literals": 6,
     },
     "docs": {
-        "all patterns": 10.1,
+        "all patterns": 10,
         "what-as-noun": 1.1,
         "that-of": 0.9,
         "where-for-if": 0.6,
         "fragment-of": 0.2,
-        "animated": 6.2,
+        "animated": 6.1,
         "nobody-none": 0.6,
         "but-for": 0.8,
-        "lines over 100 columns": 205,
+        "lines over 100 columns": 206,
     },
 }
 GOALS: dict[str, dict[str, float]] = {
