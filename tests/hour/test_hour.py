@@ -93,5 +93,5 @@ def test_a_mutilated_file_is_found_out(
 
 def test_a_command_that_fails_ends_the_programme(tmp_path: Path) -> None:
     words = ["convert", str(tmp_path / "none.kcap")]
-    with pytest.raises(RuntimeError, match=r"exit code 1: .*none\.kcap"):
+    with pytest.raises(RuntimeError, match=r"exit code 2: .*none\.kcap"):
         Step("bad", words, tmp_path / "a.csv", lambda _: Verdict()).run()
