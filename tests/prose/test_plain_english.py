@@ -9,7 +9,7 @@ from plain_english import Measure, measure_groups, measure_text
 
 LIMITS: dict[str, dict[str, float]] = {
     "product": {
-        "all patterns": 31.5,
+        "all patterns": 31.4,
         "what-as-noun": 8,
         "that-of": 3.1,
         "where-for-if": 4.5,
@@ -17,7 +17,7 @@ LIMITS: dict[str, dict[str, float]] = {
         "animated": 9.2,
         "nobody-none": 2.3,
         "but-for": 3.8,
-        "lines over 100 columns": 1013,
+        "lines over 100 columns": 1012,
         "tokens a code line": 9,
         "conditional expressions": 29.2,
         "tuple assignments": 15.9,
@@ -39,15 +39,15 @@ LIMITS: dict[str, dict[str, float]] = {
         "starred literals": 6,
     },
     "docs": {
-        "all patterns": 10,
-        "what-as-noun": 1.1,
-        "that-of": 0.9,
-        "where-for-if": 0.6,
+        "all patterns": 6.6,
+        "what-as-noun": 0.6,
+        "that-of": 0.7,
+        "where-for-if": 0.2,
         "fragment-of": 0.2,
-        "animated": 6.1,
-        "nobody-none": 0.6,
-        "but-for": 0.8,
-        "lines over 100 columns": 206,
+        "animated": 4.5,
+        "nobody-none": 0.4,
+        "but-for": 0.4,
+        "lines over 100 columns": 67,
     },
 }
 GOALS: dict[str, dict[str, float]] = {
