@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from kontronik_can_gw.cli import discard_output, say
+from kontronik_can_gw.cli.arguments import default_config
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.recordings.convert import Output
@@ -47,9 +48,16 @@ def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
 
 
 def configuration_files(config: Path | None, dbc: Path | None = None) -> list[Path]:
-    """Return the files that are read for ``-c`` and ``--dbc``: with a configuration its DBC and its EDS, too."""
+    """Return the files that are read for ``-c`` and ``--dbc``.
+
+    These are the configuration, its DBC and its EDS. Without ``-c``, commands look into the default
+    configuration, even if they then use nothing of it.
+    """
     found = [] if dbc is None else [dbc]
-    if config is not None:
+    if config is None:
+        default = default_config()
+        found += [] if default is None else [default]
+    else:
         loaded = load(config)
         found += [config, loaded.dbc_path, loaded.eds_path]
     return found

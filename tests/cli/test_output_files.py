@@ -78,6 +78,8 @@ def test_an_output_that_cannot_be_written_leaves_nothing(command: str, folder: P
         ("dbc -o {o}", "gateway.toml"),
         ("dbc -c gateway.toml -o {o}", "own.dbc"),
         ("dbc --from own.dbc -o {o}", "own.dbc"),
+        ("dbc --canopen -o {o}", "gateway.toml"),
+        ("eds -o {o}", "gateway.toml"),
         ("eds -c nodes.toml -o {o}", "own.eds"),
         ("describe -o {o}", "gateway.toml"),
         ("describe --dbc own.dbc -o {o}", "own.dbc"),
