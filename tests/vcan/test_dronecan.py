@@ -10,6 +10,8 @@ import pytest
 from harness import PtyPort
 from vcan_tools import LIMIT_S, GatewayProcess, configuration, feeding, sent_by, wait_for
 
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+
 pytestmark = pytest.mark.extended
 dronecan: Any = import_module("dronecan")
 Start = Callable[..., GatewayProcess]
@@ -57,6 +59,13 @@ class Peer:
         self.node.close()
 
 
+def expected_rpm(live: LiveData) -> int:
+    """The speed of a motor with 7 pole pairs, negative in the states Sync_Backward and Backward."""
+    rpm = (live.electrical_speed + 3) // 7
+    is_backward = live.operating_state in (19, 22)
+    return -rpm if is_backward else rpm
+
+
 def check_statuses(ports: list[PtyPort], peer: Peer) -> None:
     """Telemetry begins, and each status from now on is a reading that was sent."""
     for port in ports:
@@ -66,7 +75,7 @@ def check_statuses(ports: list[PtyPort], peer: Peer) -> None:
     for event in list(peer.statuses):
         got = event.message
         assert any(
-            (each.electrical_speed + 3) // 7 == got.rpm
+            expected_rpm(each) == got.rpm
             and abs(each.battery_voltage / 100 - got.voltage) < 0.032
             and abs(each.battery_current / 10 - got.current) < 0.126
             and abs(each.power_stage_temperature + 273.15 - got.temperature) < 0.126

@@ -68,10 +68,14 @@ def test_a_block_can_be_typed_as_it_stands(
 
 
 def assert_voltages(table: Path) -> None:
-    """README's block for newcomers ends with a table that has the voltages of the simulated ESC."""
+    """README's block for newcomers ends with a table that has the voltages of the simulated ESC.
+
+    The number of rows is not judged: the block ends as soon as an ESC is heard and `status` shows
+    it, which takes a few telemetry frames or many, as the machine is fast or slow.
+    """
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
     (column,) = (name for name in rows[0] if name.partition(" ")[0] == "battery_voltage")
     voltages = [float(row[column]) for row in rows if row[column]]
-    assert len(voltages) > 10
+    assert voltages, f"none of {len(rows)} rows has a voltage"
     assert 20 < min(voltages) <= max(voltages) < 26
