@@ -26,6 +26,8 @@ PAGES = (
     *sorted((PROJECT / "examples").rglob("*.md")),
 )
 WORDS = ("", "vcan", "root", "systemd", "network", "hardware")
+LIMIT_S = 60
+"""Ends a block that hangs, so that what it printed is shown. No block needs a quarter of it."""
 
 
 class Block(NamedTuple):
@@ -78,8 +80,11 @@ def run_block(block: Block, folder: Path, before: str = "", *around: str) -> str
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
+        code: int | str
         try:
-            code = process.wait(300)
+            code = process.wait(LIMIT_S)
+        except subprocess.TimeoutExpired:
+            code = f"no end within {LIMIT_S} s"
         finally:
             with contextlib.suppress(ProcessLookupError):  # nothing was left
                 os.killpg(process.pid, signal.SIGKILL)

@@ -18,6 +18,7 @@ NEEDS_ROS = "examples/ros2/README.md"
 
 GATEWAY = """
 mount -t sysfs sys /sys  # that of this network namespace
+mount -t tmpfs run /run  # the gateway is killed at the end and leaves its status there
 ip link set lo up
 ip link add can0 type vcan
 ip link set can0 up

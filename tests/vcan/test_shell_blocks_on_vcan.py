@@ -24,6 +24,7 @@ kontronik-can-gw() {
     wait $! || { cat said; return 1; }
 }
 mount -t sysfs sys /sys  # that of this network namespace
+mount -t tmpfs run /run  # `status` finds no gateway that another test killed
 ip link set lo up
 """
 RUNNING = """
