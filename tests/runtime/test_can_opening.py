@@ -227,7 +227,7 @@ class Slcan(threading.Thread):
 
 
 class Clock:
-    """Stands in for the module `time` in python-can's slcan driver: a sleep lasts as the test says."""
+    """Stands in for the module `time` in python-can's slcan driver. The test ends its sleep."""
 
     time = staticmethod(time.time)
 
