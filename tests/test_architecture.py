@@ -14,7 +14,7 @@ ORDER = (
     ("printable",),
     ("errors",),
     ("frames",),
-    ("lean",),
+    ("light_imports",),
     ("gateway_status",),
     ("node_state",),
     ("esc",),

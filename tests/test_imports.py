@@ -143,7 +143,7 @@ def test_the_list_can_fail(tmp_path: Path) -> None:
     assert {"rich", "kontronik_can_gw.desk.recordings.layouts"} <= found
 
 
-LEAN = "import sys; from kontronik_can_gw.lean import without_asammdf\n"
+LEAN = "import sys; from kontronik_can_gw.light_imports import without_asammdf\n"
 DATABASE = f"{LEAN}with without_asammdf(): import cantools.database\n"
 WHOLE = f"""{DATABASE}
 import cantools

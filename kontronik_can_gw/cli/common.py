@@ -44,7 +44,7 @@ def announced_config(with_nodes: bool = False) -> Path | None:
 def logging_to_stderr() -> Iterator[None]:
     """Write log lines to standard error from a thread; under systemd without time, with journald's priorities."""
     from kontronik_can_gw.runtime.fault_log import BackgroundHandler
-    from kontronik_can_gw.runtime.systemd import log_formatter
+    from kontronik_can_gw.runtime.sd_notify import log_formatter
 
     handler = BackgroundHandler(sys.stderr)
     handler.setFormatter(

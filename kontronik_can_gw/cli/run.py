@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from kontronik_can_gw.gateway import Gateway
     from kontronik_can_gw.runtime.loop import Loop
     from kontronik_can_gw.runtime.recorder import Recorder
+    from kontronik_can_gw.runtime.sd_notify import Notifier
     from kontronik_can_gw.runtime.store import ParameterStore
-    from kontronik_can_gw.runtime.systemd import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -50,7 +50,7 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.runtime.systemd import Notifier
+    from kontronik_can_gw.runtime.sd_notify import Notifier
 
     notifier = Notifier()
     refused: UserError | None = None

@@ -23,7 +23,7 @@ from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import RunError, UserError
 
 NAME = "kontronik-can-gw"
-PLAIN = Path(__file__).parents[1] / "service"
+PLAIN = Path(__file__).parents[1] / "systemd"
 """The files as they are."""
 _PROGRAM = f"/usr/bin/{NAME}"
 """The program in them."""

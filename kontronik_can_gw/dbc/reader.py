@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc.bounds import MAX_BYTES, STRING, check_bounds
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.light_imports import without_asammdf
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

@@ -17,9 +17,9 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.process import ProcessFacts, process_facts
+from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.snapshot import Moment, name_in_words
 from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.worker import Report
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from kontronik_can_gw.runtime.fault_log import FaultLog, duration
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
+from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.runtime.worker import Handover
 

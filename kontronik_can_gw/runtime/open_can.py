@@ -19,7 +19,7 @@ from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.light_imports import without_asammdf
 from kontronik_can_gw.runtime.can_port import (
     MAX_STANDARD_ID,
     RECEIVE_LIMIT,

@@ -24,7 +24,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import can_opener
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.native_poller import poller_for
-from kontronik_can_gw.runtime.systemd import Notifier
+from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.transmit_queue import Sent
 
 ESCS = (EscSettings("esc1", timeout_ns=60_000_000_000),)

@@ -30,8 +30,8 @@ from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Received
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler, Poller
+from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.serial_port import PortLost
-from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent

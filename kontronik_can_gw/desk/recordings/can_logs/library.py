@@ -24,7 +24,7 @@ from kontronik_can_gw.desk.recordings.can_logs.text import (
 )
 from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.light_imports import without_asammdf
 
 with without_asammdf():
     from can import BLFReader

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from kontronik_can_gw.desk.recordings.recording import ERROR, LATEST_NS, LogFrame
 from kontronik_can_gw.frames import MAX_EXTENDED_ID, CanFrame
-from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.light_imports import without_asammdf
 
 SECOND_NS = 1_000_000_000
 OLDEST_WALL_S = 631_152_000

@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
 from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
 from kontronik_can_gw.desk.recordings.recording import ERROR, LogFrame
-from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.light_imports import without_asammdf
 
 if TYPE_CHECKING:
     from can import Message
