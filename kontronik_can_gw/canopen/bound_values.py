@@ -13,13 +13,13 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
 from kontronik_can_gw.canopen.eds import FLOATS, SIGNED, TYPE_BITS, Entry, range_of
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
+from kontronik_can_gw.core.slots import SlotPlan
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Kind
 from kontronik_can_gw.esc.values import Value as EscValue
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
-from kontronik_can_gw.slots import SlotPlan
 
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 _EVENT_OF_PACE = {

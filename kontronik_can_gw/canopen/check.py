@@ -20,11 +20,11 @@ from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAPPING, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import CHECKED, Stored
 from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROFILE
+from kontronik_can_gw.core.esc_stream import EscStream
+from kontronik_can_gw.core.slots import Slots
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.slots import Slots
 
 Place = tuple[int, int]
 Mistake = tuple[Entry, str]

@@ -17,9 +17,9 @@ from kontronik_can_gw.capture.format import (
 )
 from kontronik_can_gw.capture.limits import check_counters, check_state, check_time
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.gateway_status import CanState, GatewayState
-from kontronik_can_gw.transmit_queue import TransmitQueue
 
 
 class TimedFrame(NamedTuple):

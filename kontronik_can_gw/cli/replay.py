@@ -18,10 +18,10 @@ from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.locks import Locks, in_use, names_of
 from kontronik_can_gw.runtime.open_can import check_interface, open_can
-from kontronik_can_gw.transmit_queue import Sent
 
 _DRAIN_S = 0.2
 """Time for a gateway to read the last bytes before the terminals are closed."""

@@ -15,7 +15,7 @@ from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.gateway import Gateway
+    from kontronik_can_gw.gateway.gateway import Gateway
     from kontronik_can_gw.runtime.loop import Loop
     from kontronik_can_gw.runtime.recorder import Recorder
     from kontronik_can_gw.runtime.sd_notify import Notifier
@@ -154,7 +154,7 @@ class _Run:
             from kontronik_can_gw.cli.recording import recorded
 
             return recorded(loaded, self._args.record, now, silent)
-        from kontronik_can_gw.gateway import Gateway
+        from kontronik_can_gw.gateway.gateway import Gateway
 
         further = [setup.make for setup in loaded.outputs]
         return Gateway(loaded.escs, loaded.layout, now, silent, loaded.canopen, further), None

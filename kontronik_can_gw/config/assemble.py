@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw import __version__
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
+from kontronik_can_gw.core.output import OUTPUTS, Given, OutputSetup, setup_of
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupplied
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
-from kontronik_can_gw.output import OUTPUTS, Given, OutputSetup, setup_of
 from kontronik_can_gw.runtime.machine import identity_digest
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.plan import Layout

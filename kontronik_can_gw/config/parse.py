@@ -12,10 +12,10 @@ from posixpath import normpath
 from typing import Any, cast
 
 from kontronik_can_gw.config.keys import REMOVED_KEYS, TABLES, Config, EscConfig, required
+from kontronik_can_gw.core.output import OUTPUTS
 from kontronik_can_gw.dbc.names import VALUES_BY_KEY, normalize
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.node_state import UNCONFIGURED
-from kontronik_can_gw.output import OUTPUTS
 
 
 def load(path: Path) -> Config:

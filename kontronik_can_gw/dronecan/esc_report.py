@@ -10,6 +10,7 @@ from fractions import Fraction
 from functools import cache
 from typing import Any, NamedTuple
 
+from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.wire import LOW, DataType, message_id
 from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, Severity
@@ -18,7 +19,6 @@ from kontronik_can_gw.esc.values import Group, Value, steps_of, values_of, with_
 from kontronik_can_gw.frames import FIRST_PART, PARTS
 from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
-from kontronik_can_gw.slots import Slot, SlotPlan, SlotSettings
 
 SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
 """Key ``rpm`` of the configuration to the value that is sent."""

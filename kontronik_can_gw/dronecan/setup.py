@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from kontronik_can_gw.core.output import Given
 from kontronik_can_gw.dronecan.esc_report import MAX_ESC_INDEX, MAX_RPM, SPEEDS
 from kontronik_can_gw.dronecan.nodes import Dronecan
 from kontronik_can_gw.dronecan.wire import MAX_NODE_ID, NODE
@@ -12,7 +13,6 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import id_block
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.output import Given
 from kontronik_can_gw.signals.plan import classic_bits
 
 _USUAL_BITRATE = 1_000_000

@@ -622,7 +622,7 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
     }
 }
 
-/* --- when (twin: dbc/messages.py) ---------------------------------------------------------------------------------------- */
+/* --- when (twin: core/messages.py) ---------------------------------------------------------------------------------------- */
 
 static int64_t due_of(const kcg *g, uint32_t i)
 {
@@ -764,7 +764,7 @@ static void request(kcg *g, uint32_t i, int64_t now)
     }
 }
 
-/* --- slots (twin: slots.py) ------------------------------------------------------------------------------------------ */
+/* --- slots (twin: core/slots.py) ------------------------------------------------------------------------------------------ */
 
 static int is_slot(const kcg *g, uint32_t i)
 {
@@ -1221,7 +1221,7 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
     g->taken = 0;
 }
 
-/* --- together (twin: core.py) ---------------------------------------------------------------------------------------- */
+/* --- together (twin: core/python_core.py) ---------------------------------------------------------------------------------------- */
 
 static void report(kcg *g, int esc, int events, int64_t now)
 {

@@ -2,7 +2,7 @@
 
    C99; no allocation, no operating system, no floating point but for float signals (KCG_FLOATS). Which messages there are is in tables
    (kcg_plan), made from a DBC by tables.py; state lives in memory that the caller gives. Time is nanoseconds of one monotonic clock.
-   The Python modules core.py, esc/telemetry.py, esc/kontronik/deframer.py and dbc/messages.py are its twin: the same
+   The Python modules core/python_core.py, esc/telemetry.py, esc/kontronik/deframer.py and core/messages.py are its twin: the same
    calls give the same frames, counters and deadlines, and they say in words what is done here. */
 #ifndef KCG_CORE_H
 #define KCG_CORE_H
@@ -223,7 +223,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
    part was sent, the rest is dropped. */
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
 #if KCG_SLOTS
-/* Slots (twin: slots.py): messages of one page, one ESC and at most 8 bytes (a transfer: 16, with KCG_DATA 64) that their owner starts and
+/* Slots (twin: core/slots.py): messages of one page, one ESC and at most 8 bytes (a transfer: 16, with KCG_DATA 64) that their owner starts and
    stops; `cycle` runs from frame to frame. `slot` is a number from 0 on, less than kcg_plan.slots. The owner may write the rows of
    `message`, `signal` and `piece` of a stopped slot at any time; of a started one all but the signals, followed by kcg_slot_changed. */
 void kcg_slot_start(kcg *g, uint32_t slot, int64_t now);

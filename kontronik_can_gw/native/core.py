@@ -1,11 +1,13 @@
-"""The core in C in place of the one in Python (core.py): the same surface, and what is read of it has the same names."""
+"""The core in C in place of the one in Python (core/python_core.py): the same surface, and what is read of it has the same names."""
 
 import ctypes as c
 from collections.abc import Sequence
 from typing import Any, cast
 
-from kontronik_can_gw.core import Follower
-from kontronik_can_gw.dbc.messages import own_ids
+from kontronik_can_gw.core.messages import own_ids
+from kontronik_can_gw.core.output import Owner
+from kontronik_can_gw.core.python_core import Follower
+from kontronik_can_gw.core.slots import Slot, Slots
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -17,9 +19,7 @@ from kontronik_can_gw.native.slots import NativeSlot, merge, reserve
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
-from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.slots import Slot, Slots
 
 _MAX_FRAMES = 256
 _LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"

@@ -3,13 +3,13 @@
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from kontronik_can_gw.core.slots import PendingSlot, PythonSlot, SlotPlan, SlotSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.slots import PendingSlot, PythonSlot, SlotPlan, SlotSettings
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.core import NativeCore

@@ -10,7 +10,7 @@ from ctypes import c_uint16, c_uint64
 from itertools import accumulate
 from typing import Any
 
-from kontronik_can_gw.dbc.messages import Traits, phases
+from kontronik_can_gw.core.messages import Traits, phases
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings

@@ -1,10 +1,10 @@
 """The CAN controller: its state from error frames and from rtnetlink, bus-off and its end, the bit rate."""
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_commands import restart

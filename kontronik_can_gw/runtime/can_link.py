@@ -11,11 +11,12 @@ import time
 from collections.abc import Callable
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.gateway_status import CanState
-from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_controller import CanController
 from kontronik_can_gw.runtime.can_opener import CanOpener
 from kontronik_can_gw.runtime.can_port import CanPort
@@ -25,7 +26,6 @@ from kontronik_can_gw.runtime.locks import IdLocks
 from kontronik_can_gw.runtime.poller import Poller, PortInput, Retry, StuckCheck
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.transmitter import Transmitter
-from kontronik_can_gw.transmit_queue import Sent
 
 MAX_RETRY_NS = SECOND // 2
 _OK = Sent.OK  # an enumeration's members are slow to look up

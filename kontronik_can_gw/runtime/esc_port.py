@@ -5,11 +5,11 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.esc.telemetry import MS, SECOND, LinkState
-from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.output import NEVER
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.facts import PortFacts
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Poller, Retry, StuckCheck

@@ -8,7 +8,7 @@ from copy import copy
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.esc_port import EscPort

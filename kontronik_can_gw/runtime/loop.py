@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.esc_port import LOOK_NS, EscPort
 from kontronik_can_gw.runtime.facts import ProgramFacts

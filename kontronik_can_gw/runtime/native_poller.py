@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native.turns import OUTPUTS
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller, PortInput
 

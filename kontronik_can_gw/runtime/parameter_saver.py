@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.facts import StoreFacts
 

@@ -16,7 +16,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 )
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayState
 
 STEP_NS = 10_000_000

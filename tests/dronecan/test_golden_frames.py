@@ -9,7 +9,8 @@ import pytest
 from dronecan_bench import Reader, dronecan, peers_frames
 from packer_oracle import random_live
 
-from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.slots import SlotSettings
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.esc_report import fill, plans_of
 from kontronik_can_gw.dronecan.wire import Assembler, DataType, message_id, response_id
@@ -23,7 +24,6 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.transfer import transfer
-from kontronik_can_gw.slots import SlotSettings
 
 protocol = dronecan.uavcan.protocol
 UNIQUE_ID = bytes(range(1, 17))

@@ -142,7 +142,7 @@ def test_a_dbc_whose_ids_are_frames_of_our_node_is_refused(
 def test_nothing_of_it_is_loaded_when_it_is_off_and_openssl_never(is_on: bool) -> None:
     code = (
         "import sys\nfrom kontronik_can_gw.config.assemble import assemble\nfrom kontronik_can_gw.config.parse import parse\n"
-        "import kontronik_can_gw.cli.run, kontronik_can_gw.gateway, kontronik_can_gw.runtime.loop, kontronik_can_gw.capture.setup\n"
+        "import kontronik_can_gw.cli.run, kontronik_can_gw.gateway.gateway, kontronik_can_gw.runtime.loop, kontronik_can_gw.capture.setup\n"
         f"assemble(parse({{'can': {{'interface': 'virtual'}}, 'dronecan': {{'enabled': {is_on}}}, 'esc': [{{'port': 'p'}}]}}, 'a.toml'))\n"
         "print('hashlib' in sys.modules, any('dronecan' in m for m in sys.modules))"
     )

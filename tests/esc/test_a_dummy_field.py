@@ -24,7 +24,7 @@ from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.values import VALUES
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.facts import (PortFacts)
 from kontronik_can_gw.runtime.snapshot import (_esc)
 

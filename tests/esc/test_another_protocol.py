@@ -27,7 +27,7 @@ from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group, values_of
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.facts import PortFacts
 from kontronik_can_gw.runtime.serial_port import SerialPort
 from kontronik_can_gw.runtime.snapshot import _esc

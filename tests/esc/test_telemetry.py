@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from esc.reference import SHORTEST_FIRST, fits
 from esc.streams import decoded, form_of, random_stream
+from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device
-from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
     MS,

@@ -7,6 +7,7 @@ import pytest
 
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.core.output import NO_IDS, Output, Owner
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -14,9 +15,8 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, steps
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.output import NO_IDS, Output, Owner
 from kontronik_can_gw.signals.plan import Layout
 
 FIRST_ID, COMMAND_ID = 0x1234500, 0x12

@@ -15,7 +15,7 @@ from kontronik_can_gw.esc.telemetry import (
     EscSettings,
     LinkState,
 )
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 
 EVENT = 'BA_ "GenMsgSendType" BO_ 256 1;\n'
 ON_CHANGE = 'BA_ "GenMsgSendType" BO_ 256 2;\n'

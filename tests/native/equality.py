@@ -27,7 +27,8 @@ from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.core import Follower, PythonCore
+from kontronik_can_gw.core.python_core import Follower, PythonCore
+from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
@@ -41,7 +42,6 @@ from kontronik_can_gw.native.rows import GATEWAY, MAX_GEAR, NotInCore
 from kontronik_can_gw.native.slots import _rows
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
-from kontronik_can_gw.slots import Slot, SlotPlan, SlotSettings
 
 START = 1_000 * SECOND
 _STEPS = (0, 1_000, 100_000, MS, 2 * MS, 5 * MS, 10 * MS, 10 * MS, 10 * MS, 50 * MS, 260 * MS)

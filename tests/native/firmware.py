@@ -10,7 +10,7 @@ import equality
 from built import STRICT
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.native.export_c import exported

@@ -13,7 +13,7 @@ from built import STRICT, built, run_sanitized
 from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData

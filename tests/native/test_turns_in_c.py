@@ -25,18 +25,18 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.output_keys import DronecanConfig
+from kontronik_can_gw.core.output import Given, Output, setup_of
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
-from kontronik_can_gw.output import Given, Output, setup_of
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.transmit_queue import Sent
 
 
 def _nodes(escs: Sequence[EscSettings]) -> CanopenSetup:

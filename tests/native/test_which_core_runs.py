@@ -19,7 +19,7 @@ from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import compile as compiling
 from kontronik_can_gw.native import load, objects
 from kontronik_can_gw.native.compile import compile_core

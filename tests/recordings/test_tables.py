@@ -21,6 +21,7 @@ from recordings import (
 )
 
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.desk.recordings.convert import _table_writer
 from kontronik_can_gw.desk.recordings.fields import (
     Choice,
@@ -35,7 +36,6 @@ from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native.binding import load
 from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import OPTIONS
@@ -17,7 +18,6 @@ from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.native_poller import NativePoller
 from kontronik_can_gw.runtime.poller import Handler
 from kontronik_can_gw.runtime.serial_port import PortLost
-from kontronik_can_gw.transmit_queue import Sent
 
 if TYPE_CHECKING:
     from wire_world import World

@@ -9,7 +9,7 @@ from typing import Any
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.facts import (
     CanFacts,
     PortFacts,

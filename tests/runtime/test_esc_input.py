@@ -19,7 +19,7 @@ from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime import serial_port, usb_adapters
 from kontronik_can_gw.runtime.esc_port import EscPort

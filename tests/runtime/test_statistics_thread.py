@@ -14,7 +14,7 @@ from statistics_bench import moment_of
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime import statistics as statistics_module
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment
 from kontronik_can_gw.runtime.statistics import Statistics

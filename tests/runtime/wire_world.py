@@ -22,7 +22,8 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway, MakeOutput
+from kontronik_can_gw.gateway.gateway import Gateway, MakeOutput
+from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime import can_opener
@@ -34,7 +35,6 @@ from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.serial_port import PortLost
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.transmit_queue import Sent
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 

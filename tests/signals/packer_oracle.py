@@ -18,9 +18,9 @@ import cantools.database
 from cantools.database.can import Database
 from esc import sheet
 
+from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 

@@ -12,7 +12,7 @@ from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.core import PythonCore
+from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.recordings.stream import Stream, StreamReader
@@ -20,9 +20,9 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import MS
-from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.gateway_status import GatewayState
-from kontronik_can_gw.transmit_queue import TransmitQueue
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames

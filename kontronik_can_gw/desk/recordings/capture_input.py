@@ -28,7 +28,7 @@ from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, tim
 from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.gateway import Gateway
+    from kontronik_can_gw.gateway.gateway import Gateway
     from kontronik_can_gw.native.offline import Frames
     from kontronik_can_gw.native.player import Player
 

@@ -14,7 +14,7 @@ from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample, timed
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.gateway import Gateway, MakeOutput
+from kontronik_can_gw.gateway.gateway import Gateway, MakeOutput
 from kontronik_can_gw.native import load
 from kontronik_can_gw.signals.plan import Layout
 

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Sample
@@ -16,7 +17,6 @@ from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.esc.values import Kind as How
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import MessagePlan, SendType
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value

@@ -7,11 +7,11 @@ spread phases, and none is sent closer than its minimum distance.
 
 from collections.abc import Sequence
 
+from kontronik_can_gw.core.output import NEVER, Owner
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.output import NEVER, Owner
 from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
 

@@ -7,15 +7,15 @@ Pure, and the way of every value: ``receive`` decodes and marks messages as pend
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-from kontronik_can_gw.dbc.messages import Messages, own_ids
+from kontronik_can_gw.core.esc_stream import EscStream
+from kontronik_can_gw.core.messages import Messages, own_ids
+from kontronik_can_gw.core.output import Owner
+from kontronik_can_gw.core.slots import Slot, Slots
 from kontronik_can_gw.esc.decoder import Reading
-from kontronik_can_gw.esc.stream import EscStream
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.slots import Slot, Slots
 
 OnEvent = Callable[[int, int, int], None]
 """ESC, bits of telemetry.Event, time."""

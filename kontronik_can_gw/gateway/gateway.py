@@ -6,13 +6,13 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.core import Core, Follower, PythonCore
+from kontronik_can_gw.core.output import NEVER, SLOTS, Output
+from kontronik_can_gw.core.python_core import Core, Follower, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway.id_conflicts import IdConflicts
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
-from kontronik_can_gw.id_conflicts import IdConflicts
 from kontronik_can_gw.native.load import make_core
-from kontronik_can_gw.output import NEVER, SLOTS, Output
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
