@@ -15,6 +15,7 @@ ORDER = (
     ("errors",),
     ("frames",),
     ("light_imports",),
+    ("times",),
     ("gateway_status",),
     ("node_state",),
     ("esc",),

@@ -17,9 +17,8 @@ from kontronik_can_gw.canopen.emergency_codes import (
     GatewayError,
     register_of,
 )
-from kontronik_can_gw.core.output import NEVER
-from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.times import MS, NEVER
 
 _MAX_PENDING = 64
 _DATA = Struct("<HBBI")

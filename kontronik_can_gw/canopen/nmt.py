@@ -8,9 +8,8 @@ from enum import IntEnum
 from functools import partial
 
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
-from kontronik_can_gw.core.output import NEVER
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.node_state import NmtState
+from kontronik_can_gw.times import MS, NEVER, SECOND
 
 _SELF_START_OFF = 4
 _CATCHING_UP_NS = SECOND // 2

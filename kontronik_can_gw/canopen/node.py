@@ -19,11 +19,11 @@ from kontronik_can_gw.canopen.pdo import Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Parameters, Stored
 from kontronik_can_gw.canopen.sync import SyncConsumer
-from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
+from kontronik_can_gw.times import NEVER
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes

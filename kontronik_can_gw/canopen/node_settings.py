@@ -7,7 +7,8 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.storage import APPLICATION, Stored
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.times import MS
 
 _SELF_START_OFF = 4
 # whatever the limits of an EDS are

@@ -23,13 +23,14 @@ from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, m
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.core.output import NEVER, Output, Owner
+from kontronik_can_gw.core.output import Output, Owner
 from kontronik_can_gw.core.slots import Slot, Slots
-from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.signals.plan import classic_bits
+from kontronik_can_gw.times import NEVER, SECOND
 
 SettingsChanged = Callable[[int, EscSettings], None]
 

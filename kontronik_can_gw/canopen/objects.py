@@ -12,7 +12,7 @@ from pathlib import Path
 
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS
-from kontronik_can_gw.esc.telemetry import MS, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import (
     VALUES,
     Group,
@@ -24,6 +24,7 @@ from kontronik_can_gw.esc.values import (
     values_of,
 )
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
+from kontronik_can_gw.times import MS
 
 U8, U16 = 0xFF, 0xFFFF
 LIVE, DERIVED, INFO, EXTREMES, LINK, GATEWAY = 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x2021

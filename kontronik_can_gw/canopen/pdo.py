@@ -14,11 +14,11 @@ from kontronik_can_gw.canopen.bound_values import bits_of, compile_pdo
 from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, Taken, check_free
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Variable, key
 from kontronik_can_gw.canopen.sync import LAST_SYNC_TYPE, SyncTransmission
-from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
-from kontronik_can_gw.esc.telemetry import MS, SECOND, Event
+from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ
+from kontronik_can_gw.times import MS, NEVER, SECOND
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
 MAX_TPDOS = 512

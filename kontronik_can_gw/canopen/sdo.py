@@ -34,7 +34,7 @@ from kontronik_can_gw.canopen.sdo_transfers import (
     segmented_download,
     segmented_upload,
 )
-from kontronik_can_gw.core.output import NEVER
+from kontronik_can_gw.times import NEVER
 
 TIMEOUT_NS = 2_000_000_000
 """A transfer ends with 05040000h this long after the last frame of either side.

@@ -2,9 +2,9 @@
 
 from kontronik_can_gw.canopen.cob_ids import SYNC, Taken, check_free
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
-from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.core.slots import Slot
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.times import NEVER
 
 MAX_WAITING = 32
 """At most this many frames of one TPDO wait for their turn after SYNCs that were read at once."""

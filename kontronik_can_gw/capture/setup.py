@@ -29,9 +29,10 @@ from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import MS
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

@@ -16,12 +16,12 @@ from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.recordings.stream import name_of
 from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.locks import Locks, in_use, names_of
 from kontronik_can_gw.runtime.open_can import check_interface, open_can
+from kontronik_can_gw.times import SECOND
 
 _DRAIN_S = 0.2
 """Time for a gateway to read the last bytes before the terminals are closed."""

@@ -22,12 +22,12 @@ from kontronik_can_gw.esc.decoder import Counters, Data, Decoder, Reading
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
-    SECOND,
     EscSettings,
     EscTelemetry,
     Event,
     LinkState,
 )
+from kontronik_can_gw.times import SECOND
 
 _DEGRADED_BYTES_PER_DROPPED = 10
 """A link is degraded if more than one byte in this many is dropped."""

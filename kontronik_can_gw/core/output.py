@@ -11,9 +11,8 @@ from typing import Any, NamedTuple, Protocol
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
+from kontronik_can_gw.times import NEVER
 
-NEVER = 1 << 62
-"""Later than every deadline, ns."""
 NO_IDS: frozenset[int] = frozenset()
 SLOTS = 4
 """Slots that an output may have for each ESC and be sent by the core in C; further ones are sent in Python."""

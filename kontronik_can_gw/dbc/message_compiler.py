@@ -11,7 +11,6 @@ from kontronik_can_gw.dbc.names import is_e2e, normalize
 from kontronik_can_gw.dbc.raw_values import raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.signal_compiler import Compilation, SignalCompiler
-from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.signals.plan import (
     FD_LENGTHS,
     SEND_TYPES,
@@ -20,6 +19,7 @@ from kontronik_can_gw.signals.plan import (
     SendType,
     SignalPlan,
 )
+from kontronik_can_gw.times import MS
 
 if TYPE_CHECKING:
     from cantools.database.can import Message

@@ -7,10 +7,10 @@ cycles (at least 3 s; never if no message has a cycle).
 
 from collections.abc import Sequence
 
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import SendType
 from kontronik_can_gw.signals.unpacker import Chunk, Part, SignalReader, Value
+from kontronik_can_gw.times import MS, SECOND
 
 _MIN_NS = 250 * MS
 _CYCLES = 3

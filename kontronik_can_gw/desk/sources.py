@@ -23,12 +23,12 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     OperatingError,
     SimulatedEsc,
 )
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.bus_listener import BusListener
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.unpacker import SignalReader
+from kontronik_can_gw.times import SECOND
 
 _MAX_LAG_S = 0.5
 _LONGEST_SLEEP_S = 0.05

@@ -4,11 +4,10 @@ The unique id goes out in three anonymous requests, each after the allocator has
 that hears another's request begins anew, later. Random numbers come from a seed, so that a replay asks at the same moments.
 """
 
-from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.dronecan.wire import ALLOCATION, LOW, MAX_NODE_ID, anonymous_id
-from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.transfer import transfer
+from kontronik_can_gw.times import MS, NEVER
 
 _PERIOD_MS, _MORE_MS, _FOLLOW_UP_MS = 600, 401, 401
 _PART = 6

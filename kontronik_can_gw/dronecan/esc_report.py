@@ -14,11 +14,12 @@ from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.wire import LOW, DataType, message_id
 from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, Severity
-from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Value, steps_of, values_of, with_direction
 from kontronik_can_gw.frames import FIRST_PART, PARTS
 from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.times import SECOND
 
 SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
 """Key ``rpm`` of the configuration to the value that is sent."""

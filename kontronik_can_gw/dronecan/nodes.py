@@ -4,16 +4,17 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.core.output import NEVER, Output, Owner
+from kontronik_can_gw.core.output import Output, Owner
 from kontronik_can_gw.core.slots import Slot
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.allocation import Allocation
 from kontronik_can_gw.dronecan.esc_report import EscReport
 from kontronik_can_gw.dronecan.wire import NODE, REQUEST, SERVICE, Assembler, DataType
-from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
+from kontronik_can_gw.times import NEVER, SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.dronecan.setup import DronecanSetup, NodeSetup

@@ -8,8 +8,8 @@ from binascii import crc_hqx
 from collections.abc import Callable
 from typing import NamedTuple
 
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.signals.transfer import END, START, TOGGLE, TRANSFER_ID
+from kontronik_can_gw.times import SECOND
 
 LOW, LOWEST = 24, 31
 """Priorities, as autopilots and their peripherals use them: of measurements, of node states and texts."""

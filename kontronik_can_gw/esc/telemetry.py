@@ -11,9 +11,8 @@ from typing import Self
 
 from kontronik_can_gw.esc.decoder import Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.times import MS, SECOND
 
-MS = 1_000_000
-SECOND = 1000 * MS
 INFO_TIMEOUT_NS = 10 * SECOND
 """Info data older than this is not available.
 

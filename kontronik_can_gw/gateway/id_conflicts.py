@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from kontronik_can_gw.core.output import NEVER, NO_IDS, Output, Owner
-from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.core.output import NO_IDS, Output, Owner
 from kontronik_can_gw.frames import block_of, ids_in_words
+from kontronik_can_gw.times import NEVER, SECOND
 
 _OVER_NS = 10 * SECOND
 """A conflict is over when no further frame has come for so long."""

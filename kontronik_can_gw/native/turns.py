@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
+from kontronik_can_gw.times import NEVER
 
 OUTPUTS = 1 << 29
 """Found: time is to pass for the outputs."""

@@ -11,9 +11,7 @@ import time
 from collections.abc import Callable
 
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.gateway_status import CanState
@@ -26,6 +24,7 @@ from kontronik_can_gw.runtime.locks import IdLocks
 from kontronik_can_gw.runtime.poller import Poller, PortInput, Retry, StuckCheck
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.transmitter import Transmitter
+from kontronik_can_gw.times import NEVER, SECOND
 
 MAX_RETRY_NS = SECOND // 2
 _OK = Sent.OK  # an enumeration's members are slow to look up

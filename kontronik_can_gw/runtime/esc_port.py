@@ -5,10 +5,9 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from kontronik_can_gw.core.output import NEVER
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import Counters
-from kontronik_can_gw.esc.telemetry import MS, SECOND, LinkState
+from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.facts import PortFacts
 from kontronik_can_gw.runtime.fault_log import FaultLog
@@ -21,6 +20,7 @@ from kontronik_can_gw.runtime.serial_port import (
     is_mini_uart,
 )
 from kontronik_can_gw.runtime.usb_adapters import Identity, find_adapter, identity_at
+from kontronik_can_gw.times import MS, NEVER, SECOND
 
 MAX_RETRY_NS = SECOND
 LOOK_NS = 100 * MS

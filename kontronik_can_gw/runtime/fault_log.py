@@ -10,9 +10,9 @@ import time
 from collections import deque
 from typing import TextIO
 
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.worker import Worker
+from kontronik_can_gw.times import SECOND
 
 log = logging.getLogger("kontronik_can_gw")
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.esc_port import LOOK_NS, EscPort
@@ -25,6 +24,7 @@ from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.runtime.worker import Handover
+from kontronik_can_gw.times import MS, SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import Recorder

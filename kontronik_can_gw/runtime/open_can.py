@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.gateway_status import CanState
@@ -29,6 +28,7 @@ from kontronik_can_gw.runtime.can_port import (
 )
 from kontronik_can_gw.runtime.socketcan_port import open_socketcan
 from kontronik_can_gw.runtime.worker import Handover, Worker
+from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
     import can

@@ -11,8 +11,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.core.output import NEVER
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.times import MS, NEVER, SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.can_link import CanLink

@@ -12,7 +12,7 @@ from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw.esc.decoder import Data, EscProtocol, Severity, bit_texts
-from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscTelemetry
+from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, EscTelemetry
 from kontronik_can_gw.esc.values import (
     VALUES,
     Divisor,
@@ -35,6 +35,7 @@ from kontronik_can_gw.runtime.facts import (
     utc,
 )
 from kontronik_can_gw.runtime.process import ProcessFacts
+from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import RecorderFacts

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.gateway_status import CanState
@@ -22,6 +21,7 @@ from kontronik_can_gw.runtime.can_port import (
     Received,
 )
 from kontronik_can_gw.runtime.link_commands import VIRTUAL, add_virtual, enable_fd, kind_of, set_up
+from kontronik_can_gw.times import SECOND
 
 _RECEIVE_BUFFER = 1 << 20
 """Bytes asked for; the kernel grants what net.core.rmem_max allows, by default twice the usual 278 frames."""

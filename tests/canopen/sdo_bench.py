@@ -7,7 +7,7 @@ from script import MS, Talker, bytes_of, hexadecimal, ms
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, Variable, key
 from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.sdo import SdoServer
-from kontronik_can_gw.core.output import NEVER
+from kontronik_can_gw.times import NEVER
 
 _U8, _U16, _U32, _TEXT, _DOMAIN, _U64 = 0x05, 0x06, 0x07, 0x09, 0x0F, 0x1B
 _ENTRIES: list[tuple[int, int, int, str, int | bytes]] = [

@@ -30,8 +30,9 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     SimulatedEsc,
 )
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.times import MS, SECOND
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_canopen.dbc"
 ONE = (EscSettings("esc1"),)

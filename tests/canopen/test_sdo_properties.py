@@ -17,7 +17,7 @@ from sdo_client import Refused, answer_to, download, upload, uploaded
 from wire import Wire
 
 from kontronik_can_gw.canopen.dictionary import Abort
-from kontronik_can_gw.core.output import NEVER
+from kontronik_can_gw.times import NEVER
 
 # ---- any traffic
 

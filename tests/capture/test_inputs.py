@@ -23,7 +23,7 @@ from kontronik_can_gw.desk.recordings.inputs import (
 )
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.times import MS, SECOND
 
 
 def plain_run(seconds: float, faults: Faults | None = None) -> Bench:

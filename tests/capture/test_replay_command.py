@@ -12,7 +12,7 @@ from capture_bench import START, Bench, capture, made
 from command_line import refused, written
 
 from kontronik_can_gw.capture.format import Kind
-from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.times import SECOND
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 

@@ -23,7 +23,7 @@ from kontronik_can_gw.config.export import as_toml, schema
 from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
 from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.times import MS
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 KEYS: dict[str, dict[str, Any]] = {

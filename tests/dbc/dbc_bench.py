@@ -14,10 +14,11 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
+from kontronik_can_gw.times import MS
 
 
 def check_comments(database: Database) -> None:

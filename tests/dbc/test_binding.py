@@ -17,10 +17,11 @@ from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.packer import e2e_crc
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import MS
 
 LIVE = LiveData(
     electrical_speed=70_000,

@@ -18,9 +18,10 @@ from kontronik_can_gw.dbc.prepare import is_mute, reporter, unreported
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.desk.describe.tables import held
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import SEND_TYPES, Role, SendType
 from kontronik_can_gw.signals.units import conversion
+from kontronik_can_gw.times import MS
 
 
 def signal(

@@ -9,9 +9,9 @@ from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.times import MS, SECOND
 
 dronecan: Any = import_module("dronecan")
 """The package; for mypy this folder has its name."""

@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 from dronecan_bench import Bench, dronecan, peers_frames
 
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.times import MS, SECOND
 
 Allocation = dronecan.uavcan.protocol.dynamic_node_id.Allocation
 

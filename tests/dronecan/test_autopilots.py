@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from dronecan_bench import LIVE, Bench, Transfer
 
-from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.times import MS, SECOND
 
 TIMEOUT = 250 * MS
 """After which the gateway's value of an ESC is not available (telemetry_timeout_ms)."""

@@ -8,8 +8,8 @@ import pytest
 from dronecan_bench import Bench, Reader, dronecan
 
 from kontronik_can_gw.dronecan.wire import MAX_PAYLOAD, MAX_TRANSFERS
-from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.times import MS
 
 
 def frame(rng: random.Random, node_ids: list[int]) -> CanFrame:

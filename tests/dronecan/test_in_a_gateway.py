@@ -17,9 +17,9 @@ from test_replay_is_identical import replayed
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.dronecan.wire import STATUS, Assembler
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import MS, SECOND
 
 ON = {"enabled": True, "node_id": 42, "per_esc_nodes": True, "extended_hz": 7}
 TOML = """

@@ -20,14 +20,8 @@ from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, devi
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device
-from kontronik_can_gw.esc.telemetry import (
-    INFO_TIMEOUT_NS,
-    MS,
-    SECOND,
-    EscSettings,
-    Event,
-    LinkState,
-)
+from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, EscSettings, Event, LinkState
+from kontronik_can_gw.times import MS, SECOND
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 

@@ -8,14 +8,9 @@ from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import Device
-from kontronik_can_gw.esc.telemetry import (
-    INFO_TIMEOUT_NS,
-    MS,
-    SECOND,
-    EscSettings,
-    LinkState,
-)
+from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, EscSettings, LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.times import MS, SECOND
 
 EVENT = 'BA_ "GenMsgSendType" BO_ 256 1;\n'
 ON_CHANGE = 'BA_ "GenMsgSendType" BO_ 256 2;\n'

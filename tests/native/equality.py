@@ -33,7 +33,7 @@ from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -42,6 +42,7 @@ from kontronik_can_gw.native.rows import GATEWAY, MAX_GEAR, NotInCore
 from kontronik_can_gw.native.slots import _rows
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.times import MS, SECOND
 
 START = 1_000 * SECOND
 _STEPS = (0, 1_000, 100_000, MS, 2 * MS, 5 * MS, 10 * MS, 10 * MS, 10 * MS, 50 * MS, 260 * MS)

@@ -15,8 +15,8 @@ from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_
 from kontronik_can_gw.desk.recordings.fields import Choice
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.recording import PlayedBlock
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.native import load
+from kontronik_can_gw.times import SECOND
 
 TEXTS = ("csv", "jsonl", "candump")
 

@@ -17,13 +17,14 @@ from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.binding import WrongObject, load
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.plan import Layout, SendType
+from kontronik_can_gw.times import MS
 
 SEEDS = 16
 

@@ -29,7 +29,7 @@ from kontronik_can_gw.core.output import Given, Output, setup_of
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
@@ -37,6 +37,7 @@ from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import MS, SECOND
 
 
 def _nodes(escs: Sequence[EscSettings]) -> CanopenSetup:

@@ -18,7 +18,7 @@ from kontronik_can_gw.esc import protocols
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import compile as compiling
 from kontronik_can_gw.native import load, objects
@@ -26,6 +26,7 @@ from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import sealed
 from kontronik_can_gw.native.rows import MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import SECOND
 
 EMPTY = Layout("", "", ())
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Car\nBO_ 256 M: 8 Gw\n SG_ {} Car\n'

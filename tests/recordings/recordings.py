@@ -10,7 +10,7 @@ from simulated_bus import Timed, flight, layout_of, write_log
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device
-from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.times import SECOND
 
 WALL_NS = 1_700_000_000 * SECOND + 250_000_000
 

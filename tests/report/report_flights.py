@@ -15,8 +15,8 @@ from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
+from kontronik_can_gw.times import SECOND
 
 Row = tuple[int, list[Value]]
 

@@ -24,8 +24,8 @@ from kontronik_can_gw.esc.kontronik.states import (
     OperatingState,
     SelfTestError,
 )
-from kontronik_can_gw.esc.telemetry import SECOND as S
 from kontronik_can_gw.signals.unpacker import Value
+from kontronik_can_gw.times import SECOND as S
 
 GAP_NS = 500_000_000
 FAULTS = Faults(

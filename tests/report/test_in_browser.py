@@ -13,7 +13,7 @@ from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.esc.telemetry import SECOND as S
+from kontronik_can_gw.times import SECOND as S
 
 pytestmark = [pytest.mark.extended, pytest.mark.skipif(PROGRAM is None, reason=MISSING)]
 

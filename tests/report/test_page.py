@@ -15,8 +15,8 @@ from kontronik_can_gw.desk.recordings.samples import fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
 from kontronik_can_gw.desk.report.summary import clock, duration, number, wall_clock
-from kontronik_can_gw.esc.telemetry import SECOND as S
 from kontronik_can_gw.signals.unpacker import SignalReader
+from kontronik_can_gw.times import SECOND as S
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"
 

@@ -9,7 +9,7 @@ from report_flights import data_of
 
 from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.esc.telemetry import SECOND as S
+from kontronik_can_gw.times import SECOND as S
 
 
 @pytest.fixture(scope="module")

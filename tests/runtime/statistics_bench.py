@@ -8,7 +8,7 @@ from typing import Any
 
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.facts import (
     CanFacts,
@@ -19,6 +19,7 @@ from kontronik_can_gw.runtime.facts import (
 from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.snapshot import Moment, snapshot
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import MS, SECOND
 
 START = 1000 * SECOND
 PROGRAM = ProgramFacts(

@@ -12,7 +12,6 @@ from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
@@ -22,6 +21,7 @@ from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
+from kontronik_can_gw.times import MS, SECOND
 
 
 @pytest.fixture(autouse=True)

@@ -22,7 +22,6 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.gateway_status import CanState
@@ -30,6 +29,7 @@ from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
 from kontronik_can_gw.runtime.open_can import QUEUE_LENGTH, DriverPort, OwnFrames, open_can
 from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
+from kontronik_can_gw.times import MS, SECOND
 
 SOL = socket.SOL_SOCKET
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000

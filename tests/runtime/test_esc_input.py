@@ -18,7 +18,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
+from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime import serial_port, usb_adapters
@@ -27,6 +27,7 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.serial_port import NoPort, PortLost, is_mini_uart
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import MS, SECOND
 
 LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)

@@ -15,10 +15,10 @@ from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.runtime.housekeeping import COLLECT_NS
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.runtime.recorder import Recorder
+from kontronik_can_gw.times import MS, SECOND
 
 LIVE_EACH = 20 * MS
 EVENTS_A_SECOND = 2 * (SECOND // LIVE_EACH + 1)

@@ -14,11 +14,12 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.runtime.facts import program_facts, utc
 from kontronik_can_gw.runtime.process import process_facts, start_ticks
 from kontronik_can_gw.runtime.snapshot import snapshot
+from kontronik_can_gw.times import MS, SECOND
 
 
 def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> None:

@@ -20,7 +20,7 @@ from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway, MakeOutput
 from kontronik_can_gw.gateway.transmit_queue import Sent
@@ -35,6 +35,7 @@ from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.serial_port import PortLost
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import MS, SECOND
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 

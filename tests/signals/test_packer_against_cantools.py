@@ -24,11 +24,12 @@ from packer_oracle import (
 
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import compile_frame, float_of, ratio
+from kontronik_can_gw.times import MS
 
 ESCS = (
     EscSettings("left", pole_pairs=7, gear=Fraction(31, 4), timeout_ns=250 * MS),

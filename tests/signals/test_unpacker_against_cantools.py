@@ -15,10 +15,10 @@ from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
-from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.plan import SignalPlan
 from kontronik_can_gw.signals.unpacker import SignalReader
+from kontronik_can_gw.times import MS, SECOND
 
 
 def wanted(plan: SignalPlan, raw: Any, bits: int) -> Any:

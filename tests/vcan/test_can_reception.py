@@ -10,11 +10,11 @@ from vcan_tools import LIMIT_S, MARK, ip, wait_for_delivery
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.open_can import open_can
+from kontronik_can_gw.times import SECOND
 
 
 def peer_on(interface: str) -> RawBus:

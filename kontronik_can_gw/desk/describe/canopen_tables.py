@@ -17,8 +17,9 @@ from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.describe.tables import meanings_of, number, protocols_of
-from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.times import MS
 
 _MASK = (at.SETTINGS, 6)
 """The object that selects the error bits reported as emergencies."""

@@ -9,10 +9,10 @@ from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS
 from kontronik_can_gw.esc.decoder import Severity
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader
+from kontronik_can_gw.times import SECOND
 
 HISTORY_S = 60
 """Length of a history, one value each second."""

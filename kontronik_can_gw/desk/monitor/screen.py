@@ -29,9 +29,9 @@ from kontronik_can_gw.desk.monitor.model import (
 )
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.esc.decoder import Severity
-from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.runtime.fault_log import duration
+from kontronik_can_gw.times import MS
 
 _LEVELS = "▁▂▃▄▅▆▇█"
 _MARKS = {"": "bold", "!": "bold yellow", "!!": "bold red"}

@@ -19,8 +19,8 @@ from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import alarms, notices, screen, table_of
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.times import SECOND
 
 REFRESH_S = 0.15
 _LINES_S = 1.0

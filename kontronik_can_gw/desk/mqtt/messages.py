@@ -27,10 +27,11 @@ from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.mqtt.discovery import device
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader
+from kontronik_can_gw.times import MS, SECOND
 
 ONLINE = b"online"
 OFFLINE = b"offline"

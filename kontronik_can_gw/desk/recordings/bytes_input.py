@@ -19,10 +19,10 @@ from kontronik_can_gw.desk.recordings.stream import Stream, StreamReader
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
-from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.times import MS
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames

@@ -13,13 +13,14 @@ from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Sample
-from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.esc.values import Kind as How
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import MessagePlan, SendType
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
+from kontronik_can_gw.times import MS
 
 SAME_ROW_NS = 5 * MS
 GATEWAY_NS = 100 * MS

@@ -12,8 +12,8 @@ from typing import IO, TYPE_CHECKING, Any
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock, Sample
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.native import load
+from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Lines

@@ -21,7 +21,8 @@ from kontronik_can_gw.desk.report.quantities import (
     SPEEDS,
 )
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.times import SECOND
 
 HOUR_NS = 3600 * SECOND
 REST_CURRENT = 1.0

@@ -14,8 +14,9 @@ from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Block
 from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Event, Events, Number
 from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.esc.protocols import PROTOCOLS
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.times import MS, SECOND
 
 LONGEST_GAP_NS = 86_400 * SECOND
 """Longer gaps are cut out: the clock was set forward, or the recording holds runs of different days."""

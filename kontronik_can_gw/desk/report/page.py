@@ -15,8 +15,8 @@ from kontronik_can_gw.desk.report.esc import Number
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS
 from kontronik_can_gw.desk.report.summary import clock, duration, number, tables, tiles, wall_clock
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.times import SECOND
 
 HERE = Path(__file__).parent
 _MAX_CUTS = 20

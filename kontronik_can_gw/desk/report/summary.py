@@ -7,8 +7,8 @@ from html import escape
 from kontronik_can_gw.desk.report.esc import EscFlight, Extreme
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.quantities import COUNTERS, MAXIMA, MINIMA
-from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.times import SECOND
 
 _EXTREMES = (
     ("Peak power", "battery_power", 0),
