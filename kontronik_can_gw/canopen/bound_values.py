@@ -17,9 +17,9 @@ from kontronik_can_gw.core.slots import SlotPlan
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Kind
 from kontronik_can_gw.esc.values import Value as EscValue
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.status import GatewayStatus
 
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 _EVENT_OF_PACE = {

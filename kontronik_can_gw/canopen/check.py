@@ -24,7 +24,7 @@ from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.core.slots import Slots
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.status import GatewayStatus
 
 Place = tuple[int, int]
 Mistake = tuple[Entry, str]

@@ -8,7 +8,7 @@ from kontronik_can_gw.canopen import nmt
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import Command
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.node import Node

@@ -22,8 +22,8 @@ from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.writer import MessageRow, SignalRow, dbc_text
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
-from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.signals.plan import SignalPlan
+from kontronik_can_gw.status import UNCONFIGURED, NmtState
 from kontronik_can_gw.times import MS
 
 _MAX_START_VALUE_BITS = 32

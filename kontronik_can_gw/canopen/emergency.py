@@ -17,7 +17,7 @@ from kontronik_can_gw.canopen.emergency_codes import (
     GatewayError,
     register_of,
 )
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 from kontronik_can_gw.times import MS, NEVER
 
 _MAX_PENDING = 64

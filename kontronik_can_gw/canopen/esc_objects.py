@@ -8,7 +8,7 @@ from kontronik_can_gw.canopen.dictionary import Abort, SdoAbort, signature
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
 from kontronik_can_gw.esc.telemetry import EscSettings, Event, LinkState
-from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.status import GatewayStatus
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.node import Node

@@ -26,7 +26,7 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.storage import Parameters
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 
 
 class Service(IntEnum):

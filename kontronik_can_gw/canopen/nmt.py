@@ -8,7 +8,7 @@ from enum import IntEnum
 from functools import partial
 
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
-from kontronik_can_gw.node_state import NmtState
+from kontronik_can_gw.status import NmtState
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 _SELF_START_OFF = 4

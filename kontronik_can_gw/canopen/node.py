@@ -21,8 +21,7 @@ from kontronik_can_gw.canopen.storage import Parameters, Stored
 from kontronik_can_gw.canopen.sync import SyncConsumer
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
+from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus, NmtState
 from kontronik_can_gw.times import NEVER
 
 if TYPE_CHECKING:

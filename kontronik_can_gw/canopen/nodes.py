@@ -27,9 +27,8 @@ from kontronik_can_gw.core.output import Output, Owner
 from kontronik_can_gw.core.slots import Slot, Slots
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import CanState, GatewayStatus
-from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.signals.plan import classic_bits
+from kontronik_can_gw.status import UNCONFIGURED, CanState, GatewayStatus, NmtState
 from kontronik_can_gw.times import NEVER, SECOND
 
 SettingsChanged = Callable[[int, EscSettings], None]

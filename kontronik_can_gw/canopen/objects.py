@@ -23,7 +23,7 @@ from kontronik_can_gw.esc.values import (
     steps_of,
     values_of,
 )
-from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
+from kontronik_can_gw.status import GatewayState, GatewayStatus
 from kontronik_can_gw.times import MS
 
 U8, U16 = 0xFF, 0xFFFF

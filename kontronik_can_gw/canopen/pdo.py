@@ -16,8 +16,8 @@ from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Var
 from kontronik_can_gw.canopen.sync import LAST_SYNC_TYPE, SyncTransmission
 from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.esc.telemetry import Event
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00

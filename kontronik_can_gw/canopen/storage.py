@@ -22,7 +22,7 @@ from typing import Any
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Variable, signature
 from kontronik_can_gw.canopen.sdo import SdoServer
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 
 VERSION = 1
 VERIFY = 0x1020

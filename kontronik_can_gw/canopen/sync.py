@@ -3,7 +3,7 @@
 from kontronik_can_gw.canopen.cob_ids import SYNC, Taken, check_free
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
 from kontronik_can_gw.core.slots import Slot
-from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import NEVER
 
 MAX_WAITING = 32

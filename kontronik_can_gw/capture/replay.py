@@ -19,7 +19,7 @@ from kontronik_can_gw.capture.limits import check_counters, check_state, check_t
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
-from kontronik_can_gw.gateway_status import CanState, GatewayState
+from kontronik_can_gw.status import CanState, GatewayState
 
 
 class TimedFrame(NamedTuple):

@@ -13,8 +13,8 @@ from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.assemble import Loaded, load_configuration
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.printable import printable_json
+from kontronik_can_gw.status import UNCONFIGURED
 
 _EXAMPLE_PORT = "_EXAMPLE-"
 """In the port of the configuration that ``init`` writes."""

@@ -16,7 +16,7 @@ from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 
 _NODE_ID = number_from(1, 127, "node-ID", kind=lambda text: int(text, 0))
 # fmt: off

@@ -20,10 +20,10 @@ from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupp
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.machine import identity_digest
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import UNCONFIGURED
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

@@ -34,7 +34,7 @@ from kontronik_can_gw.config.output_keys import (
 )
 from kontronik_can_gw.esc.protocols import PROTOCOLS, device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 from kontronik_can_gw.times import MS
 
 REQUIRED = MISSING

@@ -15,9 +15,9 @@ from kontronik_can_gw.config.kinds import (
     meanings,
     table_of,
 )
-from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import SEND_TYPES
+from kontronik_can_gw.status import UNCONFIGURED
 
 SHIPPED = "shipped"
 NODE_ID = integer(1, 127, also=UNCONFIGURED)

@@ -15,7 +15,7 @@ from kontronik_can_gw.config.keys import REMOVED_KEYS, TABLES, Config, EscConfig
 from kontronik_can_gw.core.output import OUTPUTS
 from kontronik_can_gw.dbc.names import VALUES_BY_KEY, normalize
 from kontronik_can_gw.errors import UserError, did_you_mean
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 
 
 def load(path: Path) -> Config:

@@ -11,9 +11,9 @@ from kontronik_can_gw.core.output import Owner
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import NEVER
 
 _LONG_AGO = -(1 << 62)

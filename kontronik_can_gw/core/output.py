@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import CanState, GatewayStatus
+from kontronik_can_gw.status import CanState, GatewayStatus
 from kontronik_can_gw.times import NEVER
 
 NO_IDS: frozenset[int] = frozenset()

@@ -14,8 +14,8 @@ from kontronik_can_gw.core.slots import Slot, Slots
 from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import SECOND
 
 OnEvent = Callable[[int, int, int], None]

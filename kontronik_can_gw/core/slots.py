@@ -18,10 +18,10 @@ from typing import NamedTuple, Protocol
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import divisor, steps
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import Pack
 from kontronik_can_gw.signals.plan import MessagePlan
 from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import NEVER
 
 

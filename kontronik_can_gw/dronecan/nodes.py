@@ -12,8 +12,8 @@ from kontronik_can_gw.dronecan.esc_report import EscReport
 from kontronik_can_gw.dronecan.wire import NODE, REQUEST, SERVICE, Assembler, DataType
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame, id_block
-from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
+from kontronik_can_gw.status import CanState, GatewayStatus
 from kontronik_can_gw.times import NEVER, SECOND
 
 if TYPE_CHECKING:

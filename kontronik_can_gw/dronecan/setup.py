@@ -12,8 +12,8 @@ from kontronik_can_gw.dronecan.wire import MAX_NODE_ID, NODE
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import id_block
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import classic_bits
+from kontronik_can_gw.status import GatewayStatus
 
 _USUAL_BITRATE = 1_000_000
 _LOWEST_RATE_HZ = 10

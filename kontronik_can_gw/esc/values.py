@@ -16,7 +16,7 @@ from typing import Any
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
-from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
+from kontronik_can_gw.status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
 MWS_PER_WH = 3_600_000

@@ -11,9 +11,9 @@ from kontronik_can_gw.core.python_core import Core, Follower, PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
-from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.times import NEVER
 
 if TYPE_CHECKING:

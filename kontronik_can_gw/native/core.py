@@ -10,7 +10,6 @@ from kontronik_can_gw.core.python_core import Follower
 from kontronik_can_gw.core.slots import Slot, Slots
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, held_settings
@@ -20,6 +19,7 @@ from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import GatewayStatus
 
 _MAX_FRAMES = 256
 _LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"

@@ -9,8 +9,8 @@ from typing import Any, Self
 from kontronik_can_gw.esc.decoder import SECOND_NS, Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
-from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.native.rows import COUNTS, GATEWAY
+from kontronik_can_gw.status import CanState, GatewayState
 
 _STREAM = COUNTS.index("longer_crcs") + 1
 """Number of counters in kcg_esc.count that are those of the stream."""

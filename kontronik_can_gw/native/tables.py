@@ -16,7 +16,6 @@ from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
@@ -33,6 +32,7 @@ from kontronik_can_gw.native.rows import (
 from kontronik_can_gw.native.scale import END_OF_TIME, set_scale
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
+from kontronik_can_gw.status import GatewayState
 
 WIRE = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32}
 ALL_ESCS = 255

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Sequence
 
 from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.status import CanState
 
 RECEIVE_LIMIT, _DISCARD_LIMIT = 64, 4096
 """Frames, error frames among them, that one call of ``receive`` or ``discard`` takes at most."""

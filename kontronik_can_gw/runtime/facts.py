@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from kontronik_can_gw import __version__
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
+from kontronik_can_gw.status import GatewayStatus
 
 
 class GatewayFacts(NamedTuple):

@@ -8,7 +8,6 @@ from copy import copy
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.facts import CanFacts, ProgramFacts, gateway_facts
@@ -20,6 +19,7 @@ from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.snapshot import Moment, name_in_words
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.worker import Report
+from kontronik_can_gw.status import UNCONFIGURED, NmtState
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:

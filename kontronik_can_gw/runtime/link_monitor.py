@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.status import CanState
 
 _ROUTE, _LINK_GROUP = 0, 1
 _HEADER = struct.Struct("=IHHII")

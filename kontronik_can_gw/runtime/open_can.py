@@ -18,7 +18,6 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.light_imports import without_asammdf
 from kontronik_can_gw.runtime.can_port import (
     MAX_STANDARD_ID,
@@ -28,6 +27,7 @@ from kontronik_can_gw.runtime.can_port import (
 )
 from kontronik_can_gw.runtime.socketcan_port import open_socketcan
 from kontronik_can_gw.runtime.worker import Handover, Worker
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Any
 from kontronik_can_gw.capture.format import COUNTERS, Kind, frame_data, numbers_data
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.gateway_status import CanState, GatewayStatus
+from kontronik_can_gw.status import CanState, GatewayStatus
 
 Put = Callable[[int, int, int, bytes, int, int | None], None]
 """(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""

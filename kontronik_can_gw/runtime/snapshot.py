@@ -24,8 +24,6 @@ from kontronik_can_gw.esc.values import (
     steps_of,
     values_of,
 )
-from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.facts import (
     CanFacts,
     GatewayFacts,
@@ -35,6 +33,7 @@ from kontronik_can_gw.runtime.facts import (
     utc,
 )
 from kontronik_can_gw.runtime.process import ProcessFacts
+from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:

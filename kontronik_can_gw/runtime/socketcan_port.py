@@ -13,7 +13,6 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import (
     MAX_STANDARD_ID,
     RECEIVE_LIMIT,
@@ -21,6 +20,7 @@ from kontronik_can_gw.runtime.can_port import (
     Received,
 )
 from kontronik_can_gw.runtime.link_commands import VIRTUAL, add_virtual, enable_fd, kind_of, set_up
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import SECOND
 
 _RECEIVE_BUFFER = 1 << 20

@@ -13,8 +13,8 @@ from fractions import Fraction
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import divisor, steps
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
+from kontronik_can_gw.status import GatewayStatus
 
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
 """Maps ESCs, gateway, time, alive counter and page to the bits of a frame, without a CRC.

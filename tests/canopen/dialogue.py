@@ -28,8 +28,8 @@ from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import CanState
 
 EMPTY = Layout("", "", ())
 OFF = 0xC0000000

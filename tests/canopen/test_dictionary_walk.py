@@ -9,7 +9,7 @@ from kontronik_can_gw.canopen.eds import Entry
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.codec import encode as uart
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
-from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.status import GatewayState
 
 NO_OBJECT, NO_SUB, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
 TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x06070012, 0x06070013, 0x06090031, 0x06090032

@@ -15,7 +15,7 @@ from dialogue import NO_HEARTBEAT, QUIET, Bench, live
 from wire import wire_to
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 
 EDS = shipped("eds/kontronik_esc.eds")
 BUS = """

@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.status import CanState
 
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 NODES = 2

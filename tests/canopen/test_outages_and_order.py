@@ -7,7 +7,7 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 
 LINK_STATUS = LINK << 16 | 0x0108
 CRC_ERRORS = LINK << 16 | 0x0720

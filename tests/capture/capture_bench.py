@@ -16,9 +16,9 @@ from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, Simulat
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
 START = 5_000 * SECOND + 123

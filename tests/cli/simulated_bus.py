@@ -17,7 +17,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.status import GatewayState
 
 STEP_NS = 10_000_000
 START_S = 1_790_000_000

@@ -17,7 +17,7 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)

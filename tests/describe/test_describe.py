@@ -25,7 +25,7 @@ from kontronik_can_gw.desk.describe.tables import CAN_STATES, GATEWAY_STATES, LI
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import VALUES
-from kontronik_can_gw.gateway_status import CanState, GatewayState
+from kontronik_can_gw.status import CanState, GatewayState
 
 Facts = dict[str, Any]
 DBC = shipped("dbc/kontronik_esc.dbc")

@@ -8,8 +8,8 @@ from dronecan_bench import LIVE, START, Bench
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.esc.kontronik.fields import InfoData, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, OperatingState
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
 HOT = OperatingError.POWER_STAGE_OVERTEMP_ERROR

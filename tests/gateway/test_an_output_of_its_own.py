@@ -16,8 +16,8 @@ from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, steps
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import SECOND
 
 FIRST_ID, COMMAND_ID = 0x1234500, 0x12

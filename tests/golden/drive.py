@@ -19,7 +19,7 @@ from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.frames import CanFrame as CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.status import CanState
 
 VERSION = kontronik_can_gw.__version__
 FOLDERS = {str(shipped("dbc").parent): "SHIPPED"}

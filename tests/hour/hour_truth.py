@@ -32,7 +32,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 )
 from kontronik_can_gw.esc.kontronik.simulator import Sent as Wired
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
-from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.status import CanState
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

@@ -36,12 +36,12 @@ from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import GATEWAY, MAX_GEAR, NotInCore
 from kontronik_can_gw.native.slots import _rows
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
 START = 1_000 * SECOND

@@ -33,10 +33,10 @@ from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
 

@@ -37,7 +37,7 @@ from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
 Cells = list[dict[str, Any]]

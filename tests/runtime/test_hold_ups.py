@@ -36,10 +36,9 @@ from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.gateway_status import GatewayState
-from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import GatewayState, NmtState
 from kontronik_can_gw.times import MS, SECOND
 
 if TYPE_CHECKING:

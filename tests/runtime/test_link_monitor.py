@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import link_monitor
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor
+from kontronik_can_gw.status import CanState
 
 
 def attribute(kind: int, value: bytes) -> bytes:

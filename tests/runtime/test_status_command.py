@@ -21,7 +21,6 @@ from kontronik_can_gw.desk.monitor.status import (
     judge,
     lines_of,
 )
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import folders
 from kontronik_can_gw.runtime.facts import (
     CanFacts,
@@ -31,6 +30,7 @@ from kontronik_can_gw.runtime.facts import (
     program_facts,
 )
 from kontronik_can_gw.runtime.snapshot import STALE_NS
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import SECOND
 
 Document = dict[str, Any]

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.gateway.transmit_queue import QUEUE_LENGTH, TransmitQueue
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import compile_frame
+from kontronik_can_gw.status import GatewayStatus
 
 
 def queued(number: int, can_id: int = 0x581) -> CanFrame:

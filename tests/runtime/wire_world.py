@@ -24,7 +24,6 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway, MakeOutput
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime import can_opener
 from kontronik_can_gw.runtime import esc_port as esc_input
@@ -35,6 +34,7 @@ from kontronik_can_gw.runtime.sd_notify import Notifier
 from kontronik_can_gw.runtime.serial_port import PortLost
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
 NS_PER_BYTE = KONTRONIK.byte_ns

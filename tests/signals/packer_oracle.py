@@ -22,7 +22,7 @@ from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
-from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
+from kontronik_can_gw.status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
 # --- bits, counted one by one

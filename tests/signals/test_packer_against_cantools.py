@@ -27,8 +27,8 @@ from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import compile_frame, float_of, ratio
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS
 
 ESCS = (

@@ -18,7 +18,7 @@ from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.describe.tables import meanings_of, number, protocols_of
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.status import UNCONFIGURED
 from kontronik_can_gw.times import MS
 
 _MASK = (at.SETTINGS, 6)

@@ -23,9 +23,9 @@ from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, State
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group
-from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.signals.packer import float_of
 from kontronik_can_gw.signals.plan import MessagePlan, Role, SendType, SignalPlan
+from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import MS
 
 _AVAILABLE = {

@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
-from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS
 
 if TYPE_CHECKING:

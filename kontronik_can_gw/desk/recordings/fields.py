@@ -13,8 +13,8 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps, values_of_esc
 from kontronik_can_gw.esc.values import Value as EscValue
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.unpacker import Value
+from kontronik_can_gw.status import GatewayStatus
 
 TIME = "Time"
 UTC = "Utc"

@@ -16,10 +16,10 @@ from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Sample
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.esc.values import Kind as How
-from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import MessagePlan, SendType
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
+from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS
 
 SAME_ROW_NS = 5 * MS

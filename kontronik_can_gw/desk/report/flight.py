@@ -15,7 +15,7 @@ from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Event, Eve
 from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS, SECOND
 
 LONGEST_GAP_NS = 86_400 * SECOND

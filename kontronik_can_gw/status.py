@@ -1,7 +1,13 @@
-"""What the gateway knows of itself: its state, that of the CAN controller, counters of frames."""
+"""States that several rooms share: of the gateway, its CAN controller and its CANopen nodes.
+
+Importing this module loads nothing of ``canopen/``.
+"""
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
+
+UNCONFIGURED = 0xFF
+"""The node-ID of a node that has none."""
 
 
 class GatewayState(IntEnum):
@@ -18,6 +24,15 @@ class CanState(IntEnum):
     ERROR_PASSIVE = 3
     BUS_OFF = 4
     DOWN = 5
+
+
+class NmtState(IntEnum):
+    """As heartbeats report it. ``INITIALISING`` is also that of a node without a node-ID: LSS only."""
+
+    INITIALISING = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
 
 
 @dataclass(slots=True)
