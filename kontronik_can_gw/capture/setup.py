@@ -24,7 +24,7 @@ from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
 from kontronik_can_gw.capture.limits import END_OF_TIME, HeaderError, check_state, whole_number
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.core.output import OUTPUTS, Given, OutputSetup, setup_of
+from kontronik_can_gw.core.output_setup import OUTPUTS, Given, OutputSetup, setup_of
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw import __version__
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
-from kontronik_can_gw.core.output import OUTPUTS, Given, OutputSetup, setup_of
+from kontronik_can_gw.core.output_setup import OUTPUTS, Given, OutputSetup, setup_of
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupplied
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc

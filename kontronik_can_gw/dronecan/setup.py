@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from kontronik_can_gw.core.output import Given
+from kontronik_can_gw.core.output_setup import Given
 from kontronik_can_gw.dronecan.esc_report import MAX_ESC_INDEX, MAX_RPM, SPEEDS
 from kontronik_can_gw.dronecan.nodes import Dronecan
 from kontronik_can_gw.dronecan.wire import MAX_NODE_ID, NODE

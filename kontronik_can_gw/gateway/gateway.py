@@ -6,8 +6,9 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from kontronik_can_gw.core.interface import Core, Follower
 from kontronik_can_gw.core.output import SLOTS, Output
-from kontronik_can_gw.core.python_core import Core, Follower, PythonCore
+from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts

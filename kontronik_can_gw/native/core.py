@@ -4,9 +4,9 @@ import ctypes as c
 from collections.abc import Sequence
 from typing import Any, cast
 
+from kontronik_can_gw.core.interface import Follower
 from kontronik_can_gw.core.messages import own_ids
 from kontronik_can_gw.core.output import Owner
-from kontronik_can_gw.core.python_core import Follower
 from kontronik_can_gw.core.slots import Slot, Slots
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame

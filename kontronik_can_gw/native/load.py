@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.core.python_core import Core, PythonCore
+from kontronik_can_gw.core.interface import Core
+from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.objects import fault, shared_object
 from kontronik_can_gw.signals.plan import Layout

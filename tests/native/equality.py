@@ -27,7 +27,8 @@ from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.core.python_core import Follower, PythonCore
+from kontronik_can_gw.core.interface import Follower
+from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError

@@ -25,7 +25,8 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.output_keys import DronecanConfig
-from kontronik_can_gw.core.output import Given, Output, setup_of
+from kontronik_can_gw.core.output import Output
+from kontronik_can_gw.core.output_setup import Given, setup_of
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
