@@ -15,11 +15,11 @@ from kontronik_can_gw import __version__
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
 from kontronik_can_gw.core.output_setup import OUTPUTS, Given, OutputSetup, setup_of
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupplied
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.runtime.machine import identity_digest
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.plan import Layout

@@ -13,8 +13,8 @@ from typing import Any, cast
 
 from kontronik_can_gw.config.keys import REMOVED_KEYS, TABLES, Config, EscConfig, required
 from kontronik_can_gw.core.output_setup import OUTPUTS
-from kontronik_can_gw.dbc.names import VALUES_BY_KEY, normalize
 from kontronik_can_gw.errors import UserError, did_you_mean
+from kontronik_can_gw.esc.value_names import VALUES_BY_KEY, normalize
 from kontronik_can_gw.status import UNCONFIGURED
 
 

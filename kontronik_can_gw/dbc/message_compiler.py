@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.names import is_e2e, normalize
+from kontronik_can_gw.dbc.names import is_e2e
 from kontronik_can_gw.dbc.raw_values import raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.signal_compiler import Compilation, SignalCompiler
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.signals.plan import (
     FD_LENGTHS,
     SEND_TYPES,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.errors import did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import VALUES, Group, Value, values_of_esc
+from kontronik_can_gw.esc.value_names import VALUES_BY_KEY, normalize
+from kontronik_can_gw.esc.values import Group, Value, values_of_esc
 from kontronik_can_gw.signals.plan import Role
 
 if TYPE_CHECKING:
@@ -34,11 +35,6 @@ _WHOLE = {"counter", "cntr", "cnt", "ctr"}
 """Only as a whole name: an ErrorCounter counts no frames."""
 
 
-def normalize(name: str) -> str:
-    """Letters and digits of a name, in lower case."""
-    return "".join(c for c in name.casefold() if c.isalnum())
-
-
 def esc_prefix(name: str) -> str:
     """An ESC's name as the beginning of message and signal names: ``left_front`` becomes ``LeftFront``."""
     return "".join(part[:1].upper() + part[1:] for part in re.split(r"[^A-Za-z0-9]+", name) if part)
@@ -59,10 +55,6 @@ def is_e2e(crc: str, counter: str) -> bool:
     """True for a pair of names that means AUTOSAR E2E profile 1."""
     pairs = ((crc, Role.CRC), (counter, Role.ALIVE))
     return all(normalize(name).endswith(_E2E_ENDINGS[role]) for name, role in pairs)
-
-
-VALUES_BY_KEY = {normalize(name): value for name, value in VALUES.items()}
-"""Every value by its normalized name."""
 
 
 class Binder:

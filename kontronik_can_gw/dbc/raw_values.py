@@ -5,7 +5,7 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import Value
 from kontronik_can_gw.signals.packer import float_bits
 from kontronik_can_gw.signals.plan import Piece

@@ -11,13 +11,13 @@ from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.member import alarms_of
 from kontronik_can_gw.desk.monitor.model import HISTORY_S, Monitor
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.frames import CanFrame
 
 ONE = layout_of(["esc1"])

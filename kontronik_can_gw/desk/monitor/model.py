@@ -3,12 +3,12 @@
 from collections import deque
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS
 from kontronik_can_gw.esc.decoder import Severity
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader

@@ -5,7 +5,6 @@ from math import inf
 
 from rich.text import Text
 
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
@@ -29,6 +28,7 @@ from kontronik_can_gw.desk.monitor.model import (
 )
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.esc.decoder import Severity
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.runtime.fault_log import duration
 from kontronik_can_gw.times import MS

@@ -21,13 +21,13 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.config.keys import MqttConfig
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.member import Alarm, Member
 from kontronik_can_gw.desk.mqtt.discovery import device
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader

@@ -9,10 +9,10 @@ from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.expand import copies_of
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.reader import choose_node, load_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.plan import Layout
 

@@ -9,7 +9,6 @@ from itertools import pairwise, repeat
 from math import isfinite
 from typing import Any, Literal, NamedTuple
 
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.desk.report.quantities import (
     COMPUTED_FROM,
@@ -22,6 +21,7 @@ from kontronik_can_gw.desk.report.quantities import (
 )
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.times import SECOND
 
 HOUR_NS = 3600 * SECOND

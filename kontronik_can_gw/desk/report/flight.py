@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Block
 from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Event, Events, Number
 from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS, SECOND
 
