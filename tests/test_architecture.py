@@ -52,8 +52,8 @@ BLOCKING = {
 ONLY_IN = {
     "cantools": (
         "dbc/",
-        "capture/setup.py",
-        "config/assemble.py",
+        "assembly/capture_setup.py",
+        "assembly/assemble.py",
         "desk/recordings/layouts.py",
         "cli",
     ),

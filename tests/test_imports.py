@@ -30,10 +30,10 @@ NEVER = {"tkinter", "curses", "multiprocessing", "unittest", "pydoc", "doctest",
 NEVER |= {"sqlite3", "email"}
 """Of the standard library."""
 NODES = '[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nstore = "store"\n'
-CANOPEN = {"kontronik_can_gw.canopen", "kontronik_can_gw.runtime.store"}
+CANOPEN = {"kontronik_can_gw.canopen", "kontronik_can_gw.runtime.files.store"}
 RECORDER = {
     f"kontronik_can_gw.{name}"
-    for name in ("capture.setup", "runtime.recorder", "runtime.recorded_gateway")
+    for name in ("assembly.capture_setup", "capture.recorded_gateway", "runtime.files.recorder")
 }
 CONFIGURATIONS = {
     "DBC": ("", CANTOOLS, set[str]()),

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from kontronik_can_gw.assembly.assemble import Loaded, load_configuration
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file, option
 from kontronik_can_gw.cli.common import say, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
-from kontronik_can_gw.config.assemble import Loaded, load_configuration
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json

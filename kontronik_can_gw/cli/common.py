@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.assembly.assemble import Loaded, load_configuration
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
 from kontronik_can_gw.cli.arguments import default_config
-from kontronik_can_gw.config.assemble import Loaded, load_configuration
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import UserError
 

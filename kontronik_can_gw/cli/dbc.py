@@ -5,12 +5,12 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.canopen.dbc import pdo_text, waiting_for_lss
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
 from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare

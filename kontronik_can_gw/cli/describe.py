@@ -4,11 +4,11 @@ import argparse
 from pathlib import Path
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.cli.arguments import OUTPUT, option
 from kontronik_can_gw.cli.common import announced_config, load_all
 from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.cli.output import configuration_files, write_output
-from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
 from kontronik_can_gw.desk.describe.markdown import Table, markdown
 from kontronik_can_gw.desk.describe.tables import dbc, values

@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.assembly.assemble import Loaded, assemble
+from kontronik_can_gw.assembly.canopen_nodes import parameter_folder
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.cli.recording import record_folder
-from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import Config
-from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor import Finding, Findings, count
 from kontronik_can_gw.desk.doctor.can import check_can

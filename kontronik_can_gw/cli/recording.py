@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.config.assemble import Loaded
+from kontronik_can_gw.assembly.assemble import Loaded
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
+from kontronik_can_gw.capture.recorded_gateway import RecordedGateway, state_of
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.machine import state_folder
-from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway, state_of
 from kontronik_can_gw.runtime.recorder import Recorder
 
 _STATE = "state"

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.assembly.assemble import Loaded
 from kontronik_can_gw.cli.arguments import CONFIG, config_file, option
 from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
-from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:

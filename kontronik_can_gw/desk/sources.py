@@ -8,8 +8,8 @@ from pathlib import Path
 from threading import Thread
 from typing import Self
 
+from kontronik_can_gw.assembly.assemble import assemble, check_devices
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.config.assemble import assemble, check_devices
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.inputs import Input

@@ -28,7 +28,7 @@ class Gateway:
     """One gateway: several ESCs in, one CAN bus out. ``canopen`` None: no CANopen nodes; a layout without messages: only nodes."""
 
     is_recorded = False
-    """True where each call is to be known (runtime/recorded_gateway.py)."""
+    """True where each call is to be known (capture/recorded_gateway.py)."""
 
     def __init__(
         self,

@@ -13,9 +13,9 @@ from kontronik_can_gw.native.turns import OUTPUTS
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller, PortInput
 
 if TYPE_CHECKING:
+    from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
     from kontronik_can_gw.native.core import NativeCore
     from kontronik_can_gw.runtime.can_link import CanLink
-    from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 
 
 def poller_for(gateway: Gateway) -> Poller:

@@ -65,9 +65,9 @@ def convert(
 
 def capture(context: Context, seconds: int, noise: bool = False) -> Path:
     """Of one ESC, as a recorder writes it: a read and a turn for each UART frame. ``noise``: 5 % of the frames are spoilt."""
+    from kontronik_can_gw.assembly.assemble import assemble
     from kontronik_can_gw.capture.format import Kind, block, data_payload, json_payload
     from kontronik_can_gw.cli.recording import setup_of
-    from kontronik_can_gw.config.assemble import assemble
     from kontronik_can_gw.config.parse import parse
 
     file = context.folder / f"{'noise' if noise else 'capture'}-{seconds}.kcap"

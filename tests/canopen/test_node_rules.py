@@ -8,11 +8,11 @@ import pytest
 from dialogue import NO_HEARTBEAT, OFF, QUIET, SPARE, Bench, default, live, shipped_eds, tpdo
 from script import MS
 
+from kontronik_can_gw.assembly.assemble import Loaded, assemble
 from kontronik_can_gw.canopen.bound_values import message_plan
 from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.storage import Stored, encode
-from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
 from kontronik_can_gw.signals.plan import Layout

@@ -5,18 +5,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from kontronik_can_gw.assembly.assemble import assemble
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.capture.format import Entry, block, data_payload, json_payload
+from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.capture.replay import TimedFrame, in_order
-from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.recording import setup_of
-from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
-from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND

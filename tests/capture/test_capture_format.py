@@ -19,6 +19,7 @@ from capture_bench import START, Bench, made
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture import format as capture
 from kontronik_can_gw.capture.format import (
     MAGIC,
@@ -36,7 +37,6 @@ from kontronik_can_gw.capture.format import (
     read_numbers,
 )
 from kontronik_can_gw.capture.limits import HeaderError
-from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame

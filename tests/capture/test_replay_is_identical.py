@@ -3,6 +3,7 @@
 import pytest
 from capture_bench import START, Bench, made
 
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import (
     Block,
     Entry,
@@ -15,7 +16,6 @@ from kontronik_can_gw.capture.format import (
     read_json,
 )
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
-from kontronik_can_gw.capture.setup import CaptureSetup
 
 
 def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:

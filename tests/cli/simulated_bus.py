@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.simulator import (

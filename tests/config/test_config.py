@@ -18,7 +18,7 @@ import pytest
 from hypothesis import strategies as st
 
 import kontronik_can_gw
-from kontronik_can_gw.config.assemble import load_configuration
+from kontronik_can_gw.assembly.assemble import load_configuration
 from kontronik_can_gw.config.export import as_toml, schema
 from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
 from kontronik_can_gw.config.parse import load, parse

@@ -11,7 +11,7 @@ import pytest
 from dbc_bench import FILE, compiled, gateway_with, packed, refused
 from packer_oracle import UNITS
 
-from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.prepare import is_mute, reporter, unreported

@@ -5,7 +5,7 @@ from importlib import import_module
 from itertools import pairwise
 from typing import Any
 
-from kontronik_can_gw.config.assemble import Loaded, assemble
+from kontronik_can_gw.assembly.assemble import Loaded, assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData

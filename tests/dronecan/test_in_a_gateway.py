@@ -14,7 +14,7 @@ from command_line import run
 from dronecan_bench import LIVE, Bench, loaded
 from test_replay_is_identical import replayed
 
-from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.dronecan.wire import STATUS, Assembler
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
@@ -99,7 +99,7 @@ def test_check_warns_of_what_is_unusual(
 ) -> None:
     """As that a machine has no id, so that unique ids come from names alone."""
     if not given:
-        monkeypatch.setattr("kontronik_can_gw.config.assemble.identity_digest", lambda: b"")
+        monkeypatch.setattr("kontronik_can_gw.assembly.assemble.identity_digest", lambda: b"")
     found, _, err = checked(tmp_path, f"node_id = 42\n{more}", **given)  # type: ignore[arg-type]
     assert found == code
     assert said in err if said else not err
@@ -141,8 +141,9 @@ def test_a_dbc_whose_ids_are_frames_of_our_node_is_refused(
 @pytest.mark.parametrize("is_on", [False, True])
 def test_nothing_of_it_is_loaded_when_it_is_off_and_openssl_never(is_on: bool) -> None:
     code = (
-        "import sys\nfrom kontronik_can_gw.config.assemble import assemble\nfrom kontronik_can_gw.config.parse import parse\n"
-        "import kontronik_can_gw.cli.run, kontronik_can_gw.gateway.gateway, kontronik_can_gw.runtime.loop, kontronik_can_gw.capture.setup\n"
+        "import sys\nfrom kontronik_can_gw.assembly.assemble import assemble\nfrom kontronik_can_gw.config.parse import parse\n"
+        "import kontronik_can_gw.cli.run, kontronik_can_gw.gateway.gateway\n"
+        "import kontronik_can_gw.runtime.loop, kontronik_can_gw.assembly.capture_setup\n"
         f"assemble(parse({{'can': {{'interface': 'virtual'}}, 'dronecan': {{'enabled': {is_on}}}, 'esc': [{{'port': 'p'}}]}}, 'a.toml'))\n"
         "print('hashlib' in sys.modules, any('dronecan' in m for m in sys.modules))"
     )

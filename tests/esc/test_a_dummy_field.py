@@ -15,9 +15,9 @@ FIRST = "    electrical_speed: ElectricalSpeed = 0\n"
 SHOW = """
 import json
 from kontronik_can_gw.canopen.objects import BINDINGS
-from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.kontronik.codec import Layout

@@ -13,10 +13,10 @@ from typing import Any
 import cantools
 import pytest
 
+from kontronik_can_gw.assembly.assemble import assemble
+from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.canopen.dictionary import SdoAbort
-from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.output import NO_IDS, Output, Owner
 from kontronik_can_gw.errors import UserError

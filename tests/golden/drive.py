@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import kontronik_can_gw
+from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.canopen.storage import encode
 from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 
-from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.member import alarms_of
 from kontronik_can_gw.desk.monitor.model import HISTORY_S, Monitor

@@ -23,6 +23,7 @@ from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
+from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output import Output
@@ -35,7 +36,6 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
-from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND

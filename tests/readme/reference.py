@@ -5,10 +5,10 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 
+from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.cli.arguments import Option, Rows
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
 from kontronik_can_gw.desk.describe.markdown import Code, Row, Table, markdown
 from kontronik_can_gw.desk.describe.tables import configuration, dbc, values

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from wire_world import CAN_FD, Bus, World
 
-from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode

@@ -28,7 +28,7 @@ from wire_world import (
     speed_and_age,
 )
 
-from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import LiveData

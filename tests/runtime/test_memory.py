@@ -11,12 +11,12 @@ import wire_world
 from capture_bench import made
 from wire_world import World, loop_in, run
 
+from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.runtime.housekeeping import COLLECT_NS
-from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.times import MS, SECOND
 

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import Block as DataBlock
 from kontronik_can_gw.capture.format import (
     Damage,
@@ -20,7 +21,6 @@ from kontronik_can_gw.capture.format import (
 )
 from kontronik_can_gw.capture.limits import HeaderError
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
-from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput

@@ -106,7 +106,7 @@ def load_configuration(
         raise UserError(*problems)
     if store is None or not config.canopen.enabled:
         return assemble(config)
-    from kontronik_can_gw.config.nodes import parameter_folder
+    from kontronik_can_gw.assembly.canopen_nodes import parameter_folder
 
     return assemble(config, store(parameter_folder(config)))
 
@@ -194,16 +194,17 @@ def _read_nodes(
     """
     if not config.canopen.enabled:
         return None
-    from kontronik_can_gw.config import nodes  # only here: a start without nodes stays short
+    # Imported only here, so that a start without nodes stays short.
+    from kontronik_can_gw.assembly import canopen_nodes
 
     with collecting(problems):
-        plain = nodes.plain_setup(config)
+        plain = canopen_nodes.plain_setup(config)
         escs = plain.esc_settings(config.escs)
-        cob_ids, bits[_NODES], worst[_NODES] = nodes.needs(plain, escs)
+        cob_ids, bits[_NODES], worst[_NODES] = canopen_nodes.needs(plain, escs)
         taken |= cob_ids
     if problems:
         return None
-    stored, damaged, warnings = nodes.read_stored(config, store)
+    stored, damaged, warnings = canopen_nodes.read_stored(config, store)
     return _NodesRead(plain, stored, damaged, warnings)
 
 
@@ -219,12 +220,12 @@ def _apply_stored(
 
     Updates the usual and the worst bits per second that the nodes need.
     """
-    from kontronik_can_gw.config import nodes
+    from kontronik_can_gw.assembly import canopen_nodes
 
     foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
-    setup, warnings = nodes.with_stored(read.plain, read.stored, config, escs, foreign)
+    setup, warnings = canopen_nodes.with_stored(read.plain, read.stored, config, escs, foreign)
     if setup.stored != read.plain.stored:
-        _, bits[_NODES], worst[_NODES] = nodes.needs(setup, escs)
+        _, bits[_NODES], worst[_NODES] = canopen_nodes.needs(setup, escs)
     return setup, [*warnings, *read.warnings]
 
 
