@@ -107,7 +107,7 @@ def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
       runs as root still uses /run/kontronik-can-gw.
     """
     from kontronik_can_gw.cli import arguments
-    from kontronik_can_gw.runtime import folders, machine
+    from kontronik_can_gw.runtime.system import folders, machine
 
     file = tmp_path_factory.mktemp("machine") / "machine-id"
     file.write_text("0123456789abcdef0123456789abcdef\n")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.runtime.folders import runtime_folder
+from kontronik_can_gw.runtime.system.folders import runtime_folder
 
 TESTS = Path(__file__).parent
 IGNORING = ["sh", "-c", 'trap "" HUP INT QUIT; exec "$@"', "sh", sys.executable, "-c"]

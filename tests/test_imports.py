@@ -52,7 +52,7 @@ from standin import use
 use("{bus}")
 sys.path.pop()
 
-from kontronik_can_gw.runtime import locks
+from kontronik_can_gw.runtime.system import locks
 locks.PREFIX += "{bus}/"  # tests may run side by side, all on "lo"
 
 def write():

@@ -20,8 +20,8 @@ from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
-from kontronik_can_gw.runtime.machine import identity_digest
-from kontronik_can_gw.runtime.open_can import check_interface
+from kontronik_can_gw.runtime.can.open_can import check_interface
+from kontronik_can_gw.runtime.system.machine import identity_digest
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import UNCONFIGURED
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from kontronik_can_gw.canopen.nodes import CanopenSetup
     from kontronik_can_gw.canopen.storage import Stored
-    from kontronik_can_gw.runtime.store import ParameterStore
+    from kontronik_can_gw.runtime.files.store import ParameterStore
 
 
 _NODES = "the CANopen nodes"

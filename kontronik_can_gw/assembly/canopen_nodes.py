@@ -20,8 +20,8 @@ from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
-from kontronik_can_gw.runtime.store import ParameterStore, parameter_file
+from kontronik_can_gw.runtime.files.store import ParameterStore, parameter_file
+from kontronik_can_gw.runtime.system.machine import machine_identity, serial_number, state_folder
 from kontronik_can_gw.signals.plan import classic_bits
 from kontronik_can_gw.status import UNCONFIGURED
 from kontronik_can_gw.times import SECOND

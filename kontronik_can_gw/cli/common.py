@@ -17,7 +17,7 @@ from kontronik_can_gw.errors import UserError
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup
-    from kontronik_can_gw.runtime.store import ParameterStore
+    from kontronik_can_gw.runtime.files.store import ParameterStore
 
 
 def load_all(path: Path, store: "Callable[[Path], ParameterStore] | None" = None) -> Loaded:
@@ -43,8 +43,8 @@ def announced_config(with_nodes: bool = False) -> Path | None:
 @contextmanager
 def logging_to_stderr() -> Iterator[None]:
     """Write log lines to standard error from a thread; under systemd without time, with journald's priorities."""
-    from kontronik_can_gw.runtime.fault_log import BackgroundHandler
-    from kontronik_can_gw.runtime.sd_notify import log_formatter
+    from kontronik_can_gw.runtime.system.fault_log import BackgroundHandler
+    from kontronik_can_gw.runtime.system.sd_notify import log_formatter
 
     handler = BackgroundHandler(sys.stderr)
     handler.setFormatter(

@@ -26,7 +26,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words, make_core
 from kontronik_can_gw.printable import printable_json
-from kontronik_can_gw.runtime.open_can import check_interface
+from kontronik_can_gw.runtime.can.open_can import check_interface
 
 OPTIONS = (CONFIG, JSON)
 EPILOG = (

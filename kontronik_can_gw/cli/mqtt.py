@@ -22,8 +22,8 @@ from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.mqtt.messages import Publisher, Topics
 from kontronik_can_gw.desk.sources import Bus, can_config
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.sd_notify import Notifier
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
+from kontronik_can_gw.runtime.system.sd_notify import Notifier
 
 if TYPE_CHECKING:  # it needs paho-mqtt
     from kontronik_can_gw.desk.mqtt.client import MqttClient

@@ -8,8 +8,8 @@ from kontronik_can_gw.capture.recorded_gateway import RecordedGateway, state_of
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.machine import state_folder
-from kontronik_can_gw.runtime.recorder import Recorder
+from kontronik_can_gw.runtime.files.recorder import Recorder
+from kontronik_can_gw.runtime.system.machine import state_folder
 
 _STATE = "state"
 

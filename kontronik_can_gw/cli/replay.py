@@ -18,9 +18,9 @@ from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.locks import Locks, in_use, names_of
-from kontronik_can_gw.runtime.open_can import check_interface, open_can
+from kontronik_can_gw.runtime.can.can_port import CanPort
+from kontronik_can_gw.runtime.can.open_can import check_interface, open_can
+from kontronik_can_gw.runtime.system.locks import Locks, in_use, names_of
 from kontronik_can_gw.times import SECOND
 
 _DRAIN_S = 0.2

@@ -16,10 +16,10 @@ from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
     from kontronik_can_gw.gateway.gateway import Gateway
+    from kontronik_can_gw.runtime.files.recorder import Recorder
+    from kontronik_can_gw.runtime.files.store import ParameterStore
     from kontronik_can_gw.runtime.loop import Loop
-    from kontronik_can_gw.runtime.recorder import Recorder
-    from kontronik_can_gw.runtime.sd_notify import Notifier
-    from kontronik_can_gw.runtime.store import ParameterStore
+    from kontronik_can_gw.runtime.system.sd_notify import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -50,7 +50,7 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.runtime.sd_notify import Notifier
+    from kontronik_can_gw.runtime.system.sd_notify import Notifier
 
     notifier = Notifier()
     refused: UserError | None = None
@@ -103,10 +103,10 @@ class _Run:
     def _opened(self) -> "Loop":
         """The loop with everything open."""
         from kontronik_can_gw.native.load import in_words
-        from kontronik_can_gw.runtime.facts import program_facts
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.native_poller import poller_for
-        from kontronik_can_gw.runtime.statistics import open_statistics
+        from kontronik_can_gw.runtime.status.facts import program_facts
+        from kontronik_can_gw.runtime.status.statistics import open_statistics
 
         path = config_file(self._args.config)
         program = program_facts(path)
@@ -162,7 +162,7 @@ class _Run:
 
 def _begin_realtime(priority: int | None, wait: bool) -> None:
     """RunError where the priority is not granted, unless ``wait``: then the gateway runs without."""
-    from kontronik_can_gw.runtime import realtime
+    from kontronik_can_gw.runtime.system import realtime
 
     if priority is None:
         return
@@ -175,7 +175,7 @@ def _begin_realtime(priority: int | None, wait: bool) -> None:
 
 
 def _parameter_store(folder: Path) -> "ParameterStore":
-    from kontronik_can_gw.runtime.store import ParameterStore  # not loaded without CANopen
+    from kontronik_can_gw.runtime.files.store import ParameterStore  # not loaded without CANopen
 
     return ParameterStore(folder)
 

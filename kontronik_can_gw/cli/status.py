@@ -19,7 +19,7 @@ from kontronik_can_gw.desk.monitor.status import (
 )
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.printable import printable_json
-from kontronik_can_gw.runtime.snapshot import PROGRAM
+from kontronik_can_gw.runtime.status.snapshot import PROGRAM
 
 
 class NotRunning(RunError):

@@ -25,8 +25,8 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 )
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.bus_listener import BusListener
-from kontronik_can_gw.runtime.open_can import check_interface
+from kontronik_can_gw.runtime.can.bus_listener import BusListener
+from kontronik_can_gw.runtime.can.open_can import check_interface
 from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND
 

@@ -8,22 +8,22 @@ from copy import copy
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.esc_port import EscPort
-from kontronik_can_gw.runtime.facts import CanFacts, ProgramFacts, gateway_facts
-from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.link_monitor import LinkFacts
-from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
-from kontronik_can_gw.runtime.process import ProcessFacts, process_facts
-from kontronik_can_gw.runtime.sd_notify import Notifier
-from kontronik_can_gw.runtime.snapshot import Moment, name_in_words
-from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.runtime.worker import Report
+from kontronik_can_gw.runtime.can.can_link import CanLink
+from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.files.parameter_saver import ParameterSaver
+from kontronik_can_gw.runtime.ports.esc_port import EscPort
+from kontronik_can_gw.runtime.status.facts import CanFacts, ProgramFacts, gateway_facts
+from kontronik_can_gw.runtime.status.snapshot import Moment, name_in_words
+from kontronik_can_gw.runtime.status.statistics import Statistics
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
+from kontronik_can_gw.runtime.system.process import ProcessFacts, process_facts
+from kontronik_can_gw.runtime.system.sd_notify import Notifier
+from kontronik_can_gw.runtime.system.worker import Report
 from kontronik_can_gw.status import UNCONFIGURED, NmtState
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.recorder import Recorder
+    from kontronik_can_gw.runtime.files.recorder import Recorder
 
 log = logging.getLogger("kontronik_can_gw")
 

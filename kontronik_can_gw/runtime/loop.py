@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.esc_port import LOOK_NS, EscPort
-from kontronik_can_gw.runtime.facts import ProgramFacts
-from kontronik_can_gw.runtime.fault_log import FaultLog, duration
+from kontronik_can_gw.runtime.can.can_link import CanLink
+from kontronik_can_gw.runtime.files.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
-from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
-from kontronik_can_gw.runtime.sd_notify import Notifier
-from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.runtime.usb_adapters import Identity
-from kontronik_can_gw.runtime.worker import Handover
+from kontronik_can_gw.runtime.ports.esc_port import LOOK_NS, EscPort
+from kontronik_can_gw.runtime.ports.usb_adapters import Identity
+from kontronik_can_gw.runtime.status.facts import ProgramFacts
+from kontronik_can_gw.runtime.status.statistics import Statistics
+from kontronik_can_gw.runtime.system.fault_log import FaultLog, duration
+from kontronik_can_gw.runtime.system.sd_notify import Notifier
+from kontronik_can_gw.runtime.system.worker import Handover
 from kontronik_can_gw.times import MS, SECOND
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.recorder import Recorder
-    from kontronik_can_gw.runtime.store import ParameterStore
+    from kontronik_can_gw.runtime.files.recorder import Recorder
+    from kontronik_can_gw.runtime.files.store import ParameterStore
 
 _WAKES_PER_TIMEOUT = 4
 """The loop wakes at least this often within the shortest telemetry time-out: by how much of it a value may go early.

@@ -15,7 +15,7 @@ from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller, Por
 if TYPE_CHECKING:
     from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
     from kontronik_can_gw.native.core import NativeCore
-    from kontronik_can_gw.runtime.can_link import CanLink
+    from kontronik_can_gw.runtime.can.can_link import CanLink
 
 
 def poller_for(gateway: Gateway) -> Poller:

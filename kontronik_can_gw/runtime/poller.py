@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.can_link import CanLink
-    from kontronik_can_gw.runtime.can_port import CanPort
-    from kontronik_can_gw.runtime.serial_port import SerialPort
+    from kontronik_can_gw.runtime.can.can_link import CanLink
+    from kontronik_can_gw.runtime.can.can_port import CanPort
+    from kontronik_can_gw.runtime.ports.serial_port import SerialPort
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (select.POLLIN, POLLOUT)."""

@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
         return 0
     from kontronik_can_gw.cli import main as run
     from kontronik_can_gw.dbc import prepare
-    from kontronik_can_gw.runtime import locks
+    from kontronik_can_gw.runtime.system import locks
 
     prepare.REFUSE_LOAD = math.inf  # 64 ESCs need several buses' worth
     locks.PREFIX += f"bench/{os.getpid()}/"  # other benchmarks may run beside this one, each on a bus of its own

@@ -14,7 +14,7 @@ from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.runtime.machine import machine_identity, serial_number
+from kontronik_can_gw.runtime.system.machine import machine_identity, serial_number
 from kontronik_can_gw.signals.plan import Layout
 
 VALUE, TAKEN = 0x06090030, 0x06040043

@@ -16,8 +16,8 @@ from kontronik_can_gw.capture.format import Entry, Kind, read_numbers
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime import recorder
-from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder
+from kontronik_can_gw.runtime.files import recorder
+from kontronik_can_gw.runtime.files.recorder import CAPACITY, Recorder
 from kontronik_can_gw.times import SECOND
 
 HEADER = made(1)[0].header()

@@ -15,7 +15,7 @@ from kontronik_can_gw.cli import main, say, show
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
-from kontronik_can_gw.runtime.fault_log import BackgroundHandler
+from kontronik_can_gw.runtime.system.fault_log import BackgroundHandler
 
 EVIL = "a\x1b]0;x\x07\x9b31m\u202eb\u2066\x7f\r\nINFO fake"
 SHOWN = "a?]0;x??31m?b????INFO fake"

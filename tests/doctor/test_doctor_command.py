@@ -12,7 +12,7 @@ from statistics_bench import Bench
 
 from kontronik_can_gw.desk.doctor import ports
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.runtime.facts import PortFacts, program_facts
+from kontronik_can_gw.runtime.status.facts import PortFacts, program_facts
 
 
 @pytest.fixture

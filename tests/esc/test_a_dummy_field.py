@@ -25,8 +25,8 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.facts import (PortFacts)
-from kontronik_can_gw.runtime.snapshot import (_esc)
+from kontronik_can_gw.runtime.status.facts import (PortFacts)
+from kontronik_can_gw.runtime.status.snapshot import (_esc)
 
 esc = [{"port": "/dev/null"}, {"port": "/dev/zero"}]
 config = parse({"can": {"interface": "virtual", "channel": "x"}, "esc": esc}, "x.toml")

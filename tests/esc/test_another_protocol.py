@@ -28,9 +28,9 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import VALUES, Group, values_of
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.facts import PortFacts
-from kontronik_can_gw.runtime.serial_port import SerialPort
-from kontronik_can_gw.runtime.snapshot import _esc
+from kontronik_can_gw.runtime.ports.serial_port import SerialPort
+from kontronik_can_gw.runtime.status.facts import PortFacts
+from kontronik_can_gw.runtime.status.snapshot import _esc
 from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND
 

@@ -31,8 +31,8 @@ from kontronik_can_gw.desk.monitor.status import look_at
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
-from kontronik_can_gw.runtime.facts import CanFacts, PortFacts, StoreFacts
-from kontronik_can_gw.runtime.snapshot import STALE_NS
+from kontronik_can_gw.runtime.status.facts import CanFacts, PortFacts, StoreFacts
+from kontronik_can_gw.runtime.status.snapshot import STALE_NS
 from kontronik_can_gw.times import SECOND
 
 PROMTOOL = shutil.which("promtool")

@@ -8,8 +8,8 @@ from simulated_bus import Clock
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime import bus_listener
-from kontronik_can_gw.runtime.bus_listener import BusListener
+from kontronik_can_gw.runtime.can import bus_listener
+from kontronik_can_gw.runtime.can.bus_listener import BusListener
 from kontronik_can_gw.status import CanState
 
 FRAME = CanFrame(0x123, b"\x01\x02")

@@ -23,7 +23,7 @@ from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.sources import Recording
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
-from kontronik_can_gw.runtime import bus_listener
+from kontronik_can_gw.runtime.can import bus_listener
 
 DBC = shipped("dbc/kontronik_esc.dbc")
 ONE = layout_of(["esc1"])

@@ -14,10 +14,10 @@ from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native.binding import load
 from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import OPTIONS
-from kontronik_can_gw.runtime.can_link import CanLink
+from kontronik_can_gw.runtime.can.can_link import CanLink
 from kontronik_can_gw.runtime.native_poller import NativePoller
 from kontronik_can_gw.runtime.poller import Handler
-from kontronik_can_gw.runtime.serial_port import PortLost
+from kontronik_can_gw.runtime.ports.serial_port import PortLost
 
 if TYPE_CHECKING:
     from wire_world import World

@@ -10,14 +10,14 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.facts import (
+from kontronik_can_gw.runtime.status.facts import (
     CanFacts,
     PortFacts,
     ProgramFacts,
     gateway_facts,
 )
-from kontronik_can_gw.runtime.process import ProcessFacts
-from kontronik_can_gw.runtime.snapshot import Moment, snapshot
+from kontronik_can_gw.runtime.status.snapshot import Moment, snapshot
+from kontronik_can_gw.runtime.system.process import ProcessFacts
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 

@@ -15,11 +15,12 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime import can_controller, can_opener, folders
-from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.link_monitor import LinkFacts
-from kontronik_can_gw.runtime.socketcan_port import socketcan_error
+from kontronik_can_gw.runtime.can import can_controller, can_opener
+from kontronik_can_gw.runtime.can.can_link import CanLink
+from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
+from kontronik_can_gw.runtime.system import folders
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 

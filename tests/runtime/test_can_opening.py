@@ -22,10 +22,10 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime import can_opener
+from kontronik_can_gw.runtime.can import can_opener
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.native_poller import poller_for
-from kontronik_can_gw.runtime.sd_notify import Notifier
+from kontronik_can_gw.runtime.system.sd_notify import Notifier
 
 ESCS = (EscSettings("esc1", timeout_ns=60_000_000_000),)
 LIMIT_S = 60

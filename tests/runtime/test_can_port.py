@@ -24,10 +24,10 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime import socketcan_port
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
-from kontronik_can_gw.runtime.open_can import QUEUE_LENGTH, DriverPort, OwnFrames, open_can
-from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
+from kontronik_can_gw.runtime.can import socketcan_port
+from kontronik_can_gw.runtime.can.can_port import RECEIVE_LIMIT, CanPort
+from kontronik_can_gw.runtime.can.open_can import QUEUE_LENGTH, DriverPort, OwnFrames, open_can
+from kontronik_can_gw.runtime.can.socketcan_port import SocketCanPort
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kontronik_can_gw.runtime.fault_log import FLAPPING, MINUTE, FaultLog
+from kontronik_can_gw.runtime.system.fault_log import FLAPPING, MINUTE, FaultLog
 from kontronik_can_gw.times import SECOND
 
 NAME = "kontronik_can_gw"

@@ -20,12 +20,12 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime import esc_port as esc_input
-from kontronik_can_gw.runtime import serial_port, usb_adapters
-from kontronik_can_gw.runtime.esc_port import EscPort
-from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.serial_port import NoPort, PortLost, is_mini_uart
-from kontronik_can_gw.runtime.usb_adapters import Identity
+from kontronik_can_gw.runtime.ports import esc_port as esc_input
+from kontronik_can_gw.runtime.ports import serial_port, usb_adapters
+from kontronik_can_gw.runtime.ports.esc_port import EscPort
+from kontronik_can_gw.runtime.ports.serial_port import NoPort, PortLost, is_mini_uart
+from kontronik_can_gw.runtime.ports.usb_adapters import Identity
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 

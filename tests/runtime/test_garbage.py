@@ -11,8 +11,8 @@ from statistics_bench import moment_of
 from wire_world import World, loop_in, run
 
 from kontronik_can_gw.config.keys import RecordConfig
-from kontronik_can_gw.runtime.recorder import Recorder
-from kontronik_can_gw.runtime.snapshot import snapshot
+from kontronik_can_gw.runtime.files.recorder import Recorder
+from kontronik_can_gw.runtime.status.snapshot import snapshot
 from kontronik_can_gw.times import MS, SECOND
 
 EVERYTHING = made(2, canopen=True, dronecan={"node_id": 40, "enabled": True})

@@ -15,7 +15,7 @@ import pytest
 from vcan_tools import feeding
 
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.runtime.statistics import open_statistics
+from kontronik_can_gw.runtime.status.statistics import open_statistics
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 ENOUGH = 36_000
@@ -151,7 +151,7 @@ def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Pat
 
 ELSEWHERE = """
 from pathlib import Path
-from kontronik_can_gw.runtime import folders
+from kontronik_can_gw.runtime.system import folders
 folders.RUN, folders.TEMPORARY = Path({folder!r}, "run"), Path({folder!r}, "tmp")
 """
 BY_HAND = '[can]\ninterface = "virtual"\n{more}[[esc]]\nport = "{port}"\n'

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.runtime import link_commands, socketcan_port
-from kontronik_can_gw.runtime.link_monitor import LinkFacts
-from kontronik_can_gw.runtime.socketcan_port import socketcan_error
+from kontronik_can_gw.runtime.can import link_commands, socketcan_port
+from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 
 ADD = "sudo ip link add vcan0 type vcan && sudo ip link set vcan0 up"
 UP = "sudo ip link set can0 up type can bitrate 500000 restart-ms 100"
@@ -70,4 +70,4 @@ def test_no_other_module_writes_such_a_command() -> None:
         for path, text in texts.items()
         if "ip link set" in text
     }
-    assert found == {"runtime/link_commands.py", "desk/mqtt/client.py"}, "MQTT's is about lo"
+    assert found == {"runtime/can/link_commands.py", "desk/mqtt/client.py"}, "MQTT's is about lo"

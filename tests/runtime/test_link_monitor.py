@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kontronik_can_gw.runtime import link_monitor
-from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor
+from kontronik_can_gw.runtime.can import link_monitor
+from kontronik_can_gw.runtime.can.link_monitor import LinkFacts, LinkMonitor
 from kontronik_can_gw.status import CanState
 
 

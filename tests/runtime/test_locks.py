@@ -13,11 +13,12 @@ from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime import can_controller, can_opener, folders
-from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.locks import Locks, Taken, file_name, lock_file
+from kontronik_can_gw.runtime.can import can_controller, can_opener
+from kontronik_can_gw.runtime.can.can_link import CanLink
 from kontronik_can_gw.runtime.poller import Poller
+from kontronik_can_gw.runtime.system import folders
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
+from kontronik_can_gw.runtime.system.locks import Locks, Taken, file_name, lock_file
 
 CHANNEL = "can0"
 NODES = [f"{CHANNEL}: CANopen node {number}" for number in (5, 6, 7)]

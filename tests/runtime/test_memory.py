@@ -16,8 +16,8 @@ from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.runtime.files.recorder import Recorder
 from kontronik_can_gw.runtime.housekeeping import COLLECT_NS
-from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.times import MS, SECOND
 
 LIVE_EACH = 20 * MS

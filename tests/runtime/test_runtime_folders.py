@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.runtime import folders
-from kontronik_can_gw.runtime.locks import Locks
+from kontronik_can_gw.runtime.system import folders
+from kontronik_can_gw.runtime.system.locks import Locks
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.runtime.facts import program_facts, utc
-from kontronik_can_gw.runtime.process import process_facts, start_ticks
-from kontronik_can_gw.runtime.snapshot import snapshot
+from kontronik_can_gw.runtime.status.facts import program_facts, utc
+from kontronik_can_gw.runtime.status.snapshot import snapshot
+from kontronik_can_gw.runtime.system.process import process_facts, start_ticks
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 

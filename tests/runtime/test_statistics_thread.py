@@ -15,10 +15,10 @@ from statistics_bench import moment_of
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime import statistics as statistics_module
-from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment
-from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.runtime.worker import Report
+from kontronik_can_gw.runtime.status import statistics as statistics_module
+from kontronik_can_gw.runtime.status.snapshot import STALE_NS, Moment
+from kontronik_can_gw.runtime.status.statistics import Statistics
+from kontronik_can_gw.runtime.system.worker import Report
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import SECOND
 

@@ -21,15 +21,15 @@ from kontronik_can_gw.desk.monitor.status import (
     judge,
     lines_of,
 )
-from kontronik_can_gw.runtime import folders
-from kontronik_can_gw.runtime.facts import (
+from kontronik_can_gw.runtime.status.facts import (
     CanFacts,
     PortFacts,
     ProgramFacts,
     StoreFacts,
     program_facts,
 )
-from kontronik_can_gw.runtime.snapshot import STALE_NS
+from kontronik_can_gw.runtime.status.snapshot import STALE_NS
+from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import SECOND
 

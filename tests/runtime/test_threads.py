@@ -10,10 +10,10 @@ import threading
 import pytest
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime import realtime
-from kontronik_can_gw.runtime import worker as worker_module
-from kontronik_can_gw.runtime.fault_log import CAPACITY, BackgroundHandler
-from kontronik_can_gw.runtime.worker import Handover, Worker, start_beside_the_loop
+from kontronik_can_gw.runtime.system import realtime
+from kontronik_can_gw.runtime.system import worker as worker_module
+from kontronik_can_gw.runtime.system.fault_log import CAPACITY, BackgroundHandler
+from kontronik_can_gw.runtime.system.worker import Handover, Worker, start_beside_the_loop
 
 PATIENCE = 120
 

@@ -25,14 +25,14 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway, MakeOutput
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
-from kontronik_can_gw.runtime import can_opener
-from kontronik_can_gw.runtime import esc_port as esc_input
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Received
+from kontronik_can_gw.runtime.can import can_opener
+from kontronik_can_gw.runtime.can.can_port import RECEIVE_LIMIT, CanPort, Received
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler, Poller
-from kontronik_can_gw.runtime.sd_notify import Notifier
-from kontronik_can_gw.runtime.serial_port import PortLost
-from kontronik_can_gw.runtime.usb_adapters import Identity
+from kontronik_can_gw.runtime.ports import esc_port as esc_input
+from kontronik_can_gw.runtime.ports.serial_port import PortLost
+from kontronik_can_gw.runtime.ports.usb_adapters import Identity
+from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.runtime.sd_notify import Notifier, is_journal, log_formatter
+from kontronik_can_gw.runtime.system.sd_notify import Notifier, is_journal, log_formatter
 
 
 class Manager:

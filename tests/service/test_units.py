@@ -12,7 +12,7 @@ import pytest
 
 import kontronik_can_gw
 from kontronik_can_gw.cli.service import planned
-from kontronik_can_gw.runtime.folders import NAME, RUN
+from kontronik_can_gw.runtime.system.folders import NAME, RUN
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 BESIDE = tuple(

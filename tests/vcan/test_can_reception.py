@@ -12,8 +12,8 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.open_can import open_can
+from kontronik_can_gw.runtime.can.can_port import CanPort
+from kontronik_can_gw.runtime.can.open_can import open_can
 from kontronik_can_gw.times import SECOND
 
 

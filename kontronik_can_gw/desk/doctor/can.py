@@ -7,7 +7,7 @@ from typing import Any
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.runtime.link_commands import (
+from kontronik_can_gw.runtime.can.link_commands import (
     VIRTUAL,
     add_virtual,
     controller_settings,

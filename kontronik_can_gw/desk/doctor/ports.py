@@ -11,7 +11,7 @@ from typing import Any
 from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.printable import printable
-from kontronik_can_gw.runtime.serial_port import is_mini_uart
+from kontronik_can_gw.runtime.ports.serial_port import is_mini_uart
 
 _RULES = "udev/rules.d/70-kontronik-can-gw.rules"
 """Keeps ModemManager away."""

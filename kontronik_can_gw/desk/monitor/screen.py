@@ -30,7 +30,7 @@ from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import Group
-from kontronik_can_gw.runtime.fault_log import duration
+from kontronik_can_gw.runtime.system.fault_log import duration
 from kontronik_can_gw.times import MS
 
 _LEVELS = "▁▂▃▄▅▆▇█"

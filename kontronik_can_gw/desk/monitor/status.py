@@ -26,9 +26,9 @@ from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words
 from kontronik_can_gw.printable import printable
-from kontronik_can_gw.runtime import folders
-from kontronik_can_gw.runtime.fault_log import duration
-from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
+from kontronik_can_gw.runtime.status.snapshot import FORMAT, PROGRAM, STALE_NS
+from kontronik_can_gw.runtime.system import folders
+from kontronik_can_gw.runtime.system.fault_log import duration
 from kontronik_can_gw.times import MS, SECOND
 
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3

@@ -25,7 +25,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.desk.mqtt.messages import OFFLINE, ONLINE, Publication
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
 
 KEEPALIVE_S = 15
 """After 1.5 times this without a packet, the broker publishes the last will."""

@@ -14,15 +14,15 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime.can_controller import CanController
-from kontronik_can_gw.runtime.can_opener import CanOpener
-from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.link_monitor import LinkFacts
-from kontronik_can_gw.runtime.locks import IdLocks
+from kontronik_can_gw.runtime.can.can_controller import CanController
+from kontronik_can_gw.runtime.can.can_opener import CanOpener
+from kontronik_can_gw.runtime.can.can_port import CanPort
+from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
+from kontronik_can_gw.runtime.can.transmitter import Transmitter
 from kontronik_can_gw.runtime.poller import Poller, PortInput, Retry, StuckCheck
-from kontronik_can_gw.runtime.socketcan_port import socketcan_error
-from kontronik_can_gw.runtime.transmitter import Transmitter
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
+from kontronik_can_gw.runtime.system.locks import IdLocks
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import NEVER, SECOND
 

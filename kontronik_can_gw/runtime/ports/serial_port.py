@@ -20,7 +20,7 @@ import serial
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import EscProtocol
-from kontronik_can_gw.runtime.usb_adapters import Identity, identity_at
+from kontronik_can_gw.runtime.ports.usb_adapters import Identity, identity_at
 
 READ_SIZE = 4096
 

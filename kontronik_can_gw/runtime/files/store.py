@@ -14,9 +14,9 @@ from pathlib import Path
 
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.disk import reason_of, sync_folder, write_new
-from kontronik_can_gw.runtime.locks import Taken, lock_file
-from kontronik_can_gw.runtime.worker import Handover, Worker
+from kontronik_can_gw.runtime.files.disk import reason_of, sync_folder, write_new
+from kontronik_can_gw.runtime.system.locks import Taken, lock_file
+from kontronik_can_gw.runtime.system.worker import Handover, Worker
 
 
 class ParameterStore:

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.open_can import open_can
-from kontronik_can_gw.runtime.worker import Handover, Worker
+from kontronik_can_gw.runtime.can.can_port import CanPort
+from kontronik_can_gw.runtime.can.open_can import open_can
+from kontronik_can_gw.runtime.system.worker import Handover, Worker
 
 _AT_ONCE = ("socketcan", "virtual")
 """Interfaces that wait for nothing when they are opened: SocketCAN, and python-can's bus within the process."""

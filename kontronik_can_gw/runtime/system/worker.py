@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
-from kontronik_can_gw.runtime import realtime
+from kontronik_can_gw.runtime.system import realtime
 
 log = logging.getLogger("kontronik_can_gw")
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.esc_port import EscPort
-from kontronik_can_gw.runtime.facts import StoreFacts
+from kontronik_can_gw.runtime.ports.esc_port import EscPort
+from kontronik_can_gw.runtime.status.facts import StoreFacts
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.store import ParameterStore
+    from kontronik_can_gw.runtime.files.store import ParameterStore
 
 log = logging.getLogger("kontronik_can_gw")
 

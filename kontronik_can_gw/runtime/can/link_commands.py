@@ -6,7 +6,7 @@ A controller (can0) needs its bit rate. A virtual interface (vcan, vxcan) has no
 from contextlib import closing
 
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.runtime.link_monitor import link_monitor
+from kontronik_can_gw.runtime.can.link_monitor import link_monitor
 
 VIRTUAL = ("vcan", "vxcan")
 _FD_MTU = 72

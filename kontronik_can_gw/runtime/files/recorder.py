@@ -30,8 +30,8 @@ from kontronik_can_gw.capture.recorded_gateway import devices_of, state_of
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.disk import is_locked, reason_of, sync_folder, write_all
-from kontronik_can_gw.runtime.worker import Report, Worker
+from kontronik_can_gw.runtime.files.disk import is_locked, reason_of, sync_folder, write_all
+from kontronik_can_gw.runtime.system.worker import Report, Worker
 from kontronik_can_gw.times import MS, SECOND
 
 CAPACITY = 50_000

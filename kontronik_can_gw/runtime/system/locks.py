@@ -17,9 +17,9 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import ids_in_words
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.disk import reason_of
-from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.folders import make_runtime_folder, runtime_folder
+from kontronik_can_gw.runtime.files.disk import reason_of
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
+from kontronik_can_gw.runtime.system.folders import make_runtime_folder, runtime_folder
 from kontronik_can_gw.status import UNCONFIGURED
 
 log = logging.getLogger("kontronik_can_gw")

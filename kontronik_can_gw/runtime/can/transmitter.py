@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent, TransmitQueue
-from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.can.can_port import CanPort
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 BUSY_RETRY_NS = 2 * MS

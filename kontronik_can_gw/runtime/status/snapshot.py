@@ -24,7 +24,7 @@ from kontronik_can_gw.esc.values import (
     steps_of,
     values_of,
 )
-from kontronik_can_gw.runtime.facts import (
+from kontronik_can_gw.runtime.status.facts import (
     CanFacts,
     GatewayFacts,
     PortFacts,
@@ -32,12 +32,12 @@ from kontronik_can_gw.runtime.facts import (
     StoreFacts,
     utc,
 )
-from kontronik_can_gw.runtime.process import ProcessFacts
+from kontronik_can_gw.runtime.system.process import ProcessFacts
 from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.recorder import RecorderFacts
+    from kontronik_can_gw.runtime.files.recorder import RecorderFacts
 
 FORMAT = 1
 """Of the document; another number for a change that readers must know of. New keys may come without one."""

@@ -19,14 +19,14 @@ from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.light_imports import without_asammdf
-from kontronik_can_gw.runtime.can_port import (
+from kontronik_can_gw.runtime.can.can_port import (
     MAX_STANDARD_ID,
     RECEIVE_LIMIT,
     CanPort,
     Received,
 )
-from kontronik_can_gw.runtime.socketcan_port import open_socketcan
-from kontronik_can_gw.runtime.worker import Handover, Worker
+from kontronik_can_gw.runtime.can.socketcan_port import open_socketcan
+from kontronik_can_gw.runtime.system.worker import Handover, Worker
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import SECOND
 

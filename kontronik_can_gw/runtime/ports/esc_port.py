@@ -9,17 +9,17 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.facts import PortFacts
-from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Poller, Retry, StuckCheck
-from kontronik_can_gw.runtime.serial_port import (
+from kontronik_can_gw.runtime.ports.serial_port import (
     NoPort,
     PortLost,
     SerialPort,
     device_of,
     is_mini_uart,
 )
-from kontronik_can_gw.runtime.usb_adapters import Identity, find_adapter, identity_at
+from kontronik_can_gw.runtime.ports.usb_adapters import Identity, find_adapter, identity_at
+from kontronik_can_gw.runtime.status.facts import PortFacts
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 MAX_RETRY_NS = SECOND

@@ -10,10 +10,10 @@ import time
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime.can_port import CanPort
-from kontronik_can_gw.runtime.link_commands import restart
-from kontronik_can_gw.runtime.open_can import open_can
-from kontronik_can_gw.runtime.socketcan_port import fault_of
+from kontronik_can_gw.runtime.can.can_port import CanPort
+from kontronik_can_gw.runtime.can.link_commands import restart
+from kontronik_can_gw.runtime.can.open_can import open_can
+from kontronik_can_gw.runtime.can.socketcan_port import fault_of
 from kontronik_can_gw.status import CanState
 
 RETRY_S = 0.5

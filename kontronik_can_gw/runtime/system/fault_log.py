@@ -11,7 +11,7 @@ from collections import deque
 from typing import TextIO
 
 from kontronik_can_gw.printable import printable
-from kontronik_can_gw.runtime.worker import Worker
+from kontronik_can_gw.runtime.system.worker import Worker
 from kontronik_can_gw.times import SECOND
 
 log = logging.getLogger("kontronik_can_gw")

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw import __version__
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
+from kontronik_can_gw.runtime.system.process import pid_namespace, start_ticks
 from kontronik_can_gw.status import GatewayStatus
 
 

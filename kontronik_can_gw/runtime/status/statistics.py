@@ -12,11 +12,11 @@ import time
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.disk import reason_of, write_new
-from kontronik_can_gw.runtime.folders import STATUS_FILE, make_runtime_folder, status_name
-from kontronik_can_gw.runtime.locks import Locks
-from kontronik_can_gw.runtime.snapshot import STALE_NS, Moment, snapshot
-from kontronik_can_gw.runtime.worker import Report, Worker
+from kontronik_can_gw.runtime.files.disk import reason_of, write_new
+from kontronik_can_gw.runtime.status.snapshot import STALE_NS, Moment, snapshot
+from kontronik_can_gw.runtime.system.folders import STATUS_FILE, make_runtime_folder, status_name
+from kontronik_can_gw.runtime.system.locks import Locks
+from kontronik_can_gw.runtime.system.worker import Report, Worker
 from kontronik_can_gw.times import SECOND
 
 log = logging.getLogger("kontronik_can_gw")

@@ -13,13 +13,19 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime.can_port import (
+from kontronik_can_gw.runtime.can.can_port import (
     MAX_STANDARD_ID,
     RECEIVE_LIMIT,
     CanPort,
     Received,
 )
-from kontronik_can_gw.runtime.link_commands import VIRTUAL, add_virtual, enable_fd, kind_of, set_up
+from kontronik_can_gw.runtime.can.link_commands import (
+    VIRTUAL,
+    add_virtual,
+    enable_fd,
+    kind_of,
+    set_up,
+)
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import SECOND
 
