@@ -1,0 +1,1 @@
+"""From configuration, files and captures to the objects that run."""

@@ -55,7 +55,7 @@ class Core(Protocol):
     """As 0.5.0 did, to replay its captures: with each event, so that one step may make several frames of a message."""
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
-        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (stream.py, Arrival)."""
+        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (esc_stream.py, Arrival)."""
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         """An ESC's port was opened (again), or cannot be used: its values are not available from now on."""

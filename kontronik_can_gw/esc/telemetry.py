@@ -1,6 +1,6 @@
 """The state of one ESC: newest data, derived values, freshness, link.
 
-stream.py, or its twin in C, computes this state from bytes and time. ``now`` is a whole number of
+core/esc_stream.py, or its twin in C, computes this state from bytes and time. ``now`` is a whole number of
 nanoseconds of one monotonic clock.
 """
 

@@ -1,0 +1,1 @@
+"""The gateway: the core together with its outputs."""

@@ -92,7 +92,7 @@ class Gateway:
             output.stop(now)
 
     def receive_bytes(self, esc: int, data: bytes, now: int, since: int) -> None:
-        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (stream.py, Arrival)."""
+        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (esc_stream.py, Arrival)."""
         self.core.receive(esc, data, now, since)
 
     @property

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+import kontronik_can_gw
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.runtime.can import link_commands, socketcan_port
+from kontronik_can_gw.runtime.can import link_commands
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 
@@ -63,7 +64,7 @@ def test_can_fd_is_switched_on_by_the_mtu_of_a_virtual_interface() -> None:
 
 
 def test_no_other_module_writes_such_a_command() -> None:
-    package = Path(socketcan_port.__file__).parents[1]
+    package = Path(kontronik_can_gw.__file__).parent
     texts = {path: path.read_text("utf-8") for path in package.rglob("*") if path.suffix in (".py", ".toml")}  # fmt: skip
     found = {
         path.relative_to(package).as_posix()

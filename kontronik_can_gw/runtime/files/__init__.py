@@ -1,0 +1,1 @@
+"""Files that a running gateway keeps: captures and CANopen parameters."""

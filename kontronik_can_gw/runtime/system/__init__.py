@@ -1,0 +1,1 @@
+"""The surroundings of the process: log, service manager, folders, locks, threads, machine."""
