@@ -1,7 +1,7 @@
 """The state of one ESC: newest data, derived values, freshness, link.
 
-core/esc_stream.py, or its twin in C, computes this state from bytes and time. ``now`` is a whole number of
-nanoseconds of one monotonic clock.
+core/esc_stream.py, or its twin in C, computes this state from bytes and time. ``now`` is a whole
+number of nanoseconds of one monotonic clock.
 """
 
 from dataclasses import dataclass
