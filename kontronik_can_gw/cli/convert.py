@@ -142,10 +142,12 @@ def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
 def _report(
     args: argparse.Namespace, form: str, recording: Input, summary: str | None, seconds: float
 ) -> None:
-    """Say what was written, and what of the recording was not intact. RunError where there was nothing."""
+    """Say what was written, and what of the recording was not intact. RunError or UserError where there was nothing."""
     source = name_of(Path(args.input))
     damage = [f"{source}: damaged: {line}" for line in recording.damage]
     if summary is None:
+        if recording.refusal is not None:
+            raise recording.refusal
         raise RunError(*damage, f"{source}: {_nothing(args, form, recording)}")
     if form in TABLES and recording.left_out:
         damage.append(f"{source}: {recording.left_out}")

@@ -13,17 +13,17 @@ OPTIONS = (
 )
 EPILOG = """\
 Decodes like kontronik-can-gw convert FILE - --to jsonl (or csv), but takes
-FILE for the bytes of one ESC, whatever it holds. There is a row for each live
-frame, with all values. If no frame is found, a line describes the bytes. The
-bytes of a pipe are decoded as they arrive.
+FILE for the bytes of one ESC. There is a row for each live frame, with all
+values. If no frame is found, a line describes the bytes. The bytes of a pipe
+are decoded as they arrive.
 
 examples:
   kontronik-can-gw decode esc.bin --csv
   cat esc.bin | kontronik-can-gw decode -
 
-exit codes: 0 decoded, also if a part of FILE is damaged; 1 no frame is found,
-or the output cannot be written; 2 wrong usage, or FILE cannot be opened; 130
-stopped by a signal
+exit codes: 0 decoded, also if a part of FILE is damaged; 1 there is nothing to
+decode, or the output cannot be written; 2 wrong usage, or FILE cannot be opened
+or is not a recording; 130 stopped by a signal
 """
 
 

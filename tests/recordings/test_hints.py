@@ -51,6 +51,7 @@ def test_the_screen_output_of_candump_gets_the_right_command(tmp_path: Path, lin
     log.write_text(f"{line}\n" * 3)
     for words in (
         ("convert", log, tmp_path / "o.csv"),
+        ("decode", log),
         ("report", log, "-o", tmp_path / "o.html"),
         ("monitor", "--once", log),
         ("replay", log, "--on", "pty"),
@@ -58,3 +59,19 @@ def test_the_screen_output_of_candump_gets_the_right_command(tmp_path: Path, lin
         said = refused(2, *words)
         assert said.startswith(f"{log}: is the output of candump for the screen.")
         assert said.endswith("candump -L vcan0 > FILE (or candump -l vcan0).")
+
+
+def test_decode_refuses_files_that_are_not_the_bytes_of_an_esc(tmp_path: Path) -> None:
+    noise, empty = tmp_path / "noise.bin", tmp_path / "empty.bin"
+    log = write_log(tmp_path / "bus.log", flight(layout_of(["a"]), 1))
+    noise.write_bytes(b"no recording" * 9)
+    empty.touch()
+    said = refused(2, "decode", noise)
+    assert said.startswith(f"{noise}: is neither a capture nor a CAN log")
+    assert "bytes but never KOD: wrong parity" in said
+    assert refused(2, "decode", empty) == f"{empty}: is empty"
+    said = refused(2, "decode", log)
+    assert said.startswith(f"{log}: is a candump recording, not the bytes of an ESC.")
+    for command in (["convert"], ["decode", "--csv"]):
+        said = refused(2, command[0], tmp_path / "none", *command[1:], "-o", tmp_path / "o.csv")
+        assert said == f"{tmp_path / 'none'}: there is no such file."

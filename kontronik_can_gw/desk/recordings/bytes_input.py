@@ -13,9 +13,10 @@ from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.desk.recordings.formats import BYTES, UART_MAGIC, format_of
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.played import PlayedInput
-from kontronik_can_gw.desk.recordings.stream import Stream, StreamReader
+from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader, name_of
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
 CHUNK = 1 << 16
 PERIOD_NS = 10 * MS
-UART_MAGIC = b"KOD"
-"""The first bytes of every telemetry frame."""
 _BEGINS_OF_HEADER = (b"KO", b"K")
 
 
@@ -52,6 +51,8 @@ class BytesInput(PlayedInput):
         setup = CaptureSetup(escs, (str(path),), None, DbcConfig(), False, None)
         super().__init__(str(path), layout, setup)
         self.stream = stream
+        self._head = b""
+        """The first bytes, as far as they have been read."""
         self.provenance["times"] = "assumed: 100 live frames a second"
         if layout.config is None:
             self.provenance["motor"] = (
@@ -77,9 +78,12 @@ class BytesInput(PlayedInput):
             yield Entry(now, Kind.BYTES, data=bytes(held))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:  # noqa: ARG002  there is one
+        self._head = b""
         try:
             with self._open() as file:
                 while data := file.read1(CHUNK):
+                    if len(self._head) < HEAD:
+                        self._head += data[: HEAD - len(self._head)]
                     yield data
         except OSError as error:
             raise UserError(f"{self._path}: cannot be opened: {error.strerror}.") from None
@@ -151,12 +155,27 @@ class BytesInput(PlayedInput):
 
     def _describe_damage(self, counters: Counters) -> None:
         self.damage = []
+        if not counters.live + counters.info:
+            self.refusal = self._refusal(counters)
         if counters.dropped_bytes:
             self.damage.append(
                 f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
             )
         if not counters.live:
             self.damage.append(counters.diagnosis() or "no live frame")
+
+    def _refusal(self, counters: Counters) -> UserError | None:
+        """The error for a recording of another kind, and for bytes that are none."""
+        name = name_of(self._path)
+        try:
+            found = format_of(self._head, name, diagnosis=counters.diagnosis())
+        except UserError as error:
+            return error
+        if found == BYTES:
+            return None
+        return UserError(
+            f"{name}: is a {found} recording, not the bytes of an ESC. Use kontronik-can-gw convert."
+        )
 
 
 def _pieces(read: Iterator[bytes]) -> Iterator[bytes]:

@@ -14,24 +14,17 @@ from pathlib import Path
 
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.bytes_input import UART_MAGIC, BytesInput
+from kontronik_can_gw.desk.recordings.bytes_input import BytesInput
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
+from kontronik_can_gw.desk.recordings.formats import BYTES, CAPTURE, format_of
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.recordings.log_input import (
-    STREAMED,
-    CanLogInput,
-    candump_advice,
-    log_format,
-)
+from kontronik_can_gw.desk.recordings.log_input import STREAMED, CanLogInput, log_format
 from kontronik_can_gw.desk.recordings.recording import Input
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, open_stream
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 
 __all__ = ["BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
-
-_CAPTURE, _BYTES = "capture", "bytes"
-"""Formats beside those of ``log_format``."""
 
 
 def open_input(path: Path, layout: BusLayout | None = None) -> Input:
@@ -50,8 +43,14 @@ def open_input(path: Path, layout: BusLayout | None = None) -> Input:
 
 
 def open_bytes(path: Path, layout: BusLayout | None) -> Input:
-    """Open a file or a pipe as the bytes of one ESC, whatever its content is."""
-    return BytesInput(path, layout, open_stream(path))
+    """Open a file or a pipe as the bytes of one ESC, whatever its content is.
+
+    UserError if it is missing or cannot be opened. ``refusal`` is set at the end if it was no recording.
+    """
+    stream = open_stream(path)
+    if stream is None and not path.exists():
+        raise _missing(path)
+    return BytesInput(path, layout, stream)
 
 
 def _open_file(path: Path, layout: BusLayout | None) -> Input:
@@ -60,29 +59,12 @@ def _open_file(path: Path, layout: BusLayout | None) -> Input:
             head = file.read(HEAD)
     except OSError as error:
         raise UserError(f"{path}: cannot be opened: {error.strerror}.") from None
-    found = _format_of(head, str(path), is_capture=path.suffix == SUFFIX)
-    if found == _CAPTURE:
+    found = format_of(head, str(path), is_capture=path.suffix == SUFFIX)
+    if found == CAPTURE:
         return CaptureInput([path], layout)
-    if found == _BYTES:
+    if found == BYTES:
         return BytesInput(path, layout)
     return CanLogInput(path, layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc")), found)
-
-
-def _format_of(head: bytes, name: str, *, is_capture: bool = False) -> str:
-    """The format of a recording by its head. UserError if it is none."""
-    if not head.strip():
-        raise UserError(f"{name}: is empty")
-    if is_capture or MAGIC in head:
-        return _CAPTURE
-    if (found := log_format(head)) is not None:
-        return found
-    if UART_MAGIC in head:
-        return _BYTES
-    if (advice := candump_advice(head)) is not None:
-        raise UserError(f"{name}: {advice}")
-    raise UserError(
-        f"{name}: is neither a capture nor a CAN log (candump, ASC, BLF, TRC, MF4), and has no ESC telemetry in its first {HEAD // 1024} kB"
-    )
 
 
 # --- pipes
@@ -92,7 +74,7 @@ def _open_stream(stream: Stream, layout: BusLayout | None) -> Input:
     with ExitStack() as on_error:
         on_error.callback(stream.close)
         found = _format_of_stream(stream)
-        if found == _BYTES:
+        if found == BYTES:
             opened: Input = BytesInput(Path(stream.name), layout, stream)
         elif found in STREAMED:
             layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
@@ -110,13 +92,13 @@ def _format_of_stream(stream: Stream) -> str:
     while len(stream.head) < HEAD and stream.look():
         head = stream.head
         if head.startswith(MAGIC):
-            return _CAPTURE
+            return CAPTURE
         if (found := log_format(head[: head.rfind(b"\n") + 1] or head[:8])) is not None:
             return found
         if decoder.feed(head[done:]):
-            return _BYTES
+            return BYTES
         done = len(head)
-    return _format_of(stream.head, stream.name)
+    return format_of(stream.head, stream.name)
 
 
 def _open_spooled(stream: Stream, layout: BusLayout | None) -> Input:
@@ -154,7 +136,7 @@ def _parts(path: Path) -> list[Path] | None:
         every = path.parent.glob(f"*{SUFFIX}") if path.name else ()
         found = sorted(part for part in every if part.name.startswith(path.name))
         if not found:
-            raise UserError(f"{path}: there is no such file.")
+            raise _missing(path)
     else:
         return None
     runs = list(dict.fromkeys(p.name.removesuffix(SUFFIX).rpartition("-")[0] for p in found))
@@ -163,3 +145,7 @@ def _parts(path: Path) -> list[Path] | None:
             f"{path}: has captures of {len(runs)} runs; give the beginning of the names of one: {', '.join(runs[-8:])}"
         )
     return found
+
+
+def _missing(path: Path) -> UserError:
+    return UserError(f"{path}: there is no such file.")

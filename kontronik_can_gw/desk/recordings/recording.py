@@ -142,6 +142,8 @@ class Input(ABC):
         self.damage: list[str] = []
         self.others = 0
         """CAN frames that the layout does not have; complete when it was read to the end."""
+        self.refusal: UserError | None = None
+        """The error for a file that turned out to be no recording, once it was read to its end."""
         self.begin_ns = 0
         """Time 0 of the output, from which ``clock_notes`` count. Set by the conversion."""
         self.resources = ExitStack()

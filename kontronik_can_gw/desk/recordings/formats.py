@@ -1,0 +1,34 @@
+"""Finds the format of a recording in its first bytes."""
+
+from kontronik_can_gw.capture.format import MAGIC
+from kontronik_can_gw.desk.recordings.log_input import candump_advice, log_format
+from kontronik_can_gw.desk.recordings.stream import HEAD
+from kontronik_can_gw.errors import UserError
+
+CAPTURE, BYTES = "capture", "bytes"
+"""Formats besides those of ``log_format``."""
+UART_MAGIC = b"KOD"
+"""The first bytes of every telemetry frame."""
+
+
+def format_of(
+    head: bytes, name: str, *, is_capture: bool = False, diagnosis: str | None = None
+) -> str:
+    """The format of a recording by its head. UserError if it is none.
+
+    ``diagnosis``: why the bytes are not those of an ESC, for the error.
+    """
+    if not head.strip():
+        raise UserError(f"{name}: is empty")
+    if is_capture or MAGIC in head:
+        return CAPTURE
+    if (found := log_format(head)) is not None:
+        return found
+    if UART_MAGIC in head:
+        return BYTES
+    if (advice := candump_advice(head)) is not None:
+        raise UserError(f"{name}: {advice}")
+    reason = "" if diagnosis is None else f" ({diagnosis})"
+    raise UserError(
+        f"{name}: is neither a capture nor a CAN log (candump, ASC, BLF, TRC, MF4), and has no ESC telemetry in its first {HEAD // 1024} kB{reason}"
+    )
