@@ -66,8 +66,8 @@ def test_spacing_continues_when_the_clock_is_set_back(tmp_path: Path, format_: s
     assert max(abs(a - b[0]) for a, b in zip(times, even, strict=True)) <= 2000 * (format_ == "mf4")
     assert [item.frame for item in found] == [frame for _, frame, _ in even]
     assert None not in ends
-    logged_ns = (ends[1] or 0) - (ends[0] or 0)  # the time of day is what the log has
-    assert abs(logged_ns - (even[-1][0] - HOUR_NS)) < 2000
+    passed_ns = (ends[1] or 0) - (ends[0] or 0)  # the time of day continues, too
+    assert abs(passed_ns - even[-1][0]) < 2000
 
 
 def _with_clock_set_back(log: Path, path: Path) -> Path:
@@ -92,7 +92,7 @@ def test_tables_reports_and_logs_are_those_of_a_steady_clock(tmp_path: Path) -> 
         done = run("convert", log, tmp_path / "out.csv", "--force")
         assert (note in done.err) == (log is back), done.err
         with (tmp_path / "out.csv").open() as file:
-            tables.append([row[:1] + row[2:] for row in csv.reader(file)])
+            tables.append(list(csv.reader(file)))
     assert len(tables[0]) > 250
     assert tables[0] == tables[1]
     for suffix in (".log", ".asc", ".blf", ".trc"):
@@ -102,6 +102,10 @@ def test_tables_reports_and_logs_are_those_of_a_steady_clock(tmp_path: Path) -> 
             assert (note in done.err) == (log is back), done.err
             written.append((tmp_path / f"out{suffix}").read_bytes())
         assert written[0] == written[1]
+        run("convert", "-q", tmp_path / f"out{suffix}", tmp_path / "again.csv", "--force")
+        with (tmp_path / "again.csv").open() as file:
+            again = list(csv.reader(file))
+        assert again == tables[1], suffix
     pages = []
     for log in (even, back):
         done = run("report", log, "-o", tmp_path / "out.html", "--force")
@@ -136,8 +140,6 @@ def test_ten_frames_that_go_back_by_more_than_100_ms_are_a_step(
     if is_step:
         assert found == [*before, *range(101, 111), 200 + by_ms]
         assert clock.steps == [ClockStep(101 * MS, -by_ms * MS)]
-        assert clock.logged_ns(100 * MS) == 100 * MS
-        assert clock.logged_ns(102 * MS) == (102 - by_ms) * MS
     else:
         assert found == [*before, *back, 200]
         assert clock.steps == []
@@ -149,7 +151,6 @@ def test_a_second_step_adds_to_the_first() -> None:
     found, clock = _read(times)
     assert found == [*range(1000, 1600)]
     assert [step.by_ns // MS for step in clock.steps] == [-700, -600]
-    assert clock.logged_ns(1599 * MS) == 299 * MS
 
 
 def test_the_gap_at_a_step_is_taken_from_the_periods_of_the_ids() -> None:

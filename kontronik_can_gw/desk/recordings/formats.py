@@ -30,5 +30,6 @@ def format_of(
         raise UserError(f"{name}: {advice}")
     reason = "" if diagnosis is None else f" ({diagnosis})"
     raise UserError(
-        f"{name}: is neither a capture nor a CAN log (candump, ASC, BLF, TRC, MF4), and has no ESC telemetry in its first {HEAD // 1024} kB{reason}"
+        f"{name}: is neither a capture nor a CAN log (candump, ASC, BLF, TRC, MF4), "
+        f"and has no ESC telemetry in its first {HEAD // 1024} kB{reason}"
     )

@@ -4,7 +4,7 @@ A log has the time of day of the machine that wrote it, or times since its start
 every format:
 
 1. If ten frames in a row are more than 100 ms before the frames in front of them, the clock was set
-   back. The spacing of the frames continues, and the step is reported.
+   back. The spacing of the frames and the time of day continue, and the step is reported.
 2. Frames that go back less far, or fewer of them, are out of order and keep their times.
 3. A time that jumps ahead by more than 10 s is kept and reported: a pause looks the same as a clock
    that was set ahead.
@@ -13,7 +13,6 @@ every format:
 Rules 1, 3 and 4 need the frames that follow. A frame at a usual time is returned at once.
 """
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
@@ -51,13 +50,6 @@ class LogClock:
         self._recent: deque[LogFrame] = deque(maxlen=_REMEMBERED)
         self._shift_ns = 0
         """Added to the times of the log since the last step."""
-        self._shifted_since: list[int] = []
-        self._shifts: list[int] = []
-
-    def logged_ns(self, time_ns: int) -> int:
-        """The time that the log itself has for a continuous time."""
-        index = bisect_right(self._shifted_since, time_ns)
-        return time_ns - self._shifts[index - 1] if index else time_ns
 
     def frames(self) -> Iterator[LogFrame]:
         """The frames in their order, at continuous times."""
@@ -137,8 +129,6 @@ class LogClock:
         time_ns = max(last, self._due_ns(item, following, last))
         by_ns = item.time_ns + self._shift_ns - time_ns
         self._shift_ns -= by_ns
-        self._shifted_since.append(time_ns)
-        self._shifts.append(self._shift_ns)
         self.steps.append(ClockStep(time_ns, by_ns))
         return time_ns
 

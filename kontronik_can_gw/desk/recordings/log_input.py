@@ -204,11 +204,11 @@ class CanLogInput(Input):
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")
 
     def wall_ns(self, time_ns: int) -> int | None:
-        """Unix time as the log has it: it jumps where the clock was set."""
+        """Unix time, which continues when the clock was set back."""
         start = self._reader.wall_start_ns
         if start is None or start > LATEST_NS:
             return None
-        return start + self._clock.logged_ns(time_ns)
+        return start + time_ns
 
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
