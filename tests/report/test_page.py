@@ -15,6 +15,7 @@ from kontronik_can_gw.desk.recordings.samples import fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
 from kontronik_can_gw.desk.report.summary import clock, duration, number, wall_clock
+from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
 from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND as S
 
@@ -142,7 +143,7 @@ def test_a_gap_of_years_is_cut_out_and_noted() -> None:
     assert flight.escs[0].telemetry_ns < 21 * S
     html = render(flight, source="y", wall_ns=5 * S)
     assert "Gaps of more than a day are cut out" in html
-    assert "<li>after 0:09.9: 19\u202f345 days 0 h</li>" in html
+    assert "<li>after 0:09.9: 19345 days 0 h</li>" in html
     assert "<dd>1970-01-01 00:00:05 UTC</dd>" in html
     (cut,) = data_of(html)["cuts"]
     assert cut == [9.9, flight.cuts[0].length_ns / S]
@@ -177,7 +178,7 @@ def test_times_and_numbers_in_words() -> None:
     assert [duration(ns) for ns in (12_540_000_000, 245 * S, 3_725 * S)] == [
         *("12.5 s", "4 min 05 s", "1 h 02 min 05 s"),
     ]
-    assert duration(472_221 * 3600 * S) == "19\u202f675 days 21 h"
+    assert duration(472_221 * 3600 * S) == "19675 days 21 h"
     assert number(-12345.678, 1) == "−12\u202f345.7"
     assert wall_clock(1_763_751_137 * S) == "2025-11-21 18:52:17 UTC"
     assert wall_clock(1 << 90) == f"{(1 << 90) // S} s of Unix time"

@@ -14,6 +14,7 @@ from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.fields import Field, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.stream import Stream
+from kontronik_can_gw.desk.words import duration
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
@@ -260,20 +261,22 @@ def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
     notes = []
     if hidden:
         listed = [
-            f"{'back' if step.by_ns < 0 else 'ahead'} by {_by_and_at(step, begin_ns)}"
+            f"{'back' if step.by_ns < 0 else 'ahead'} {_by_and_after(step, step.time_ns - begin_ns)}"
             for step in hidden
         ]
         notes.append(f"the clock was set {_some_of(listed)}; times continue without the step")
     if kept:
-        listed = [f"by {_by_and_at(step, begin_ns)}" for step in kept]
+        # the time in front of the jump: the one behind it contains the jump
+        listed = [_by_and_after(step, step.time_ns - step.by_ns - begin_ns) for step in kept]
         notes.append(
             f"times jump ahead {_some_of(listed)}: a pause, or the clock was set; the jump is kept"
         )
     return notes
 
 
-def _by_and_at(step: ClockStep, begin_ns: int) -> str:
-    return f"{abs(step.by_ns) / 1e9:.3f} s at {(step.time_ns - begin_ns) / 1e9:.3f} s"
+def _by_and_after(step: ClockStep, elapsed_ns: int) -> str:
+    """The size of a step, and the time since the beginning of the recording in front of it."""
+    return f"by {duration(abs(step.by_ns))} after {duration(elapsed_ns)}"
 
 
 def _some_of(listed: list[str]) -> str:

@@ -1,0 +1,41 @@
+"""Times, lengths and numbers as people read them."""
+
+from datetime import UTC, datetime
+
+from kontronik_can_gw.times import SECOND
+
+
+def clock(time_ns: int) -> str:
+    """A time of the recording as 1:02.5 or 1:00:02.5."""
+    tenths = round(time_ns * 10 / SECOND)
+    seconds, tenth = divmod(abs(tenths), 10)
+    minutes, seconds = divmod(seconds, 60)
+    hours, minutes = divmod(minutes, 60)
+    text = f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+    return f"{'−' if tenths < 0 else ''}{text}.{tenth}"
+
+
+def duration(length_ns: int) -> str:
+    """A length as 12.5 s, 4 min 05 s, 1 h 02 min 05 s, or 19675 days 17 h."""
+    if length_ns >= 100 * 3600 * SECOND:
+        days, hours = divmod(round(length_ns / (3600 * SECOND)), 24)
+        return f"{days} days {hours} h"
+    if length_ns < 60 * SECOND:
+        return f"{length_ns / SECOND:.1f} s"
+    minutes, seconds = divmod(round(length_ns / SECOND), 60)
+    hours, minutes = divmod(minutes, 60)
+    text = f"{minutes:02} min" if hours else f"{minutes} min"
+    return f"{f'{hours} h ' if hours else ''}{text} {seconds:02} s"
+
+
+def number(value: float, digits: int) -> str:
+    """A number with a thin space between thousands and a minus sign."""
+    return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
+
+
+def wall_clock(wall_ns: int) -> str:
+    """Unix time as UTC."""
+    try:
+        return datetime.fromtimestamp(wall_ns // SECOND, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    except (OverflowError, OSError, ValueError):
+        return f"{wall_ns // SECOND} s of Unix time"
