@@ -86,11 +86,11 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
             where = "by this DBC. Is -c or --dbc the right one?"
         raise RunError(*damage, f"{source}: no values {where}")
     recording.begin_ns = flight.origin_ns
-    clock = {"Clock": "; ".join(recording.clock_notes)}
+    details = {"Frames": recording.left_out, "Clock": "; ".join(recording.clock_notes)}
     page = render(
         flight,
         source=Path(source).name,
-        provenance=recording.provenance | clock,
+        provenance=recording.provenance | details,
         wall_ns=recording.wall_ns(flight.origin_ns),
         damage=recording.damage,
     )

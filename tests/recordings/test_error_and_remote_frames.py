@@ -78,6 +78,8 @@ def test_tables_reports_and_screens_count_them(tmp_path: Path) -> None:
     assert done.out == plain, "a remote frame has no values"
     assert note in done.err
     assert note in run("report", log, "-o", tmp_path / "page.html").err
+    page = (tmp_path / "page.html").read_text()
+    assert "<dt>Frames</dt><dd>1 error frame and 2 remote frames left out</dd>" in page
     done = run("monitor", "--once", log)
     assert "warning: 1 error frame and 2 remote frames left out" in done.err
     done = run("convert", log, tmp_path / "copy.trc")
