@@ -137,3 +137,24 @@ def test_a_part_has_frames_that_a_log_of_two_interfaces_holds_late(tmp_path: Pat
     found = [(frame.can_id, int.from_bytes(frame.data)) for _, frame, _ in read_log(part)[0]]
     for can_id in (0x100, 0x101):
         assert [ms for number, ms in found if number == can_id] == list(range(1000, 3001, 5))
+
+
+def test_a_direction_that_a_log_does_not_state_is_not_written(tmp_path: Path) -> None:
+    lines = [
+        "(1700000000.000000) can0 688#000000C409001400",
+        "(1700000000.001000) can0 688#000000C409001400 R",
+        "(1700000000.002000) can0 688#000000C409001400 T",
+        "(1700000000.003000) can1 12345678##1000102030405060708090A0B",
+        "(1700000000.004000) can1 681#R",
+        "(1700000000.005000) can1 20000004#0004000000000000",
+    ]
+    log = tmp_path / "mixed.log"
+    log.write_text("\n".join(lines) + "\n")
+    assert run("convert", "-q", log, "-", "--to", "candump").out.splitlines() == lines
+    trc = tmp_path / "old.trc"  # version 1.0 has no column for it
+    trc.write_text(
+        ";##########\n  1)  1842  0688  8  00 00 00 C4 09 00 14 00\n"
+        "  2)  1843  0008  4  ERROR  00 19 08 08\n"
+    )
+    written = run("convert", "-q", trc, "-", "--to", "candump").out.splitlines()
+    assert [line.split()[3:] for line in written] == [[], []]

@@ -138,7 +138,7 @@ class CanLogInput(Input):
                 self._chosen = chosen = channel
             elif channel != chosen:
                 raise self._ambiguous(logged)
-            yield TimedFrame(time_ns, frame, received)
+            yield TimedFrame(time_ns, frame, received is True)
 
     def _logged(self) -> Iterator[LogFrame]:
         """All frames, or those of the selected channel. UserError if the log does not have it."""

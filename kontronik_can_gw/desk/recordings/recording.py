@@ -38,13 +38,14 @@ _DISORDER_NS = 1_000_000_000
 class LogFrame(NamedTuple):
     """A frame of a CAN log, which may be a remote frame or an error frame, too.
 
-    ``channel``: its name or number; empty for the gateway's own bus. The id of an error frame is
-    ERROR and SocketCAN's class of the error, if the log has it.
+    ``channel``: its name or number; empty for the gateway's own bus. ``received``: None if the log
+    does not state a direction. The id of an error frame is ERROR and SocketCAN's class of the error,
+    if the log has it.
     """
 
     time_ns: int
     frame: CanFrame
-    received: bool = False
+    received: bool | None = False
     channel: str = ""
 
     @property

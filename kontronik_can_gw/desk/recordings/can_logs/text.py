@@ -169,6 +169,7 @@ _common_line = re.compile(
     rb"#((?:[0-9A-F]{2}){0,8})(?: ([RT]))?\n"
 ).fullmatch
 """Matches most lines that candump writes. Its groups need no further check."""
+_IS_RECEIVED = {b"R": True, b"r": True, b"T": False, b"t": False, None: None}
 
 
 class CandumpReader(TextReader):
@@ -184,7 +185,7 @@ class CandumpReader(TextReader):
             seconds, micros, channel, can_id, digits, direction = common.groups()
             frame = CanFrame(int(can_id, 16), unhexlify(digits), len(can_id) == 8)
             time_ns = int(seconds + micros) * 1000
-            return LogFrame(time_ns, frame, direction == b"R", channel.decode("ascii"))
+            return LogFrame(time_ns, frame, _IS_RECEIVED[direction], channel.decode("ascii"))
         match = candump_line(line)
         if match is None:
             raise ValueError
@@ -198,7 +199,7 @@ class CandumpReader(TextReader):
         else:
             is_fd = found["fd"] is not None
             frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, is_fd)
-        received = (found["dir"] or b"")[:1] in (b"R", b"r")
+        received = _IS_RECEIVED[found["dir"]]
         return checked(
             LogFrame(nanoseconds(found["time"]), frame, received, found["channel"].decode("ascii"))
         )
@@ -241,6 +242,7 @@ class TrcReader(TextReader):
             self.damage.append("its file version is not known")
         version = "".join(filter(str.isdigit, parser.file_version.name))
         self._columns = _TRC_COLUMNS.get(version, parser.columns)
+        self._has_direction = version not in ("", "10")
         if parser._start_time >= OLDEST_WALL_S:
             self.wall_start_ns = round(parser._start_time * 1e6) * 1000
         parser._start_time = 0.0
@@ -253,14 +255,16 @@ class TrcReader(TextReader):
         if self._is_error(columns):
             time_ns = round(float(columns[self._columns["O"]]) * 1_000) * 1_000
             channel = columns[self._columns["B"]] if "B" in self._columns else "1"
-            return checked(LogFrame(time_ns, error_frame(), True, channel))
+            received = True if self._has_direction else None
+            return checked(LogFrame(time_ns, error_frame(), received, channel))
         message = self._parser._parse_cols(columns)
         if message is None:
             return None
         if message.is_fd:  # its length, not the code, as in other formats
             message.dlc = self._length_of_code(message.dlc)
         found = frame_of(message)
-        return found._replace(time_ns=round(found.time_ns, -3))
+        received = found.received if self._has_direction else None
+        return found._replace(time_ns=round(found.time_ns, -3), received=received)
 
     def _is_error(self, columns: Sequence[str]) -> bool:
         """True for the line of an error frame, which python-can does not read."""

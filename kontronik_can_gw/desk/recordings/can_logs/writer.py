@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _MS = 1_000_000
 _LATEST_NS = 1 << 61
 """Of what the core in C writes as text."""
+_DIRECTIONS = {True: " R", False: " T", None: ""}
+"""Ends of the lines of candump."""
 
 
 class CanLogWriter:
@@ -87,9 +89,9 @@ class CanLogWriter:
                     content = f"R{len(data) or ''}"
                 elif fd:  # with a switched bit rate, as the gateway sends them
                     content = f"#1{content}"
-                end = "R" if received else "T"
+                end = _DIRECTIONS[received]
                 stamp = f"({us // 1000000}.{us % 1000000:06d}) {name_of(channel)}"
-                file.write(f"{stamp} {name}#{content} {end}\n".encode("ascii"))
+                file.write(f"{stamp} {name}#{content}{end}\n".encode("ascii"))
 
         self.write = write
 
@@ -208,7 +210,7 @@ class CanLogWriter:
                         data=None if frame.remote else frame.data,
                         is_fd=frame.fd,
                         bitrate_switch=frame.fd,
-                        is_rx=received,
+                        is_rx=received is True,
                         channel=number_of(channel) - 1 + first_channel,
                     )
                 )
