@@ -25,6 +25,8 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse. Exits with the usage for options that do not exist, so that no word is left over."""
+        if unknown := self._unknown_options(args or ()):
+            self._refuse(unknown)
         found, rest = super().parse_known_args(args, namespace)
         for action in self._actions:
             # argparse takes an optional argument for missing if it comes after an option
@@ -33,11 +35,26 @@ class Parser(argparse.ArgumentParser):
             if is_missing and rest and (rest[0] == "-" or not rest[0].startswith("-")):
                 setattr(found, action.dest, rest.pop(0))
         if rest:
-            names = [name for action in self._actions for name in action.option_strings]
-            known = [name for name in names if name.startswith("--")]
-            near = did_you_mean(rest[0].partition("=")[0], known)
-            self.error(f"unrecognized arguments: {' '.join(rest)}{near and '.'}{near}")
+            self._refuse(rest)
         return found, rest
+
+    def _unknown_options(self, args: Sequence[str]) -> list[str]:
+        """The long options that do not exist. argparse names them only if nothing else is missing."""
+        has_commands = any(isinstance(one, argparse._SubParsersAction) for one in self._actions)
+        unknown = []
+        for word in args:
+            if word == "--" or (has_commands and not word.startswith("-")):
+                break  # the options of a command are checked by its own parser
+            if word.startswith("--") and word.partition("=")[0] not in self._option_string_actions:
+                unknown.append(word)
+        return unknown
+
+    def _refuse(self, words: Sequence[str]) -> None:
+        """Exit with an error that names words without a meaning."""
+        known = [name[2:] for name in self._option_string_actions if name.startswith("--")]
+        # the dashes, which all have, would make any two names look alike
+        near = did_you_mean(words[0].partition("=")[0].lstrip("-"), known, show="--{}".format)
+        self.error(f"unrecognized arguments: {' '.join(words)}{near and '.'}{near}")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:

@@ -66,6 +66,14 @@ def test_dronecan_is_named_wherever_the_program_is_described() -> None:
         ("service instal", " service", "there is no 'instal'. Did you mean install?"),
         ("service install --now --rot x", " service install", "Did you mean --root?"),
         ("describe --format jsn", " describe", "there is no 'jsn'. Did you mean json?"),
+        ("--nope", "", "unrecognized arguments: --nope\n"),
+        ("--versoin", "", "unrecognized arguments: --versoin. Did you mean --version?\n"),
+        ("--nope run", "", "unrecognized arguments: --nope\n"),
+        ("service --nope", " service", "unrecognized arguments: --nope\n"),
+        ("convert --nope", " convert", "unrecognized arguments: --nope\n"),
+        ("convert a b --nope=1", " convert", "unrecognized arguments: --nope=1\n"),
+        ("check --forse", " check", "unrecognized arguments: --forse\n"),
+        ("convert a b --forse", " convert", "--forse. Did you mean --force?\n"),
     ],
 )
 def test_a_mistyped_command_line_shows_its_usage_and_what_was_meant(
