@@ -4,7 +4,7 @@ import json
 import os
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,8 @@ class Seen:
     document: Document | None = None
     is_missing: bool = False
     """There is no such file."""
+    is_service: bool = False
+    """systemd started the gateway, so its log is in the journal."""
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -69,10 +71,14 @@ class Seen:
 
 def published_files() -> list[Path]:
     """Return the status files of all gateways of the system and of this user, services first."""
-    found = sorted(folders.RUN.glob(f"{PROGRAM}*/{folders.STATUS_FILE}"))
+    found = _service_files()
     for folder in folders.status_folders():
         found += sorted(folder.glob("*.json"))
     return list({os.path.realpath(file): file for file in found}.values())
+
+
+def _service_files() -> list[Path]:
+    return sorted(folders.RUN.glob(f"{PROGRAM}*/{folders.STATUS_FILE}"))
 
 
 def possible_files(config: Path | None) -> list[Path]:
@@ -126,7 +132,9 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
     except (ValueError, RecursionError):
         text = FOREIGN
     else:
-        seen = judge(file, document, now)
+        services = map(os.path.realpath, _service_files())
+        is_service = os.path.realpath(file) in services
+        seen = replace(judge(file, document, now), is_service=is_service)
         if config is None or seen.document is None:
             return seen
         other = Path(seen.document["configuration"])
@@ -206,7 +214,8 @@ def lines_of(seen: Seen) -> Iterator[Text]:
     if seen.code == NOT_RUNNING:
         yield from wrapped(f"{PROGRAM} {document['version']}  {seen.sentence}", "bold red", _WIDTH)
         yield line((f"{document['configuration']}, last heard of {document['time']}", "dim"))
-        yield line((f"Why? journalctl -e -u '{PROGRAM}*'", "dim"))
+        if seen.is_service:
+            yield line((f"Why? journalctl -e -u '{PROGRAM}*'", "dim"))
     else:
         yield from _head(seen, document)
         yield from _can_lines(document)
