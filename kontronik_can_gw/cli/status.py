@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from kontronik_can_gw.cli import say
 from kontronik_can_gw.cli.arguments import JSON, default_config, option
 from kontronik_can_gw.desk.monitor.status import (
     NOT_RUNNING,
@@ -17,7 +18,7 @@ from kontronik_can_gw.desk.monitor.status import (
     possible_files,
     published_files,
 )
-from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.runtime.status.snapshot import PROGRAM
 
@@ -49,7 +50,11 @@ def main(args: argparse.Namespace) -> int:
     now = time.monotonic_ns()
     seen = _chosen(args, now) or [look_at(file, now) for file in published_files()]
     if not seen and (config := default_config()) is not None:
-        seen = [look_at_first(possible_files(config), now, config)]
+        try:
+            seen = [look_at_first(possible_files(config), now, config)]
+        except UserError as error:  # a running gateway was not started with this file
+            for problem in error.problems:
+                say(f"warning: {problem}", "status")
     if args.json:
         print(printable_json({"gateways": [each.as_json() for each in seen]}))
     if not seen:

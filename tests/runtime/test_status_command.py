@@ -193,6 +193,21 @@ def test_a_configuration_names_its_file_or_the_service_of_its_name(
     assert shell("-c", elsewhere)[0] == HEALTHY
 
 
+def test_a_broken_configuration_in_this_folder_is_only_a_warning(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("gateway.toml").write_text("cann = 1\n")
+    code, out, talk = shell()
+    assert (code, out) == (NOT_RUNNING, "")
+    assert "status: warning: gateway.toml: " in talk
+    assert "status: no gateway of this user or of the system runs." in talk
+    written(run_folder / "kontronik-can-gw" / "status" / "1.json", heard())
+    code, out, talk = shell()
+    assert (code, out.count("kontronik-can-gw "), talk) == (HEALTHY, 1, "")
+    assert shell("-c", "gateway.toml")[0] == 2
+
+
 def test_only_the_end_of_a_service_is_explained_by_the_journal(
     run_folder: Path, tmp_path: Path
 ) -> None:
