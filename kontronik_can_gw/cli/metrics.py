@@ -30,7 +30,7 @@ def _loopback(text: str) -> tuple[str, int]:
 OPTIONS = (
     (
         *CONFIG,
-        option("--file FILE", "its statistics file (default: the configuration's, or /run/kontronik-can-gw/status.json)", type=Path),
+        option("--file FILE", "status file of the gateway (default: the file of the gateway with this configuration)", type=Path),
     ),
     option("--listen HOST:PORT", "where Prometheus may fetch /metrics, on this machine (default 127.0.0.1:9123)",
            type=_loopback, default=("127.0.0.1", 9123)),
