@@ -45,7 +45,7 @@ def _seconds_ns(text: str) -> int:
             return int(number * 10**9)
     except InvalidOperation:
         pass
-    raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds")
+    raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds from 0 to 999999999")
 
 
 def _names(text: str) -> list[str]:

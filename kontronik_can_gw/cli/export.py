@@ -52,7 +52,9 @@ def main(args: argparse.Namespace) -> int:
         inputs = configuration_files(args.config, args.dbc)
         _write(folder, files, inputs, force=args.force)
     except OSError as error:
-        raise RunError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
+        raise RunError(
+            f"{error.filename or folder}: cannot be written: {error.strerror}. Give another folder."
+        ) from None
     say(f"{folder} written. {folder / 'README.md'} says how to build it in.")
     return 0
 

@@ -30,14 +30,19 @@ _BITS: dict[str, OperatingError | SelfTestError] = {
     bit.text: bit for kind in (OperatingError, SelfTestError) for bit in kind
 }
 _UNITS = {"ms": 1e6, "s": 1e9, "": 1e9, "min": 60e9, "h": 3600e9}
+_LONGEST_H = 999_999
+"""Longer times do not fit into the 64 bits of a time in ns."""
 
 
 def _time_ns(text: str) -> int:
     """A TIME in nanoseconds."""
-    match = re.fullmatch(r"([0-9]{1,6}(?:\.[0-9]*)?)\s*(ms|s|min|h|)", text.strip())
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]*)?)\s*(ms|s|min|h|)", text.strip())
     if not match:
         raise ArgumentTypeError(f"{text!r} is not a time. Give for example 5s, 200ms or 2min")
-    return round(float(match[1]) * _UNITS[match[2]])
+    time_ns = float(match[1]) * _UNITS[match[2]]
+    if time_ns > _LONGEST_H * _UNITS["h"]:
+        raise ArgumentTypeError(f"{text!r} is too long. Give at most {_LONGEST_H}h")
+    return round(time_ns)
 
 
 def _dropout(text: str) -> Dropout:

@@ -229,3 +229,26 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     adapter = ["--interface", "slcan", "--channel", f"{port}@115200"]
     assert "nothing may be sent to an ESC" in refused(2, *words.split(), "-c", file, *adapter)
     assert port.read_bytes() == b""
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("simulate --seconds 1000000h", "'1000000h' is too long. Give at most 999999h"),
+        ("simulate --seconds 99999999999", "'99999999999' is too long. Give at most 999999h"),
+        ("simulate --seconds 1e9", "'1e9' is not a time. Give for example 5s, 200ms or 2min"),
+        (
+            "convert a b --from 1000000000",
+            "'1000000000' is not a number of seconds from 0 to 999999999",
+        ),
+    ],
+)
+def test_a_time_that_is_too_long_is_called_so(words: str, said: str) -> None:
+    assert refused(2, *words.split()).endswith(said)
+
+
+def test_an_export_that_cannot_be_written_has_a_remedy(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    folder = tmp_path / "file" / "out"
+    said = refused(1, "export", "c", folder)
+    assert said.endswith(": cannot be written: Not a directory. Give another folder.")
