@@ -103,8 +103,7 @@ def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     - A machine id: containers and fresh roots have none, and the configuration warns about that.
     - No configuration in /etc: an installed gateway has one.
     - A runtime folder of their own, for this process and its children. A user without a session
-      has none, and a gateway of the system must not meet the locks of the tests. A child that
-      runs as root still uses /run/kontronik-can-gw.
+      has none, and a gateway of the system must not meet the locks of the tests.
     """
     from kontronik_can_gw.cli import arguments
     from kontronik_can_gw.runtime.system import folders, machine
@@ -115,6 +114,7 @@ def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         clear_environment(patch)
         patch.setenv("XDG_RUNTIME_DIR", str(runtime))
+        patch.setenv("KONTRONIK_RUN", str(runtime))
         patch.setattr(folders, "RUN", runtime)
         patch.setattr(machine, "_IDENTITIES", (str(file), "/etc/machine-id"))
         patch.setattr(arguments, "CONFIG_PLACES", arguments.CONFIG_PLACES[:1])

@@ -2,7 +2,8 @@
 
 The folder is the first that this user may use:
 
-1. ``/run/kontronik-can-gw``, shared with the service. Root and the service's user use it.
+1. ``/run/kontronik-can-gw``, shared with the service. Root and the service's user use it. The
+   environment variable ``KONTRONIK_RUN`` replaces ``/run``, so that tests never meet a service.
 2. ``kontronik-can-gw`` in ``$XDG_RUNTIME_DIR``, or in ``/run/user/UID`` of a login session.
 3. ``/tmp/kontronik-can-gw-UID``, if there is no session (cron, a container, ``su``). It must belong to this
    user, because every user can create names in ``/tmp``.
@@ -15,7 +16,7 @@ import zlib
 from pathlib import Path
 
 NAME = "kontronik-can-gw"
-RUN = Path("/run")
+RUN = Path(os.environ.get("KONTRONIK_RUN", "/run"))
 TEMPORARY = Path("/tmp")  # noqa: S108  the folder in it is checked, see _is_own
 STATUS_FILE = "status.json"
 """Name of a service's status file in its runtime folder."""
