@@ -409,5 +409,7 @@ def test_nothing_is_handed_to_the_kernel_in_bus_off_by_turns_in_c(
     turns.loop.can.controller.follow(turns.bus, turns.world.now)
     sent_before = len(turns.bus.sent)
     assert sent_before > 0
-    turns.run(2)
+    turns.run(1.9)
     assert len(turns.bus.sent) == sent_before
+    turns.run(2.5)
+    assert len(turns.bus.sent) > sent_before, "nobody confirmed the bus-off within a second"

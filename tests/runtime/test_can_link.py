@@ -22,7 +22,7 @@ from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.status import CanState
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import MS, NEVER, SECOND
 
 
 @pytest.fixture(autouse=True)
@@ -388,9 +388,14 @@ def test_nothing_is_handed_to_the_kernel_in_bus_off(
     made.can.close()
 
 
-def test_a_bus_off_that_somebody_sent_on_a_virtual_bus_ends_after_a_second(kernel: Kernel) -> None:
+@pytest.mark.parametrize("told_by", ["state of no controller", "nothing", "no rtnetlink"])
+def test_a_bus_off_that_somebody_sent_on_a_virtual_bus_ends_after_a_second(
+    kernel: Kernel, monkeypatch: pytest.MonkeyPatch, told_by: str
+) -> None:
+    if told_by == "no rtnetlink":  # as for the buses of python-can
+        monkeypatch.setattr(can_controller, "link_monitor", lambda _name: None)
     made = Bench(kernel)
-    kernel.facts = ACTIVE._replace(state=None)
+    kernel.facts = ACTIVE._replace(state=None) if told_by == "state of no controller" else None
     made.start()
     made.turn(1500)
     made.take()
@@ -400,6 +405,8 @@ def test_a_bus_off_that_somebody_sent_on_a_virtual_bus_ends_after_a_second(kerne
     made.turn(300)
     assert told(made.take())[0] == "boot-up"
     assert made.gateway.status.can_state is CanState.ERROR_ACTIVE
+    made.turn(3000)
+    assert (made.can.controller.due == NEVER) == (told_by == "no rtnetlink"), "nobody to ask"
     made.can.close()
 
 

@@ -16,9 +16,10 @@ ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
 RESTARTED_NS = SECOND
 """A driver may go on reporting bus-off for this long after a restart."""
 UNCONFIRMED_OFF_NS = SECOND
-"""A bus-off of an interface without a controller ends after this time at the latest.
+"""A bus-off that the kernel cannot confirm ends after this time at the latest.
 
 On a virtual bus any participant can send the error frame, and nothing restarts a controller there.
+The kernel knows no controller of a virtual interface, and nothing of the adapters of python-can.
 """
 
 
@@ -57,10 +58,13 @@ class CanController:
             self._monitor = None
 
     def ask(self, now: int) -> None:
-        """Ask how the interface is."""
+        """Ask how the interface is. In bus-off the time is looked at, too, even if nobody can be asked."""
         if self._monitor is not None:
             self._monitor.ask()
-            self.due = now + (ASK_OFF_NS if self.is_off else ASK_NS)
+        if self.is_off:
+            self.due = now + ASK_OFF_NS
+        else:
+            self.due = NEVER if self._monitor is None else now + ASK_NS
 
     def take(self) -> list[LinkFacts]:
         """What the kernel has reported since the last call, oldest first."""
@@ -82,13 +86,18 @@ class CanController:
 
         A driver may learn of a restart later than its error frames report it.
         """
-        if facts.state is None and self.is_off and now - self._off_since >= UNCONFIRMED_OFF_NS:
-            port.note_state(CanState.ERROR_ACTIVE)
         is_old = facts.state is CanState.BUS_OFF and (
             self.is_off or now - self._restarted_ns < RESTARTED_NS
         )
         if facts.state is not None and facts.state is not port.state and not is_old:
             port.note_state(facts.state)
+
+    def end_unconfirmed_off(self, port: CanPort, now: int) -> None:
+        """End a bus-off that has lasted long enough without a confirmation of the kernel."""
+        is_confirmed = self.facts is not None and self.facts.state is not None
+        if self.is_off and not is_confirmed and now - self._off_since >= UNCONFIRMED_OFF_NS:
+            port.note_state(CanState.ERROR_ACTIVE)
+            self.follow(port, now)
 
     def follow(self, port: CanPort, now: int) -> None:
         """The port may have another state than the gateway knows: pass it on, log what it means."""

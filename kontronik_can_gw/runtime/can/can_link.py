@@ -181,6 +181,8 @@ class CanLink:
         """Learn from the kernel how the interface is; it answers at once, so that the loop need not be woken for that."""
         self.controller.ask(now)
         self.hear(now)
+        if self.port is not None:
+            self.controller.end_unconfirmed_off(self.port, now)
 
     def hear(self, now: int, _events: int = 0) -> None:
         """The kernel has reported something of the interface."""
