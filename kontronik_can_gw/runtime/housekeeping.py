@@ -79,6 +79,7 @@ class Housekeeping:
         self.due = now + ROUND_NS
         for esc in self._escs:
             esc.report(now)
+        self._can.report(now)
         self._log_conflicts(now)
         self._conditions.advance(now)
         self.follow_recorder(now)
@@ -201,7 +202,12 @@ class Housekeeping:
 def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
     """What the statistics show of the interface."""
     config, known = can.config, can.controller.facts or LinkFacts(exists=False)
-    faults = (can.condition, can.transmitter.condition, can.controller.condition)
+    faults = (
+        can.opening_condition,
+        can.condition,
+        can.transmitter.condition,
+        can.controller.condition,
+    )
     return CanFacts(
         config.interface,
         config.channel,

@@ -22,10 +22,11 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime.can import can_opener
+from kontronik_can_gw.runtime.can import can_link, can_opener
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.native_poller import poller_for
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
+from kontronik_can_gw.times import SECOND
 
 ESCS = (EscSettings("esc1", timeout_ns=60_000_000_000),)
 LIMIT_S = 60
@@ -199,6 +200,34 @@ def test_a_port_that_opens_after_the_end_is_closed(
         if thread.name == "can-opener":
             thread.join(LIMIT_S)
     assert (driver.opened, driver.closed_by) == (1, ["can-opener"])
+
+
+@pytest.mark.parametrize("error", [None, RunError("CAN slcan /dev/none: there is none.")])
+def test_a_driver_that_does_not_return_from_opening_is_logged_until_it_does(
+    error: RunError | None, uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(can_link, "SLOW_OPENING_NS", 1000 * SECOND)  # no test takes that long
+    driver = Driver(monkeypatch)
+    driver.may_close.set()
+    before = time.monotonic_ns()
+    it = Running(uart, "slcan", "/dev/none", wait=True)
+    after = time.monotonic_ns()
+    it.turn_until(lambda: it.received >= 1)
+    it.loop._housekeeping.run(before + 999 * SECOND)
+    told = [line for line in it.loop.conditions.recent if "CAN" in line]
+    assert told == []
+    for seconds in (1000, 1001):
+        it.loop._housekeeping.run(after + seconds * SECOND)
+    (line,) = (line for line in it.loop.conditions.recent if "CAN" in line)
+    assert "CAN slcan /dev/none: still opening: the driver does not return." in line
+    driver.error = error
+    driver.may_open.set()
+    it.turn_until(lambda: len([line for line in it.loop.conditions.recent if "CAN" in line]) > 1)
+    last = [line for line in it.loop.conditions.recent if "CAN" in line][1]
+    expected = "CAN slcan /dev/none is open, after " if error is None else f"{error} Trying again."
+    assert expected in last
+    assert not it.loop.conditions.is_on(it.loop.can.opening_condition)
+    it.loop.end()
 
 
 class Slcan(threading.Thread):

@@ -27,6 +27,8 @@ from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import NEVER, SECOND
 
 MAX_RETRY_NS = SECOND // 2
+SLOW_OPENING_NS = 10 * SECOND
+"""A driver that takes longer to open an interface is reported. slcan sleeps for two seconds."""
 _OK = Sent.OK  # an enumeration's members are slow to look up
 
 
@@ -50,6 +52,9 @@ class CanLink:
         self._poller = poller
         self._conditions = conditions
         self.condition = f"CAN {config.channel}: interface"
+        self.opening_condition = f"CAN {config.channel}: opening"
+        self._opening_since: int | None = None
+        """When the opening beside the loop began that has not ended yet."""
         self._clock = clock
         self._retry = Retry(MAX_RETRY_NS)
         self._own_ids = IdLocks(config, gateway, conditions)
@@ -108,14 +113,27 @@ class CanLink:
     def _follow_opener(self, now: int, _events: int = 0) -> None:
         """An opening beside the loop has ended."""
         result = self._opener.take()
+        if result is not None:
+            self._opening_since = None
         if isinstance(result, CanPort):
             self._use(result, now)
             self._gateway.can_returned(now)
         elif result is not None:
             if self.must_open:
                 raise result
+            self._conditions.forget(self.opening_condition)
             self._failed(str(result), now)
         self.must_open = self.must_open and result is None
+
+    def report(self, now: int) -> None:
+        """Log a driver that takes long to open the interface, or never returns."""
+        since = self._opening_since
+        if since is not None and now - since >= SLOW_OPENING_NS:
+            text = (
+                f"CAN {self.config.interface} {self.config.channel}: still opening: the driver does not return. "
+                "Check the adapter; restart the gateway if it was replaced."
+            )
+            self._conditions.begin(self.opening_condition, text, now, since=since)
 
     def close(self) -> None:
         """Close everything. A second call changes nothing."""
@@ -133,6 +151,8 @@ class CanLink:
         self._retry.due = None
         if (port := self._opener.open()) is not None:
             self._use(port, now)
+        else:
+            self._opening_since = now
         return port is not None
 
     def _use(self, port: CanPort, now: int) -> None:
@@ -148,10 +168,11 @@ class CanLink:
         self.follow_ids()
         self._gateway.can_opened(now)
         self.controller.refresh(now)  # older reports, as that it was down, are past
-        if not self._conditions.is_on(self.condition):  # otherwise logged when a frame is sent
-            self._conditions.say(
-                logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open"
-            )
+        text = f"CAN {self.config.interface} {self.config.channel} is open"
+        if self._conditions.is_on(self.opening_condition):
+            self._conditions.end(self.opening_condition, text, now)
+        elif not self._conditions.is_on(self.condition):  # otherwise logged when a frame is sent
+            self._conditions.say(logging.INFO, text)
 
     def _close_port(self) -> None:
         self.transmitter.forget_failures()
