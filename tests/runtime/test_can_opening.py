@@ -128,6 +128,13 @@ class Running:
         return int(self.loop.gateway.escs[0].counters.live)
 
 
+def wait_for_opener() -> None:
+    """Until its thread has ended: the loop does not wait for it."""
+    for thread in threading.enumerate():
+        if thread.name == "can-opener":
+            thread.join(LIMIT_S)
+
+
 @pytest.mark.parametrize("wait", [True, False])
 def test_ports_are_served_while_a_driver_opens_and_frames_are_sent_then(
     wait: bool, uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
@@ -144,7 +151,23 @@ def test_ports_are_served_while_a_driver_opens_and_frames_are_sent_then(
     assert it.loop.can.is_open
     assert it.status.is_ready
     it.loop.end()
-    assert (driver.opened, driver.closed_by) == (1, ["MainThread"]), "there is no loop any more"
+    wait_for_opener()
+    assert (driver.opened, driver.closed_by) == (1, ["can-opener"])
+
+
+def test_a_driver_that_takes_long_to_close_does_not_hold_up_the_end(
+    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread is left alone. It ends with the process, or when the driver has returned."""
+    driver = Driver(monkeypatch)
+    driver.may_open.set()
+    it = Running(uart, "slcan", "/dev/none", wait=True)
+    it.turn_until(lambda: bool(driver.bus.sent))
+    it.loop.end()
+    assert driver.closed_by == [], "the end did not wait for it"
+    driver.may_close.set()
+    wait_for_opener()
+    assert driver.closed_by == ["can-opener"]
 
 
 def test_a_driver_that_fails_at_start_ends_the_loop_unless_it_may_wait(
@@ -196,9 +219,7 @@ def test_a_port_that_opens_after_the_end_is_closed(
     assert driver.begun.wait(LIMIT_S)
     it.loop.end()
     driver.may_open.set()
-    for thread in threading.enumerate():
-        if thread.name == "can-opener":
-            thread.join(LIMIT_S)
+    wait_for_opener()
     assert (driver.opened, driver.closed_by) == (1, ["can-opener"])
 
 

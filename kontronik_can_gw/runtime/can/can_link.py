@@ -137,10 +137,10 @@ class CanLink:
 
     def close(self) -> None:
         """Close everything. A second call changes nothing."""
+        self._close_port()  # first, so that the opener's thread waits for a slow driver, and we do not
         if (opener_fd := self._opener.fileno()) >= 0:
             self._poller.unregister(opener_fd)
             self._opener.close()
-        self._close_port()
         self._own_ids.close()
         if (fd := self.controller.fileno()) is not None:
             self._poller.unregister(fd)

@@ -15,7 +15,8 @@ from kontronik_can_gw.runtime.system.worker import Handover, Worker
 
 _AT_ONCE = ("socketcan", "virtual")
 """Interfaces that wait for nothing when they are opened: SocketCAN, and python-can's bus within the process."""
-_END_S = 0.2
+_END_S = 0.15
+"""How long ``close`` waits for a driver that opens or closes: the process must end within 0.3 s."""
 _NO_THREAD = "CAN {0.interface} {0.channel}: the system gives no thread to open it."
 
 
