@@ -39,7 +39,7 @@ class Parser(argparse.ArgumentParser):
         return found, rest
 
     def _unknown_options(self, args: Sequence[str]) -> list[str]:
-        """The long options that do not exist. argparse names them only if nothing else is missing."""
+        """The long options that do not exist. argparse often names only missing arguments."""
         has_commands = any(isinstance(one, argparse._SubParsersAction) for one in self._actions)
         unknown = []
         for word in args:

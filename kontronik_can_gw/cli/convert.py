@@ -142,7 +142,7 @@ def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
 def _report(
     args: argparse.Namespace, form: str, recording: Input, summary: str | None, seconds: float
 ) -> None:
-    """Say what was written, and what of the recording was not intact. RunError or UserError where there was nothing."""
+    """Report the result and the damage. RunError or UserError if there was nothing to convert."""
     source = name_of(Path(args.input))
     damage = [f"{source}: damaged: {line}" for line in recording.damage]
     if summary is None:

@@ -212,16 +212,16 @@ def test_only_the_end_of_a_service_is_explained_by_the_journal(
     run_folder: Path, tmp_path: Path
 ) -> None:
     """A killed gateway leaves its file behind. One that was started by hand has no journal."""
-    stopped = {"monotonic_ns": NOW - 60 * SECOND}
+    stopped_ns = NOW - 60 * SECOND
     by_hand = run_folder / "kontronik-can-gw" / "status" / "1.json"
-    written(by_hand, heard(), **stopped)
+    written(by_hand, heard(), monotonic_ns=stopped_ns)
     code, out, _ = shell()
     assert code == NOT_RUNNING
     assert "has written nothing for 60.0 s" in out and "journalctl" not in out
     by_hand.unlink()
     service = run_folder / "kontronik-can-gw-left" / "status.json"
     configured = tmp_path / "statistics.json"
-    written(configured, heard(), **stopped)
+    written(configured, heard(), monotonic_ns=stopped_ns)
     service.parent.mkdir()
     service.symlink_to(configured)
     for arguments in ((), ("--file", configured)):

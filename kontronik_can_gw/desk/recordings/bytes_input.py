@@ -174,7 +174,8 @@ class BytesInput(PlayedInput):
         if found == BYTES:
             return None
         return UserError(
-            f"{name}: is a {found} recording, not the bytes of an ESC. Use kontronik-can-gw convert."
+            f"{name}: is a {found} recording, not the bytes of an ESC. "
+            "Use kontronik-can-gw convert."
         )
 
 

@@ -45,7 +45,8 @@ def open_input(path: Path, layout: BusLayout | None = None) -> Input:
 def open_bytes(path: Path, layout: BusLayout | None) -> Input:
     """Open a file or a pipe as the bytes of one ESC, whatever its content is.
 
-    UserError if it is missing or cannot be opened. ``refusal`` is set at the end if it was no recording.
+    UserError if it is missing or cannot be opened. If it is no recording, ``refusal`` is set at
+    its end.
     """
     stream = open_stream(path)
     if stream is None and not path.exists():

@@ -39,8 +39,8 @@ class LogFrame(NamedTuple):
     """A frame of a CAN log, which may be a remote frame or an error frame, too.
 
     ``channel``: its name or number; empty for the gateway's own bus. ``received``: None if the log
-    does not state a direction. The id of an error frame is ERROR and SocketCAN's class of the error,
-    if the log has it.
+    does not state a direction. The id of an error frame is ERROR and SocketCAN's class of the
+    error, if the log has it.
     """
 
     time_ns: int
@@ -262,7 +262,7 @@ def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
     notes = []
     if hidden:
         listed = [
-            f"{'back' if step.by_ns < 0 else 'ahead'} {_by_and_after(step, step.time_ns - begin_ns)}"
+            ("back " if step.by_ns < 0 else "ahead ") + _by_and_after(step, step.time_ns - begin_ns)
             for step in hidden
         ]
         notes.append(f"the clock was set {_some_of(listed)}; times continue without the step")

@@ -58,7 +58,7 @@ class CanController:
             self._monitor = None
 
     def ask(self, now: int) -> None:
-        """Ask how the interface is. In bus-off the time is looked at, too, even if nobody can be asked."""
+        """Ask how the interface is. In bus-off ``due`` is set even if there is nothing to ask."""
         if self._monitor is not None:
             self._monitor.ask()
         if self.is_off:

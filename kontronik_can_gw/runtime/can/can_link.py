@@ -130,14 +130,14 @@ class CanLink:
         since = self._opening_since
         if since is not None and now - since >= SLOW_OPENING_NS:
             text = (
-                f"CAN {self.config.interface} {self.config.channel}: still opening: the driver does not return. "
-                "Check the adapter; restart the gateway if it was replaced."
+                f"CAN {self.config.interface} {self.config.channel}: still opening: "
+                "the driver does not return. Check the adapter; restart the gateway if it was replaced."
             )
             self._conditions.begin(self.opening_condition, text, now, since=since)
 
     def close(self) -> None:
         """Close everything. A second call changes nothing."""
-        self._close_port()  # first, so that the opener's thread waits for a slow driver, and we do not
+        self._close_port()  # first: the opener's thread waits for a slow driver, this one does not
         if (opener_fd := self._opener.fileno()) >= 0:
             self._poller.unregister(opener_fd)
             self._opener.close()
