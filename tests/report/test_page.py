@@ -14,7 +14,6 @@ from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
-from kontronik_can_gw.desk.report.summary import clock, duration, number, wall_clock
 from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
 from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND as S

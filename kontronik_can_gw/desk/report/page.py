@@ -14,7 +14,7 @@ from typing import Any
 from kontronik_can_gw.desk.report.esc import Number
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS
-from kontronik_can_gw.desk.report.summary import clock, duration, number, tables, tiles, wall_clock
+from kontronik_can_gw.desk.report.summary import tables, tiles
 from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.times import SECOND
