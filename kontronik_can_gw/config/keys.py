@@ -58,15 +58,15 @@ class CanConfig:
     """The CAN interface."""
 
     interface: str = key(TEXT, "socketcan",
-        "python-can interface name: socketcan, virtual, pcan, kvaser, slcan ...")
-    channel: str = key(TEXT, "can0", "channel of that interface, as can0")
+        "interface of python-can: socketcan, virtual, pcan, kvaser, slcan ...")
+    channel: str = key(TEXT, "can0", "channel of that interface, for example can0")
     bitrate: int = key(integer(10_000, 1_000_000), 500_000,
-        "bit rate in bit/s; with socketcan it is set by the system and only the bus load is computed from it")
-    fd: bool = key(BOOLEAN, False, "allow CAN FD messages (longer than 8 bytes)")
+        "bit rate in bit/s. With socketcan the system sets it, and the gateway only computes the bus load from it")
+    fd: bool = key(BOOLEAN, False, "allow CAN FD, that is messages of more than 8 bytes")
     data_bitrate: int = key(integer(10_000, 8_000_000), 2_000_000,
-        "bit rate of the CAN FD data phase in bit/s")
+        "bit rate of CAN FD's data phase in bit/s")
     options: Mapping[str, str | float] = key(options("can", _OF_CAN), {},
-        "further options of the python-can interface, as host or ttyBaudrate; SocketCAN takes none")
+        "more options of the python-can interface, for example host or ttyBaudrate. SocketCAN has none")
 
 
 @dataclass(frozen=True)
@@ -74,61 +74,61 @@ class RunConfig:
     """How the gateway runs."""
 
     wait_for_devices: bool = key(BOOLEAN, False,
-        "at start: wait for ports and interfaces that are missing instead of ending with an error")
+        "at start, wait for missing ports and interfaces instead of ending with an error")
     realtime_priority: int | None = key(integer(1, 99), None,
-        "real-time priority (SCHED_FIFO) and locked memory, so that the load of other programs delays no frame "
-        "(default: normal priority)")
+        "real-time priority (SCHED_FIFO). It also locks the memory, so that other programs' load "
+        "delays no frame (default: normal priority)")
 
 
 @dataclass(frozen=True)
 class StatisticsConfig:
-    """Statistics for ``kontronik-can-gw status`` and ``kontronik-can-gw metrics``."""
+    """Statistics for `kontronik-can-gw status` and `kontronik-can-gw metrics`."""
 
     file: str | None = key(TEXT, None,
-        "JSON file that is replaced each second, relative to this configuration "
+        "JSON file that is replaced each second, relative to the configuration's folder "
         "(default: a file in the runtime folder, where `status` finds it)")
 
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """Captures of all input, to be replayed and converted later."""
+    """Captures: recordings of all input, to replay and convert later."""
 
     directory: str | None = key(TEXT, None,
-        "folder of the captures, relative to this configuration; 'state' is a folder captures in the service's "
-        "state folder (default: only `run --record` records)")
-    part_mb: int = key(integer(1, 4000), 64, "begin another file at this size in megabytes")
+        "folder for captures, relative to the configuration's folder. 'state' is the folder captures "
+        "in the service's state folder (default: only `run --record` records)")
+    part_mb: int = key(integer(1, 4000), 64, "begin a new file at this size in megabytes")
     part_minutes: int = key(integer(1, 10_000), 60,
-        "begin another file after this time in minutes")
+        "begin a new file after this time in minutes")
     keep_mb: int = key(integer(0, 10_000_000), 0,
-        "remove the oldest captures of the folder when all together have more megabytes; 0: remove nothing")
+        "remove the oldest captures while the folder's captures exceed this number of megabytes. 0 removes none")
     min_free_mb: int = key(integer(0, 10_000_000), 100,
-        "record nothing while fewer megabytes are free on the file system")
+        "pause recording while the file system has less free space, in megabytes")
 
 
 @dataclass(frozen=True)
 class MqttConfig:
-    """Broker, topics and rate of ``kontronik-can-gw mqtt``."""
+    """Broker, topics and rate of `kontronik-can-gw mqtt`."""
 
     broker: str | None = key(BROKER, None,
-        "MQTT broker, as broker.example or 192.168.1.5:1883 (default port 1883, with TLS 8883)")
-    tls: bool = key(BOOLEAN, False, "encrypt, and check the broker's certificate and name")
+        "MQTT broker, for example broker.example or 192.168.1.5:1883 (default port: 1883, with TLS 8883)")
+    tls: bool = key(BOOLEAN, False, "encrypt the connection, and check the broker's certificate and name")
     ca_file: str | None = key(TEXT, None,
-        "certificate of the authority that signed the broker's, relative to this configuration "
-        "(default: those of the system)")
+        "certificate of the authority that signed the broker's certificate, relative to the "
+        "configuration's folder (default: the system's authorities)")
     cert_file: str | None = key(TEXT, None,
-        "certificate to show to the broker, relative to this configuration")
+        "client certificate, relative to the configuration's folder, for a broker that requires one")
     key_file: str | None = key(TEXT, None,
-        "key of that certificate, relative to this configuration")
+        "key of the client certificate, relative to the configuration's folder")
     username: str | None = key(TEXT, None, "user name at the broker")
     password_file: str | None = key(TEXT, None,
-        "file with the password on its first line, relative to this configuration")
+        "file whose first line is the password, relative to the configuration's folder")
     gateway: str | None = key(LEVEL, None,
         "name of this gateway in the topics (default: the host name)")
     topic: str = key(TOPIC, "kontronik", "first part of all topics")
-    rate: float = key(number(0.01, 20), 1.0, "state messages of each ESC in a second")
-    retain: bool = key(BOOLEAN, False, "let the broker keep the last state message of each ESC")
+    rate: float = key(number(0.01, 20), 1.0, "state messages per second for each ESC")
+    retain: bool = key(BOOLEAN, False, "ask the broker to keep the last state message of each ESC")
     discovery: str | None = key(TOPIC, None,
-        "topic prefix of Home Assistant's discovery, there mostly 'homeassistant' (default: no discovery)")
+        "topic prefix of Home Assistant's discovery, usually 'homeassistant' (default: no discovery)")
 
     @property
     def address(self) -> tuple[str, int] | None:
@@ -146,23 +146,23 @@ class MqttConfig:
 class EscConfig:
     """One ESC and its serial port."""
 
-    port: str = key(TEXT, REQUIRED, "serial port, best by /dev/serial/by-id/...")
+    port: str = key(TEXT, REQUIRED, "serial port, preferably a name below /dev/serial/by-id")
     name: str = key(ESC_NAME, "",
-        "short name, prefix of messages and signals with several ESCs (the shipped DBC has room for 6 letters); "
-        "default esc1, esc2 ...")
+        "short name, which becomes a prefix of messages and signals if there are several ESCs. The shipped DBC "
+        "has room for 6 letters (default: esc1, esc2 ...)")
     pole_pairs: int = key(integer(1, 100), 1,
         "pole pairs of the motor (half the number of magnets)")
     gear: Fraction = key(RATIO, Fraction(1),
-        "motor revolutions per output revolution: a number or 'numerator/denominator'")
-    cell_count: int = key(integer(0, 255), 0, "cells of the battery; 0: as the ESC reports")
+        "motor revolutions per revolution of the gear's output: a number or 'numerator/denominator'")
+    cell_count: int = key(integer(0, 255), 0, "cells of the battery. 0: the number that the ESC reports")
     telemetry_timeout_ms: int = key(integer(20, 60_000), 250,
-        "live values older than this are not available")
+        "age in milliseconds above which live values are not available")
     node_id: int | None = key(NODE_ID, None,
-        "CANopen node-ID of this ESC; 255: waits for LSS (default: counted on from canopen.node_id)")
+        "CANopen node-ID of this ESC. 255: the node waits for LSS (default: counted up from canopen.node_id)")
     device: str | None = key(choice_of(device_names), None,
-        "expected device; another one is reported (CANopen EMCY 7510h)")
+        "expected device. Any other device on this port is reported (CANopen EMCY 7510h)")
     protocol: str = key(choice_of(protocol_names), PROTOCOLS[0].name,
-        "protocol of the ESC's telemetry line")
+        "protocol of the ESC's telemetry")
 
     @property
     def settings(self) -> EscSettings:

@@ -33,30 +33,35 @@ class DbcConfig:
 
     enabled: bool = key(BOOLEAN, True, "send the messages of a DBC")
     file: str = key(TEXT, SHIPPED,
-        "DBC file, relative to this configuration; 'shipped' is the one of this package")
-    node: str | None = key(TEXT, None, "transmitter node in the DBC whose messages are sent")
+        "DBC file, relative to the configuration's folder. 'shipped' is the DBC of this package")
+    node: str | None = key(TEXT, None,
+        "node of the DBC whose messages the gateway sends (default: the only node that sends)")
     messages: Sequence[str] = key(NAMES, (),
-        "names of the messages to send, '*' for any characters, as [\"Motor_*\"] (default: all of the node)")
+        "names of the messages to send, for example [\"Motor_*\"]; '*' stands for any characters "
+        "(default: all messages of the node)")
     unbound: str = key(choice("error", "start_value"), "error",
-        "signals bound to nothing: 'error' refuses them, "
-        "'start_value' sends their GenSigStartValue (else NotAvailable, else 0) for ever")
+        "signals without a source: 'error' refuses them. 'start_value' always sends their "
+        "GenSigStartValue, or NotAvailable if they have none, or 0 if they have neither")
     on_loss: str = key(choice("not_available", "silent"), "not_available",
-        "without telemetry: 'not_available' sends values marked as such, 'silent' stops messages with an ESC's values")
+        "without telemetry: 'not_available' sends values marked as not available, "
+        "'silent' stops the messages that contain values of an ESC")
     flags_on_loss: int | None = key(integer(0, 1), None,
-        "value without telemetry of flags that have no NotAvailable in their value table "
-        "(default: their own GenSigStartValue, else 0)")
+        "without telemetry: value of flags whose value table has no NotAvailable "
+        "(default: their own GenSigStartValue, or 0 if they have none)")
     base_id: int | None = key(integer(0, _CAN_ID_MAX), None,
-        "move the messages so that the lowest id is this")
+        "lowest CAN id. All messages are moved by the same distance (default: the ids of the DBC)")
     id_step: int | None = key(integer(1, _CAN_ID_MAX), None,
-        "distance of the ids from ESC to ESC when a one-ESC DBC serves several")
+        "distance between the ids of one ESC and the next if a DBC for one ESC is used for several "
+        "(default: the smallest distance without a clash)")
     bind: Mapping[str, str | float] = key(BINDINGS, {},
-        "'Message.Signal' or 'Signal' = a source ('battery_voltage', 'left.battery_voltage') or a constant number")
+        "'Signal' or 'Message.Signal' = its source, for example 'battery_voltage' or "
+        "'left.battery_voltage', or a constant number")
     e2e_data_ids: Mapping[str, int] = key(table_of(integer(0, 0xFFFF)), {},
-        "message name = AUTOSAR E2E data id")
+        "name of a message = its AUTOSAR E2E data id (default: the CAN id)")
     units: Mapping[str, str] = key(meanings(units.names()), {},
-        "unit text of the DBC = the unit that it means")
+        "unit text in the DBC = the unit that is meant, for texts that the gateway does not recognise")
     send_type: Mapping[str, str] = key(meanings(tuple(SEND_TYPES)), {},
-        "GenMsgSendType of the DBC = its meaning")
+        "GenMsgSendType in the DBC = the send type that is meant, for names that the gateway does not recognise")
 
     @property
     def silent_on_loss(self) -> bool:
@@ -67,47 +72,53 @@ class DbcConfig:
 class CanopenConfig:
     """The CANopen nodes, one for each ESC."""
 
-    enabled: bool = key(BOOLEAN, False, "be a CANopen node for each ESC")
+    enabled: bool = key(BOOLEAN, False, "run a CANopen node for each ESC")
     node_id: int = key(NODE_ID, 1,
-        "node-ID of the first ESC, the others follow; 255: all wait for LSS")
+        "node-ID of the first ESC. The others count up from it. 255: all nodes wait for LSS")
     eds: str = key(TEXT, SHIPPED,
-        "EDS file the nodes are built from, relative to this configuration; 'shipped' is the one of this package")
+        "EDS file that describes the nodes, relative to the configuration's folder. "
+        "'shipped' is the EDS of this package")
     vendor_id: int | None = key(integer(0, _UINT32_MAX), None,
-        "vendor-ID in 1018h:1; only CiA assigns one (default: as the EDS says)")
+        "vendor-ID in 1018h:1. Only CiA assigns vendor-IDs (default: the EDS's)")
     serial: int | None = key(integer(0, _UINT32_MAX), None,
-        "serial number of the first node in 1018h:4, the others follow (default: made from the machine's id)")
+        "serial number of the first node in 1018h:4. The others count up from it "
+        "(default: derived from the machine's id)")
     self_start: bool = key(BOOLEAN, False,
-        "go OPERATIONAL after boot-up without a master (1F80h); otherwise as the EDS says")
-    read_only: bool = key(BOOLEAN, False, "refuse every write over the bus, and LSS")
+        "true: nodes become OPERATIONAL after boot-up without a master (1F80h). false: as the EDS defines it")
+    read_only: bool = key(BOOLEAN, False, "refuse all writes over the bus, and LSS")
     cia402_mirrors: bool = key(BOOLEAN, True,
-        "show the objects 6000h..67FFh (speed, DC link voltage, error code) that generic drive tools know")
+        "offer the objects from 6000h to 67FFh (speed, DC link voltage, error code), for generic drive tools")
     store: str | None = key(TEXT, None,
-        "folder of the parameters that masters store (default: the service's state folder; else for root /var/lib/kontronik-can-gw, "
-        "for others ~/.local/state/kontronik-can-gw)")
+        "folder for parameters that masters store (default: the service's state folder; without a service "
+        "/var/lib/kontronik-can-gw for root, ~/.local/state/kontronik-can-gw for other users)")
 
 
 @dataclass(frozen=True)
 class DronecanConfig:
     """DroneCAN nodes, for autopilots."""
 
-    enabled: bool = key(BOOLEAN, False, "report the ESCs by DroneCAN")
+    enabled: bool = key(BOOLEAN, False, "report the ESCs over DroneCAN")
     node_id: int = key(integer(0, 125), 0,
-        "node-ID of the first node, the others follow; 0: all ask an allocator on the bus (ArduPilot and PX4 are one)")
-    per_esc_nodes: bool = key(BOOLEAN, False, "a node for each ESC instead of one for the gateway")
+        "node-ID of the first node. The others count up from it. 0: an allocator on the bus, "
+        "for example ArduPilot or PX4, assigns all node-IDs")
+    per_esc_nodes: bool = key(BOOLEAN, False, "run a node for each ESC instead of one for the gateway")
     name: str = key(NODE_NAME, "kontronik_can_gw",
-        "name of the node; with per_esc_nodes a dot and the ESC's name follow")
+        "name of the node. With per_esc_nodes each name is NAME.ESC, ESC being the ESC's name")
     first_index: int = key(integer(0, 31), 0,
-        "esc_index of the first ESC, the others follow; PX4 and Betaflight take it as it is, ArduPilot adds CAN_Dn_UC_ESC_OF")
+        "esc_index of the first ESC. The others count up from it. PX4 and Betaflight use it unchanged, "
+        "ArduPilot adds CAN_Dn_UC_ESC_OF")
     rate_hz: int = key(integer(1, 200), 50,
-        "esc.Status of each ESC in a second while its telemetry is fresh; ArduPilot needs 10")
+        "esc.Status messages per second for each ESC, while its telemetry is fresh. ArduPilot needs at least 10")
     extended_hz: int = key(integer(0, 200), 0,
-        "esc.StatusExtended (throttle, duty, error bits) of each ESC in a second; 0: none, because it cannot mark a value as unknown")
+        "esc.StatusExtended messages (throttle, duty, error bits) per second for each ESC. "
+        "0 sends none, because this message cannot mark a value as unknown")
     rpm: str = key(choice("motor", "output", "electrical"), "motor",
-        "speed that is sent: of the 'motor' (ArduPilot, PX4), of the 'output' of the gear, 'electrical' (Betaflight)")
+        "speed to send: 'motor' (for ArduPilot and PX4), 'output' of the gear, or 'electrical' (for Betaflight)")
     negative_rpm: bool = key(BOOLEAN, True,
-        "rpm is negative while the motor turns backward, as the DSDL requires; false: never negative")
+        "send a negative rpm while the motor turns backward, as the DSDL requires. false: never negative")
     health: str = key(choice("gateway", "esc"), "gateway",
-        "source of the node's health: 'esc' includes errors of an ESC and lost telemetry, with which ArduPilot does not arm")
+        "source of the node's health: 'gateway' alone, or 'esc', which also counts errors of an ESC "
+        "and lost telemetry. While these last, ArduPilot does not arm")
     log_messages: bool = key(BOOLEAN, True,
-        "send errors of an ESC that begin and end as LogMessage, with the remedy")
+        "send a LogMessage with the remedy when an error of an ESC begins or ends")
 # fmt: on
