@@ -238,7 +238,10 @@ def texts_of(markdown_text: str) -> dict[str, list[str]]:
     for opening, token in pairwise(parser.parse(markdown_text)):
         assert token.type != "html_block"
         if token.type == "inline":
-            parts = [(part.type, part.content) for part in token.children or ()]
+            parts = [
+                ("text", "\n") if part.type == "softbreak" else (part.type, part.content)
+                for part in token.children or ()
+            ]
             plain = [text for kind, text in parts if (kind, text) != ("html_inline", "<!-- -->")]
             assert {kind for kind, _ in parts} <= {"text", "html_inline"}, parts
             assert len(plain) == sum(kind == "text" for kind, _ in parts), parts
@@ -282,3 +285,18 @@ def test_any_text_is_read_back_unchanged(title: str, paragraph: str, cell: str) 
         : bool(one_line(paragraph))
     ]
     assert [one_line(text) for text in found["td"]] == [one_line(cell), "y", "x", "x"]
+
+
+@given(st.lists(words, min_size=8, max_size=16))
+@example(["a|b " * 24, ":-:"])
+@example(["word " * 20, "- x", "1. x", "# x", "--- x"] * 2)
+def test_a_long_paragraph_of_any_words_is_read_back_unchanged(paragraph: list[str]) -> None:
+    joined = one_line(" ".join(paragraph))
+    found = texts_of(markdown("All", [], [Table("T", [joined])]))
+    assert [one_line(text) for text in found.get("p", [])] == [joined][: bool(joined)]
+    assert found.keys() <= {"h1", "h2", "p"}
+
+
+def test_paragraphs_are_wrapped_at_100_columns() -> None:
+    lines = markdown("All", ["one two three four five six seven eight [nine] " * 9], []).splitlines()
+    assert 90 < max(map(len, lines)) <= 100

@@ -3,12 +3,14 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
-from textwrap import indent
+from textwrap import indent, wrap
 from typing import Any, NamedTuple
 
 Row = dict[str, Any]
 _HEX = {"id": 3, "cob_id": 3, "code": 4}
 """Columns with hexadecimal numbers, and their number of digits."""
+_WIDTH = 96
+"""Length of a paragraph's lines before escaping, which makes them slightly longer."""
 
 
 class Code(str):
@@ -34,12 +36,12 @@ def markdown(title: str, lead: Iterable[str], tables: Iterable[Table]) -> str:
 
     Columns that are empty in all rows of a table are left out.
     """
-    blocks = [f"# {text(title)}", *map(text, lead)]
+    blocks = [f"# {text(title)}", *map(_wrapped, lead)]
     for table in tables:
         blocks.append(f"## {text(table.title)}")
         for paragraph in table.text:
             is_code = isinstance(paragraph, Code)
-            blocks.append(indent(paragraph, "    ") if is_code else text(paragraph))
+            blocks.append(indent(paragraph, "    ") if is_code else _wrapped(paragraph))
         if table.by:
             for head, rows in groupby(table.rows, key=lambda row: row[table.by]):
                 blocks += [f"### {text(str(head))}", _render_rows(list(rows), table.by)]
@@ -78,6 +80,13 @@ def _cell(key: str, value: object) -> str:
     return text(str(value))
 
 
+def _wrapped(paragraph: str) -> str:
+    """Return running text in lines, with every character of Markdown syntax escaped."""
+    plain = " ".join(paragraph.split())
+    lines = wrap(plain, _WIDTH, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(map(text, lines))
+
+
 def text(content: str) -> str:
     """Return running text in one line, with every character of Markdown syntax escaped."""
     plain = " ".join(content.split())
@@ -85,6 +94,6 @@ def text(content: str) -> str:
     masked = re.sub(r"(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])", r"\\_", masked)
     # Addresses must not become links.
     masked = re.sub(r"(https?|ftp)(://)|(www)(\.)", r"\1\3<!-- -->\2\4", masked)
-    # The text must not begin a heading or a list, or end a heading.
-    masked = re.sub(r"^([#+=-])|(?<= )(#+)$", r"\\\1\2", masked)
+    # The text must not begin a heading, a list or the line below a table's head, or end a heading.
+    masked = re.sub(r"^([#+=:-])|(?<= )(#+)$", r"\\\1\2", masked)
     return re.sub(r"^(\d+)([.)])(?= |$)", r"\1\\\2", masked)
