@@ -145,7 +145,7 @@ LAYOUT = (
     option("-c --config FILE", "TOML configuration of the gateway that sent the frames", type=Path),
     option("--dbc FILE", "DBC of the frames (default on a live bus: the DBC of gateway.toml; otherwise the shipped one)", type=Path),
 )
-LOG_CHANNEL = option("--channel NAME", "channel of a CAN log, as can0 or 1 (default: the only one with messages of the DBC)")
+LOG_CHANNEL = option("--channel NAME", "channel of a CAN log, for example can0 or 1 (default: the only one with messages of the DBC)")
 # fmt: on
 
 

@@ -20,11 +20,12 @@ _EXAMPLE_PORT = "_EXAMPLE-"
 """In the port of the configuration that ``init`` writes."""
 OPTIONS = (
     CONFIG,
-    (option("-v --verbose", "every key in effect, and what describe shows of the messages"), JSON),
+    (option("-v --verbose", "also print all keys in effect, messages and signals"), JSON),
 )
 EPILOG = (
-    "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot: "
-    "each mistake is a line, with key and remedy. kontronik-can-gw describe shows the objects and PDOs of CANopen nodes."
+    "Opens neither ports nor interfaces. Each mistake is one line with key and remedy. kontronik-can-gw describe "
+    "shows the objects and PDOs of CANopen nodes. Exit codes: 0 the configuration can be used, perhaps with warnings; "
+    "2 it cannot be used."
 )
 
 

@@ -14,7 +14,7 @@ from kontronik_can_gw.errors import RunError
 _SHELLS = ("bash", "zsh", "tcsh", "fish")
 OPTIONS = (option("SHELL", ", ".join(_SHELLS), choices=_SHELLS), *OUTPUT)
 EPILOG = """\
-Where the shells look for the script:
+The shells look for the script in these places:
 
   bash  ~/.local/share/bash-completion/completions/kontronik-can-gw
   zsh   ~/.zfunc/_kontronik-can-gw, with ~/.zfunc in fpath before compinit

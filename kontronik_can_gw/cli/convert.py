@@ -63,39 +63,39 @@ OPTIONS = (
     option("-o --output OUT", "another way to give OUT"),
     option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS),
     FORCE,
-    option("-q --quiet", "no summary"),
+    option("-q --quiet", "print no summary"),
     LAYOUT,
     LOG_CHANNEL,
     "a part of it",
     option("--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"),
     option("--until S", "up to this time after the start, in seconds", type=_seconds_ns, dest="end"),
     "tables",
-    option("--signals A,B*", "only these signals, in this order; * and ? stand for others", type=_names, default=[]),
+    option("--signals A,B*", "only these values, in this order; * stands for any characters, ? for one", type=_names, default=[]),
     "bin",
-    option("--esc NAME", "the ESC whose bytes are wanted, of several"),
+    option("--esc NAME", "the ESC whose bytes to write, if there are several"),
 )
 # fmt: on
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder stands for all parts of a
 run), a log of CAN frames (candump, Vector ASC or BLF, PEAK TRC, MF4 bus
-logging), or the plain UART bytes of one ESC. The content decides which it is.
-IN may be a pipe. UART bytes and candump text are then converted as they
-arrive, and Ctrl-C ends the input and keeps the rows so far.
+logging), or the plain UART bytes of one ESC. The format is detected from the
+content. IN may be a pipe. UART bytes and candump text are then converted as
+they arrive, and Ctrl-C ends the input and keeps the rows so far.
 
 OUT is a table of all values (csv, jsonl, parquet), a log of the CAN frames
 (candump, asc, blf, trc, mf4-log), or the plain UART bytes of one ESC (bin).
 Its suffix selects the format: .csv .jsonl .ndjson .parquet .log .candump .asc
-.blf .trc .bin. With another suffix give --to. - is standard output, for text.
-Parquet needs pyarrow, mf4-log needs asammdf.
+.blf .trc .bin. For any other suffix use --to. OUT may be - for standard output
+if the format is text. Parquet needs pyarrow, mf4-log needs asammdf.
 
 A table has a row for each telemetry frame, or for each group of CAN frames
-that belong together. It has a column for each value, called by its name:
-battery_voltage [V], or with several ESCs esc1.battery_voltage [V]. A value
-that is not available is empty in CSV and null elsewhere. A table of a CAN log
-with several channels needs --channel if more than one has messages of the DBC.
-Other logs keep all channels; in formats with numbers can0 is 1. If a recording
-is damaged, all intact parts are converted, and a summary lists the damage.
-OUT gets its name when it is complete. Until then it is called OUT.part.
+that were sent together. Each column is named after its value and unit, for
+example battery_voltage [V], or esc1.battery_voltage [V] with several ESCs. A
+value that is not available is empty in CSV and null in other formats. If
+several channels of a CAN log have messages of the DBC, a table needs --channel.
+CAN logs as output keep all channels; formats that number their channels count
+can0 as 1. If a recording is damaged, all intact parts are converted, and the
+summary lists the damage. OUT has the name OUT.part until it is complete.
 
 examples:
   kontronik-can-gw convert flight.kcap flight.csv

@@ -22,17 +22,18 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 _ESCS = number_from(1, 127, "number of ESCs", kind=int)
 # fmt: off
 OPTIONS = (
-    option("-c --config FILE", "write the DBC of what this configuration sends", type=Path),
-    option("--canopen", "describe what the CANopen nodes send: PDOs as they are mapped now, heartbeats, emergencies"),
-    option("--from DBC", "one-ESC DBC to start from (default: the shipped one)", type=Path),
-    option("--esc N", "number of ESCs, called esc1, esc2 ... (default 1)", type=_ESCS),
+    option("-c --config FILE", "write the DBC of the messages that this configuration sends", type=Path),
+    option("--canopen", "write the DBC of the CANopen nodes: PDOs as mapped now, heartbeats, emergencies"),
+    option("--from DBC", "DBC for one ESC to start from (default: the shipped one)", type=Path),
+    option("--esc N", "number of ESCs, which are named esc1, esc2 ... (default 1)", type=_ESCS),
     *OUTPUT,
 )
 # fmt: on
 EPILOG = (
-    "Prints a DBC that every tool reads; warnings go to standard error. Its VERSION ends with the layout's fingerprint, "
-    "which check, status, captures and report show too: an old file is recognized by it. Names, ids and nodes of your own are keys "
-    "of a configuration. Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or DBC."
+    "Prints a DBC that every tool can read, and warnings on standard error. The VERSION in it ends with the fingerprint of "
+    "the layout. check, status, captures and report show the same fingerprint, so you can recognise an outdated file. "
+    "To choose names, ids and nodes, use the keys of a configuration. "
+    "Exit codes: 0 done; 1 the file cannot be written; 2 wrong usage, configuration or DBC."
 )
 
 

@@ -13,13 +13,13 @@ from kontronik_can_gw.desk.sources import DemoBus
 
 # fmt: off
 OPTIONS = (
-    option("--seconds N", "end after N seconds (default: q or Ctrl-C)", type=number_from(0.001, 1e6), default=math.inf),
+    option("--seconds N", "end after N seconds (default: only with q or Ctrl-C)", type=number_from(0.001, 1e6), default=math.inf),
     option("--seed N", "seed of the simulated faults (default 1)", type=int, default=1),
 )
 # fmt: on
 EPILOG = (
-    "A simulated ESC with simulated faults, the gateway, and the monitor, which has the DBC. "
-    "With ports and a bus, use simulate, run and monitor. Exit code: 0 at its end, 2 wrong usage."
+    "Runs a simulated ESC with simulated faults, the gateway, and the monitor. For real ports and a real bus "
+    "use simulate, run and monitor. Exit codes: 0 ended, 2 wrong usage."
 )
 
 

@@ -18,8 +18,8 @@ from kontronik_can_gw.printable import printable, printable_json
 # fmt: off
 OPTIONS = (
     (
-        option("-c --config FILE", "what the gateway with this TOML configuration sends", type=Path),
-        option("--dbc FILE", "another DBC than the shipped one", type=Path),
+        option("-c --config FILE", "describe the gateway with this TOML configuration", type=Path),
+        option("--dbc FILE", "describe this DBC instead of the shipped one", type=Path),
     ),
     option("--format", "default: md", choices=("md", "json"), default="md"),
     *OUTPUT,
@@ -28,12 +28,12 @@ OPTIONS = (
 EPILOG = """\
 Describes the messages and signals of the DBC in use, the CANopen nodes with
 their objects and emergencies, all values, and error bits and states with
-meaning and remedy. With -c, or if there is a gateway.toml, as that
-configuration sends them. Otherwise, and with --dbc, with the shipped EDS,
-node-IDs from 1, and the given or the shipped DBC.
+meaning and remedy. With -c, or if there is a gateway.toml, it describes that
+configuration. Otherwise, and with --dbc, it describes the given or the shipped
+DBC, and the shipped EDS with node-IDs from 1.
 
-md is for a repository or wiki, json for programs (its keys only change with
-"version").
+md is for a repository or wiki, json for programs. The keys of json change only
+together with "version".
 
 exit codes: 0 done; 1 the output cannot be written; 2 wrong usage,
 configuration, DBC or EDS

@@ -30,9 +30,10 @@ from kontronik_can_gw.runtime.can.open_can import check_interface
 
 OPTIONS = (CONFIG, JSON)
 EPILOG = (
-    "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
-    "It sees what its user may: root more, the service's user (sudo -u kontronik-can-gw) what the service may. "
-    "Exit code: 0 no error (there may be warnings), 1 errors, 2 the configuration cannot be used."
+    "It changes nothing, and sends nothing to the bus or to an ESC, so you can call it while the gateway runs. "
+    "It has the permissions of its user. To check those of the service, run it as the service's user "
+    "(sudo -u kontronik-can-gw). Root sees more. "
+    "Exit codes: 0 no error, perhaps warnings; 1 errors; 2 the configuration cannot be used."
 )
 
 

@@ -21,14 +21,14 @@ from kontronik_can_gw.status import UNCONFIGURED
 _NODE_ID = number_from(1, 127, "node-ID", kind=lambda text: int(text, 0))
 # fmt: off
 OPTIONS = (
-    option("-c --config FILE", "the EDS and the nodes of this configuration (default: those of gateway.toml, else shipped)", type=Path),
-    option("--node-id N", "write the DCF of the node with this node-ID: the EDS and its values", type=_NODE_ID),
+    option("-c --config FILE", "use the EDS and the nodes of this configuration (default: gateway.toml if there is one, otherwise the shipped EDS)", type=Path),
+    option("--node-id N", "write the DCF of the node with this node-ID: the EDS with the values of the node", type=_NODE_ID),
     *OUTPUT,
 )
 # fmt: on
 EPILOG = (
-    "Prints the EDS in use, byte by byte, or a DCF by CiA 306. "
-    "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or EDS."
+    "Prints an unchanged copy of the EDS in use, or a DCF as defined in CiA 306. "
+    "Exit codes: 0 done; 1 the file cannot be written; 2 wrong usage, configuration or EDS."
 )
 _STATES_AND_COMMANDS = frozenset(
     {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}

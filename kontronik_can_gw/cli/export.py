@@ -17,22 +17,22 @@ from kontronik_can_gw.native.rows import NotInCore
 OPTIONS = (
     LAYOUT,
     option("LANGUAGE", "c: C99", choices=("c",)),
-    option("DIR", "folder to write to; it is made", nargs="?"),
+    option("DIR", "folder to write to, which is created", nargs="?"),
     option("-o --output DIR", "another way to give DIR"),
-    option("--force", "replace files that exist, as of an earlier export"),
+    option("--force", "replace files that exist, for example of an earlier export"),
 )
 # fmt: on
 EPILOG = """\
-Writes the gateway's core and, as constants, the tables of the DBC in use:
-deframer, state of the ESCs, packers, schedule; no CANopen node. With -c it
-exports the messages of that configuration, otherwise the shipped DBC for one
-ESC. README.md in the folder explains how to build it in.
+Writes the gateway's core in C (deframer, state of the ESCs, packers, schedule),
+and the tables of the DBC in use as constants. CANopen nodes are not included.
+With -c it exports the messages of that configuration, otherwise the shipped DBC
+for one ESC. README.md in the folder explains how to use the files.
 
 Files that exist, for example of an earlier export, are replaced only with
---force. example_main.c is never replaced, because it may be yours by then.
+--force. example_main.c is never replaced, because you may have changed it.
 
-exit codes: 0 done; 1 it cannot be written; 2 wrong usage, configuration or
-DBC, or something that the core in C cannot express
+exit codes: 0 done; 1 a file cannot be written; 2 wrong usage, configuration or
+DBC, or the core in C cannot express a message
 """
 
 

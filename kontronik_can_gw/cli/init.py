@@ -14,7 +14,7 @@ OPTIONS = (
     FORCE,
 )
 # fmt: on
-EPILOG = "Exit code: 0 written, 1 it cannot be written, 2 the file exists, or wrong usage."
+EPILOG = "Exit codes: 0 written, 1 the file cannot be written, 2 the file exists, or wrong usage."
 
 
 def example() -> str:

@@ -26,41 +26,43 @@ OPTIONS = (
     option("SOURCE", "a CAN interface, a recording, or - for standard input", nargs="?"),
     LAYOUT,
     option("--interface NAME", "python-can interface (default socketcan)"),
-    option("--channel NAME", "channel of the interface (default can0); of a CAN log, as can0 or 1: the one to play"),
-    option("--speed FACTOR", "play a recording faster by this factor (0.01 to 1000, default 1)", type=number_from(0.01, 1000, "factor")),
+    option("--channel NAME", "channel of the interface (default can0), or the channel of a CAN log to play, for example can0 or 1"),
+    option("--speed FACTOR", "factor by which a recording is played faster, 0.01 to 1000 (default 1)", type=number_from(0.01, 1000, "factor")),
     (
-        option("--once", "one line of JSON with everything, then end"),
-        option("--stream", "one line of JSON each second, until the end"),
+        option("--once", "print one line of JSON with all values, then end"),
+        option("--stream", "print one line of JSON each second until the end"),
     ),
-    option("--timeout S", f"--once: maximum time to wait (default {_ONCE_S:g})", type=number_from(0.1, 3600)),
+    option("--timeout S", f"with --once: longest time to wait, in seconds (default {_ONCE_S:g})", type=number_from(0.1, 3600)),
 )
 # fmt: on
 EPILOG = """\
-The monitor listens on a CAN interface, at any place on the bus. It only needs
-the DBC (-c, --dbc) and never sends a frame. SOURCE is the name of an interface,
-such as vcan0. Without it the configuration names the interface, or it is can0.
+The monitor listens on a CAN interface anywhere on the bus. It needs only the
+DBC (-c, --dbc) and never sends a frame. SOURCE is the name of an interface,
+such as vcan0. Without SOURCE the interface is the one in the configuration, or
+can0.
 
 SOURCE can also be a recording, which is played in real time: a capture (.kcap),
 a file of UART bytes, or a CAN log (candump .log, .asc, .blf, .trc, .mf4). Write
 ./NAME for a file that has the name of an interface. A recording may be a pipe:
 ssh BOARD candump -L can0 | kontronik-can-gw monitor -
 
-keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it,
-      n and p next and previous, 0 all, space pause (recording)
+keys: q      quit                         n, p   next, previous ESC
+      1 to 9 one ESC with all its values  0      all ESCs
+      r      reset minimum and maximum    space  pause (recording)
 
-A value beyond a limit is marked with ! and !!: power stage and BEC from 80 and
-100 degC, a cell from 3.5 and 3.3 V down. The limits are the monitor's own.
+The monitor marks values beyond its own limits with ! and !!: temperatures of
+power stage and BEC from 80 and 100 degC, cell voltages below 3.5 and 3.3 V.
 
-If standard output is not a terminal, or a dumb one, the table is written every
-second. --once waits until each cyclic message of the DBC has come, or for
---timeout, and prints one line of JSON; of a recording the values at its end.
---stream prints such a line each second of the bus or the recording. It goes on
-while no frames come; "problem" is the reason, if it is known. Values are in the
-units of "units", and null if they are not available.
+If standard output is not a capable terminal, the table is written every second.
+--once waits until each cyclic message of the DBC was received, at most for
+--timeout, and prints one line of JSON. From a recording it prints the values at
+the end. --stream prints such a line each second of the bus or the recording,
+also while no frames are received. "problem" then has the reason, if it is
+known. Values are in the units of "units", and null if they are not available.
 
-exit codes: 0 ended by a key or signal, end of a recording, or --once with
-values; 1 no frame came (--once), or the bus cannot be opened; 2 wrong usage, or
-the recording cannot be opened
+exit codes: 0 ended by a key, a signal or the end of a recording, or --once has
+values; 1 no frame was received (--once), or the bus cannot be opened; 2 wrong
+usage, or the recording cannot be opened
 """
 
 

@@ -45,15 +45,15 @@ OPTIONS = (
     option("FILE", argparse.SUPPRESS, nargs="?"),
     LAYOUT,
     option("--interface NAME", "python-can interface (default: can.interface, socketcan)"),
-    option("--channel NAME", "its channel (default: can.channel, can0)"),
+    option("--channel NAME", "channel of the interface (default: can.channel, can0)"),
     option("--broker HOST[:PORT]", "the MQTT broker (default: mqtt.broker; port 1883, with mqtt.tls 8883)"),
 )
 # fmt: on
 EPILOG = (
-    "Topics, rate, TLS, user and Home Assistant's discovery are keys of the table [mqtt] of the configuration (-c, or gateway.toml). "
-    "A broker that is missing, lost or refuses the connection is reported once, and tried again for ever. SIGTERM and SIGINT publish "
-    "'offline' and end it within half a second. link_state is the last one on the bus, where it has its own message: after a gap it "
-    "may still be Lost for up to that message's cycle while available is already true."
+    "Set topics, rate, TLS, user and Home Assistant's discovery in the table [mqtt] of the configuration (-c, or gateway.toml). "
+    "If the broker is missing, lost or refuses the connection, this is reported once, and mqtt retries until it is connected. "
+    "SIGTERM and SIGINT publish 'offline' and end mqtt within half a second. If link_state has its own message on the bus, it "
+    "can still be Lost for up to one cycle of that message after a gap, while available is already true."
 )
 
 

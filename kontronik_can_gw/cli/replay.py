@@ -36,32 +36,32 @@ def _speed(text: str) -> float | None:
 # fmt: off
 OPTIONS = (
     option("FILE", "the recording, or - for standard input", type=Path),
-    option("--on", "what to play it on", choices=("can", "pty"), required=True),
+    option("--on", "target: a CAN bus, or a pseudo terminal for each ESC", choices=("can", "pty"), required=True),
     LAYOUT,
-    option("--speed FACTOR", "times real time, 0.01 to 1000, or max: as fast as possible (default 1)", type=_speed, default=1.0),
+    option("--speed FACTOR", "speed relative to real time, 0.01 to 1000, or max: as fast as possible (default 1)", type=_speed, default=1.0),
     option("--interface NAME", "--on can: python-can interface (default socketcan)"),
-    option("--channel NAME", "--on can: its channel, as vcan0 (default: that of -c)"),
+    option("--channel NAME", "--on can: channel of the interface, for example vcan0 (default: can.channel of -c)"),
     option("--unmarked", "--on can: do not mark the frames as replay"),
-    option("--link PATH", "--on pty: symbolic link; {n} is the ESC's number, from 1"),
-    option("--delay S", "--on pty: time for a gateway to open them (default 1)", type=number_from(0, 3600), default=1.0),
+    option("--link PATH", "--on pty: symbolic link to the terminal; {n} is the number of the ESC, from 1"),
+    option("--delay S", "--on pty: time for a gateway to open the terminals, in seconds (default 1)", type=number_from(0, 3600), default=1.0),
 )
 # fmt: on
 _ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}
 EPILOG = """\
 FILE is a capture (.kcap; a folder or a common prefix of file names stands for
 all parts of one run) or a file of plain UART bytes. A capture is replayed
-through the gateway's core with the recorded clock: frames and times equal the
-live gateway's bit for bit.
+through the gateway's core with the recorded clock, so frames and times equal
+the live run bit for bit.
 
---on can  sends the frames on a CAN bus. The gateway's state in them
-          (GatewayState) is set to Replay, because they are old. With
-          --unmarked they are sent exactly as recorded. Refused while a gateway
-          on this machine sends the same messages. Frames that the gateway had
-          received are not sent. canplayer of can-utils sends a CAN log.
---on pty  plays the bytes of each ESC on a pseudo terminal of its own, for a
+--on can  sends the frames on a CAN bus. Their GatewayState is set to Replay,
+          because the values are old. With --unmarked they are sent exactly as
+          recorded. It is refused while a gateway on this machine sends the
+          same messages. Frames that the gateway received are not sent. To send
+          a CAN log, use canplayer of can-utils.
+--on pty  plays the bytes of each ESC on a separate pseudo terminal, for a
           gateway to read, and prints its name: "esc1 /dev/pts/5".
 
-kontronik-can-gw convert FILE flight.log makes a log of the frames.
+To write the frames to a log, use kontronik-can-gw convert FILE flight.log.
 
 examples:
   kontronik-can-gw replay flight.kcap --on can --channel vcan0

@@ -28,8 +28,8 @@ OPTIONS = (
     FORCE,
     LAYOUT,
     LOG_CHANNEL,
-    option("--from S", "begin at this time in seconds after the start", type=_SECONDS, dest="start"),
-    option("--until S", "end at this time in seconds after the start", type=_SECONDS, dest="end"),
+    option("--from S", "from this time after the start, in seconds", type=_SECONDS, dest="start"),
+    option("--until S", "up to this time after the start, in seconds", type=_SECONDS, dest="end"),
 )
 # fmt: on
 EPILOG = """\
@@ -38,12 +38,12 @@ all parts of one run), a file of plain UART bytes, or a CAN log (candump, ASC,
 BLF, TRC, MF4). For a CAN log give the DBC of its frames with -c or --dbc. IN
 may be a pipe: Ctrl-C then ends the input, and the page shows the data so far.
 
-The page is one file that needs no network: plots with zoom, the operating
-states, errors with meaning and remedy, and the numbers (energy, charge,
-extremes with their times, cell voltage sag, quality of the data). Several ESCs
-share the plots. Numbers and events come from every row. Lines are reduced to
-20 000 points in a way that keeps every peak and every gap. The same recording
-gives the same page, byte for byte, if the same core plays it.
+The page is one file that needs no network. It has plots with zoom, operating
+states, errors with meaning and remedy, and numbers: energy, charge, extremes
+with their times, cell voltage sag, quality of the data. Several ESCs share the
+plots. Numbers and events are computed from every row. Lines are reduced to
+20 000 points in a way that keeps every peak and every gap. With the same core,
+the same recording gives the same page, byte for byte.
 
 examples:
   kontronik-can-gw report flight.kcap -o flight.html

@@ -39,13 +39,13 @@ def _folder(text: str) -> Path:
 # fmt: off
 OPTIONS = (
     CONFIG,
-    option("--wait", "wait for ports and interfaces that are missing at start (run.wait_for_devices)"),
-    option("--record DIR", "write captures of what comes in to this folder (record.directory)", type=_folder),
+    option("--wait", "at start, wait for missing ports and interfaces (run.wait_for_devices)"),
+    option("--record DIR", "record all input as captures in this folder (record.directory)", type=_folder),
 )
 # fmt: on
 EPILOG = (
-    "Ends by SIGTERM or SIGINT within half a second. The configuration is read at the start only. The serial ports are only read; "
-    "nothing is ever transmitted to an ESC."
+    "SIGTERM, SIGINT and SIGHUP end it within half a second. It reads the configuration only at the start. It only "
+    "reads from the serial ports and never transmits to an ESC."
 )
 
 

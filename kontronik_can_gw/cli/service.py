@@ -59,21 +59,21 @@ def _program(text: str) -> str:
 
 
 # fmt: off
-_ROOT = option("--root DIR", "only write below DIR, as for a disk image; call no tools", type=Path)
+_ROOT = option("--root DIR", "only write files below DIR, for example for a disk image, and call no tools", type=Path)
 OPTIONS = ()
 ACTIONS = {
-    "install": ("write units, udev rules, user and an example configuration; enable", (
+    "install": ("write units, udev rules and an example configuration, create the user, enable the service", (
         _ROOT,
-        option("--instance NAME", "one of several gateways: NAME.toml, kontronik-can-gw@NAME", type=_name),
-        option("--now", "start it too, or restart it"),
-        option("--executable PATH", "the program (default: this one)", type=_program),
+        option("--instance NAME", "set up one of several gateways, with NAME.toml and kontronik-can-gw@NAME", type=_name),
+        option("--now", "also start or restart the service"),
+        option("--executable PATH", "the program that the service runs (default: this one)", type=_program),
     )),
-    "uninstall": ("stop all of them, disable, and remove what install wrote", (_ROOT,)),
+    "uninstall": ("stop and disable all services, and remove the files that install wrote", (_ROOT,)),
 }
 # fmt: on
 EPILOG = (
-    "They need root, except with --root, and print what they do. systemctl shows how the services fare. "
-    "Exit code: 0 done, 1 something failed, 2 wrong usage."
+    "Both actions need root, except with --root, and print each step. systemctl shows the state of the services. "
+    "Exit codes: 0 done, 1 a step failed, 2 wrong usage."
 )
 
 

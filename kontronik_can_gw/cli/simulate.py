@@ -67,33 +67,33 @@ def _error(text: str) -> ErrorWindow:
 
 # fmt: off
 OPTIONS = (
-    "what ESC",
+    "the ESC",
     option("--esc N", "number of ESCs, 1..1000 (default 1)", type=number_from(1, 1000, "number of ESCs", kind=int), default=1),
     option("--device NAME", f"{', '.join(_DEVICES)} (default: kosmik, in the legacy layout jivepro)", choices=tuple(_DEVICES)),
     option("--layout", "default: legacy for jivepro, else v4", choices=("v4", "legacy")),
-    option("--seed N", "seed of all that is random (default 0)", type=int, default=0),
-    "where to, and how long",
-    option("--link PATH", "symbolic link to the pseudo terminal; {n} is the ESC's number, from 1"),
-    option("-o --output --out FILE", "write the bytes to FILE (- for standard output) as fast as possible, without a pseudo "
-           "terminal; {n} as for --link"),
+    option("--seed N", "seed of all random data (default 0)", type=int, default=0),
+    "output and duration",
+    option("--link PATH", "symbolic link to the pseudo terminal; {n} is the number of the ESC, from 1"),
+    option("-o --output --out FILE", "write the bytes to FILE (- for standard output) as fast as possible instead of to a pseudo "
+           "terminal; {n} as in --link"),
     FORCE,
     option("--seconds TIME", "stop after this time", type=_time_ns),
-    "misbehaviour",
-    option("--flip-bits SHARE", "share of bits that are flipped, as 0.0001", type=number_from(0, 1, "share, as 0.0001"), default=0.0),
-    option("--dropout TIME/TIME", "length and interval of silences: 2s/10s", type=_dropout),
-    option("--error NAME@TIME[+TIME]", "set an error bit at a time, for a time or for ever; may be repeated",
+    "faults",
+    option("--flip-bits SHARE", "share of bits to flip, for example 0.0001", type=number_from(0, 1, "share, as 0.0001"), default=0.0),
+    option("--dropout TIME/TIME", "length and interval of silent periods, for example 2s/10s", type=_dropout),
+    option("--error NAME@TIME[+TIME]", "set an error bit at this time, for a time or until the end; may be repeated",
            type=_error, action="append", default=[]),
 )
 # fmt: on
 EPILOG = """\
-Prints a line "esc1 /dev/pts/5" for each ESC on standard output, then sends
-until SIGINT, SIGTERM or --seconds. The same options and seed give the same
-bytes. With several ESCs, each has a seed of its own (N, N+1, ...). If a gateway
-sends anything to the ESC, even an echo, this is an error (exit code 1): a real
-ESC could take it for a command.
+Prints a line such as "esc1 /dev/pts/5" for each ESC, then sends until SIGINT,
+SIGTERM or --seconds. The same options and seed give the same bytes. Several
+ESCs have the seeds N, N+1 and so on. If a gateway sends anything to the ESC,
+even an echo, this is an error (exit code 1), because a real ESC could take it
+for a command.
 
 TIME is 5s, 200ms, 2min or a number of seconds.
-Error names are those that decode prints, such as undervoltage or
+Names of errors are the ones that decode prints, such as undervoltage or
 test_short_to_ground.
 
 examples:

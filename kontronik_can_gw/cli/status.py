@@ -32,17 +32,17 @@ class NotRunning(RunError):
 # fmt: off
 OPTIONS = (
     (
-        option("-c --config FILE", "the gateway with this TOML configuration", type=Path),
-        option("--file FILE", "the gateway with this statistics file", type=Path),
+        option("-c --config FILE", "show the gateway with this TOML configuration", type=Path),
+        option("--file FILE", "show the gateway with this statistics file", type=Path),
     ),
     JSON,
 )
 # fmt: on
 EPILOG = (
     "Without options it shows all gateways of this user and of the system. "
-    "Live: watch kontronik-can-gw status. Exit code 0: running and healthy; 1: running, but an ESC is not heard, nothing "
-    "gets onto the CAN bus, or one of several gateways does not answer; 2: wrong usage; 3: no gateway runs, or it has not "
-    "answered for 3 s."
+    "For a live view run: watch kontronik-can-gw status. Exit codes: 0 running and healthy; 1 running, but there is "
+    "no telemetry of an ESC, nothing gets onto the CAN bus, or one of several gateways does not answer; 2 wrong usage; "
+    "3 no gateway runs, or it has not answered for 3 s."
 )
 
 

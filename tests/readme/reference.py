@@ -1,6 +1,7 @@
 """The pages of docs/reference, made from their sources. ``make docs`` writes them."""
 
 import re
+from argparse import SUPPRESS
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
@@ -47,6 +48,8 @@ def _commands() -> Iterator[Table]:
 def _options(rows: Rows) -> Iterable[Row]:
     for row in rows:
         if isinstance(row, Option):
+            if row.settings["help"] is SUPPRESS:
+                continue
             typed, value = ", ".join(row.names), row.settings.get("metavar")
             if value and typed.startswith("-"):
                 typed += f" {value}"
