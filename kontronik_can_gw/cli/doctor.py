@@ -31,7 +31,7 @@ from kontronik_can_gw.runtime.can.open_can import check_interface
 OPTIONS = (CONFIG, JSON)
 EPILOG = (
     "It changes nothing, and sends nothing to the bus or to an ESC, so you can call it while the gateway runs. "
-    "It has the permissions of its user. To check those of the service, run it as the service's user "
+    "It has the permissions of its user. To check the permissions of the service, run it as the service's user "
     "(sudo -u kontronik-can-gw). Root sees more. "
     "Exit codes: 0 no error, perhaps warnings; 1 errors; 2 the configuration cannot be used."
 )

@@ -27,7 +27,7 @@ OPTIONS = (
     LAYOUT,
     option("--interface NAME", "python-can interface (default socketcan)"),
     option("--channel NAME", "channel of the interface (default can0), or the channel of a CAN log to play, for example can0 or 1"),
-    option("--speed FACTOR", "factor by which a recording is played faster, 0.01 to 1000 (default 1)", type=number_from(0.01, 1000, "factor")),
+    option("--speed FACTOR", "factor that speeds up a recording, 0.01 to 1000 (default 1)", type=number_from(0.01, 1000, "factor")),
     (
         option("--once", "print one line of JSON with all values, then end"),
         option("--stream", "print one line of JSON each second until the end"),

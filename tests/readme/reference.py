@@ -39,10 +39,14 @@ def _commands() -> Iterator[Table]:
         module = import_module(f"kontronik_can_gw.cli.{name}")
         parts = module.EPILOG.strip().split("\n\n")
         text = [Code(part) if re.search(r"^  |   ", part, re.MULTILINE) else part for part in parts]
-        lead = f"{line[:1].upper()}{line[1:]}."
-        yield Table(name, [lead, *text], list(_options(module.OPTIONS)))
+        yield Table(name, [_sentence(line), *text], list(_options(module.OPTIONS)))
         for action, (about, options) in getattr(module, "ACTIONS", {}).items():
-            yield Table(f"{name} {action}", [about], list(_options(options)))
+            yield Table(f"{name} {action}", [_sentence(about)], list(_options(options)))
+
+
+def _sentence(line: str) -> str:
+    """Return a line of help as ``--help`` of its command shows it."""
+    return f"{line[:1].upper()}{line[1:]}."
 
 
 def _options(rows: Rows) -> Iterable[Row]:
