@@ -37,8 +37,8 @@ _NOTES = {
     "peak_current": " A held maximum that does not fall back when the motor stops.",
     "bec_current": " Not supplied by a JIVEPro.",
     "firmware": " Main version times 256, and the sub version.",
-    "data_age": " 65534 stands for that or more.",
-    "info_age": " 65534 stands for that or more.",
+    "data_age": " 65534 means this age or more.",
+    "info_age": " 65534 means this age or more.",
 }
 """What a reader must know of a source beside its name and unit."""
 _SYNTAX = str.maketrans('";\\', "',/")
@@ -110,7 +110,7 @@ def _about(nodes: Nodes, escs: Sequence[EscSettings]) -> str:
         parts.append(f"Waiting for a node-ID by LSS, so without frames: {', '.join(waiting)}.")
     parts.append(
         "PDOs are sent while a node is Operational. All bits set (signed: only the sign bit set) means "
-        "NotAvailable. A master that maps PDOs in another way makes another file necessary."
+        "NotAvailable. If a master changes the mapping of PDOs, write this file again."
     )
     return " ".join(parts)
 
@@ -182,8 +182,8 @@ def _emergency(node: Node) -> MessageRow:
     sources = {bit: bits.get(bit, f"Bit{bit}") for bit in range(32)} | {0xFF: "Gateway"}
     source = "Bit of the error word of the ESC that caused the emergency, or the gateway."
     word = (
-        "Error word of the ESC. Of an emergency of the gateway its detail. For TelemetryFault 1 telemetry lost, 2 CRC errors, "
-        "3 port gone, 4 other device than configured. For HeartbeatLost the node-ID."
+        "Error word of the ESC, or the detail of an emergency of the gateway. TelemetryFault: 1 telemetry lost, 2 CRC errors, "
+        "3 port gone, 4 other device than configured. HeartbeatLost: the node-ID."
     )
     signals = [_signal("EmergencyCode", 0, 16, "Emergency code.", high=max(names), texts=names)]
     for what, mask in Register.__members__.items():

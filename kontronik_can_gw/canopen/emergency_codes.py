@@ -54,23 +54,23 @@ class GatewayError(Enum):
     CRC_RATE = (0x7510, 2, "telemetry degraded: many CRC errors or dropped bytes",
         "Keep the telemetry cable short and away from the motor's wires. Check plugs and ground.")
     PORT_GONE = (0x7510, 3, "serial port gone",
-        "Check the USB adapter and its plug. It is tried again for ever; kontronik-can-gw doctor says more.")
-    OTHER_DEVICE = (0x7510, 4, "another device than [esc].device says",
-        "Check which ESC is plugged in where, or correct device in the configuration.")
+        "Check the USB adapter and its plug. The gateway retries by itself. kontronik-can-gw doctor shows details.")
+    OTHER_DEVICE = (0x7510, 4, "another device than esc.device",
+        "Check which ESC is plugged in where, or correct esc.device in the configuration.")
     RECEIVE_OVERRUN = (0x8110, 0, "received CAN frames were lost",
-        "Let masters send less at once; look for somebody who floods the bus.")
+        "Let masters send less at once, and look for a device that floods the bus.")
     CAN_PASSIVE = (0x8120, 0, "CAN controller error passive",
-        "Check bit rate, termination (120 ohm at both ends) and cables of the bus, and that another node is switched on.")
-    HEARTBEAT_LOST = (0x8130, 0, "a watched heartbeat stayed away; byte 4: the node-ID",
+        "Check bit rate, termination (120 ohm at both ends) and cables of the bus. Check that another node is switched on.")
+    HEARTBEAT_LOST = (0x8130, 0, "a watched heartbeat is missing (byte 4: the node-ID)",
         "Check that node, its supply and its bus cable, and the time in 1016h.")
     BUS_OFF_LEFT = (0x8140, 0, "back from bus-off",
         "Look for a short, a wrong bit rate or a bad cable on the bus.")
-    ID_COLLISION = (0x8150, 0, "somebody else sends with an id of this node: two nodes with one node-ID?",
+    ID_COLLISION = (0x8150, 0, "another device sends with an id of this node: two nodes with one node-ID?",
         "Give each node of the bus another node-ID, and each message another id.")
     SYNC_LENGTH = (0x8240, 0, "SYNC of a wrong length",
-        "Let the master send SYNC as 1019h says: without data, or with one byte where it has a counter.")
-    PARAMETER_FILE = (0x6300, 0, "the parameter file could not be read: defaults",
-        "Let the master store its parameters anew, or restore the file. Check the disk.")
+        "Configure the master to send SYNC as 1019h defines it: without data, or with one byte if it has a counter.")
+    PARAMETER_FILE = (0x6300, 0, "the parameter file could not be read, so defaults are used",
+        "Let the master store its parameters again, or restore the file. Check the disk.")
     # fmt: on
 
 

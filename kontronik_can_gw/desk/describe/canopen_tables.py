@@ -24,8 +24,8 @@ from kontronik_can_gw.times import MS
 _MASK = (at.SETTINGS, 6)
 """The object that selects the error bits reported as emergencies."""
 _EMERGENCIES = (
-    "Messages of the CANopen nodes: bytes 0 and 1 are the code, byte 2 is the register 1001h, byte 3 the bit of the ESC's error word, "
-    "or FFh for a fault that the gateway finds. The log and kontronik-can-gw status name these faults too."
+    "An emergency of a CANopen node has the code in bytes 0 and 1 and the register 1001h in byte 2. Byte 3 is the number of the bit "
+    "in the ESC's error word, or FFh for a fault that the gateway detected. The log and kontronik-can-gw status report these faults too."
 )
 
 
@@ -45,8 +45,8 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     text = [f"{PurePath(eds.name).name}. {refused}"]
     meanings = meanings_of(escs)
     return [
-        Table("COB-IDs", ["A node for each ESC. One that waits for LSS has few."], ids, by="node"),
-        Table("TPDOs", ["As they are when the node starts."], list(_pdos(named)), by="node"),
+        Table("COB-IDs", ["There is a node for each ESC. A node that waits for LSS uses only a few COB-IDs."], ids, by="node"),
+        Table("TPDOs", ["The TPDOs as they are when the node starts."], list(_pdos(named)), by="node"),
         Table("Objects", text, [_object(eds, entry, meanings) for entry in eds.entries]),
     ]
 
@@ -120,7 +120,7 @@ def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
         for bit in range(32):
             if not mask >> bit & 1:
                 continue
-            about = (f"bit{bit}", "a bit that has no name yet", "Ask the maker of the ESC.")
+            about = (f"bit{bit}", "a bit that has no name yet", "Ask the manufacturer of the ESC.")
             if bit in named:
                 about = (named[bit].text, named[bit].meaning, named[bit].remedy)
             rows.append(_emergency(codes.code(bit), str(bit), None, about))
@@ -129,7 +129,7 @@ def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
         byte4 = None if fault is GatewayError.HEARTBEAT_LOST else detail
         about = (fault.name.lower(), fault.meaning, fault.remedy)
         rows.append(_emergency(code, "FFh", byte4, about))
-    rows.append(_emergency(0, "FFh", 0, ("no_error", "no error any more", "Nothing to do.")))
+    rows.append(_emergency(0, "FFh", 0, ("no_error", "all errors have ended", "Nothing to do.")))
     return [Table("Emergencies", [_EMERGENCIES], rows)]
 
 

@@ -96,7 +96,7 @@ def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
     ]
 
 
-_SIGNALS = "start counts as in DBC files; not available and error are raw values; page is the value of the multiplexer."
+_SIGNALS = "start counts as in DBC files. not available and error are raw values. page is the value of the multiplexer."
 
 
 def _message(plan: MessagePlan, message: Any) -> Row:
@@ -207,26 +207,26 @@ LINK_STATES: Mapping[LinkState, Text] = {
         "Switch the ESC on. Check the cable and the telemetry setting of the ESC. A KOSMIK sends after one throttle pulse."),
     LinkState.SEARCHING: Text(
         "bytes are received, but no valid frame yet",
-        "If it stays: the ESC may be set to another protocol, or the line is disturbed. The log and decode show the probable cause."),
+        "If this state persists: the ESC may be set to another protocol, or the line is disturbed. The log and decode show the probable cause."),
     LinkState.OK: Text("valid frames are received"),
     LinkState.DEGRADED: Text("valid frames are received, with many CRC errors or dropped bytes", GatewayError.CRC_RATE.remedy),
-    LinkState.LOST: Text("valid frames were received, but not any longer", GatewayError.TELEMETRY_LOST.remedy),
+    LinkState.LOST: Text("valid frames were received earlier, but none now", GatewayError.TELEMETRY_LOST.remedy),
     LinkState.PORT_ERROR: Text("the serial port cannot be opened or read", GatewayError.PORT_GONE.remedy),
 }
 CAN_STATES: Mapping[CanState, Text] = {
     CanState.UNKNOWN: Text("the CAN interface does not report it"),
-    CanState.ERROR_ACTIVE: Text("works"),
+    CanState.ERROR_ACTIVE: Text("works without errors"),
     CanState.ERROR_WARNING: Text("works, but there are errors on the bus", GatewayError.CAN_PASSIVE.remedy),
     CanState.ERROR_PASSIVE: Text("works, with many errors on the bus", GatewayError.CAN_PASSIVE.remedy),
     CanState.BUS_OFF: Text(
-        "switched off by errors on the bus: no frame can leave",
+        "switched off because of errors on the bus, so no frame can be sent",
         f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0, restart the interface by hand."),
     CanState.DOWN: Text(
-        "the CAN interface is down or missing: no frame can leave",
-        "Plug the adapter in, set the interface up. kontronik-can-gw doctor shows the command."),
+        "the CAN interface is down or missing, so no frame can be sent",
+        "Plug in the adapter, and set the interface up. kontronik-can-gw doctor shows the command."),
 }
 GATEWAY_STATES: Mapping[GatewayState, Text] = {
-    GatewayState.STARTING: Text("opens its ports and the CAN interface"),
+    GatewayState.STARTING: Text("opening its ports and the CAN interface"),
     GatewayState.RUNNING: Text("running"),
     GatewayState.STOPPING: Text("shutting down"),
     GatewayState.REPLAY: Text("the values come from a recording, not from an ESC"),
@@ -271,7 +271,7 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
     ]
 
 
-_VALUES = "Signals of your own DBC can be bound to these values, by name or under [dbc.bind]. Their unit may differ."
+_VALUES = "Bind signals of your own DBC to these values, by name or in [dbc.bind]. Their units may differ."
 
 
 def place(index: int, sub: int) -> str:
