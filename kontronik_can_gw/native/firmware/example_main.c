@@ -1,21 +1,25 @@
-/* A gateway around core.c: bytes of UARTs in, CAN frames out. As it stands it is a program for a PC that reads recorded UART bytes, a file
-   for each ESC in their order (without any: standard input), and prints the frames as candump logs them, by a simulated clock:
+/* A gateway around core.c, which turns the bytes of UARTs into CAN frames.
+
+   Unchanged, this is a program for a PC with a simulated clock. It reads recorded UART bytes and
+   prints the frames in the format of candump. Its arguments are files, one for each ESC in the
+   order of the ESCs. Without arguments it reads standard input.
 
        cc -std=c99 -O2 -o example core.c tables.c example_main.c && ./example uart.bin
 
-   On a board only the hooks at its end are others, and its interrupts call byte_in, uart_failed and bus_state. */
+   For a board, replace the three hooks at the end, and call byte_in, uart_failed and bus_state from
+   interrupts. */
 #include "core.h"
 #include "tables.h"
 
 #include <stdio.h>
 #include <stdlib.h>
 
-enum { RING = 128, FRAMES = 4, RUNNING = 1 }; /* RING: 11 ms of one UART */
-enum { ERROR_ACTIVE = 1, ERROR_WARNING, ERROR_PASSIVE, BUS_OFF }; /* states of the CAN controller */
+enum { RING = 128, FRAMES = 4, RUNNING = 1 }; /* RING: the bytes of one UART in 11 ms. */
+enum { ERROR_ACTIVE = 1, ERROR_WARNING, ERROR_PASSIVE, BUS_OFF }; /* CAN controller. */
 
 static struct { uint8_t byte[RING]; volatile uint8_t in, out; } ring[KCG_ESCS];
 static int64_t memory[(KCG_MEMORY + 7) / 8], empty_at[KCG_ESCS];
-static volatile uint8_t uart_is_lost[KCG_ESCS]; /* a UART cannot be used */
+static volatile uint8_t uart_is_lost[KCG_ESCS]; /* 1: the UART is unusable. */
 static volatile uint8_t bus = ERROR_ACTIVE;
 static uint8_t uart_was_lost[KCG_ESCS];
 static kcg *core;
@@ -23,7 +27,8 @@ static kcg *core;
 static int64_t clock_ns(void);
 static int frame_out(const kcg_frame *frame);
 
-/* A byte was received: for the interrupt of a UART. Where there is no room it is lost, which the frame's CRC shows. */
+/* Stores a received byte. Call it from the interrupt of a UART. If the ring is full, the byte is
+   lost, and the CRC detects the damaged frame. */
 static void byte_in(int esc, uint8_t byte)
 {
     uint8_t in = ring[esc].in, next = (uint8_t)((in + 1) % RING);
@@ -33,15 +38,17 @@ static void byte_in(int esc, uint8_t byte)
     }
 }
 
-/* Errors of a UART: for its interrupt. Parity, framing and noise errors need nothing: a damaged frame fails its CRC. After an overrun, or a
-   failure of DMA, clear the flag and start the reception again. If that is not possible, the port is lost until it is. */
+/* Reports whether a UART is unusable. Call it from the interrupt of the UART.
+   Parity, framing and noise errors need no handling, because the CRC detects damaged frames. After
+   an overrun or a failure of DMA, clear the flag and restart the reception. If that fails, report
+   the UART as lost until the reception works again. */
 static void uart_failed(int esc, int is_lost)
 {
     uart_is_lost[esc] = (uint8_t)is_lost;
 }
 
-/* The CAN controller has another state: for its interrupt. A controller that does not leave bus-off by itself is restarted there, after
-   a pause of 100 ms or more. */
+/* Reports a new state of the CAN controller. Call it from the interrupt of the controller. If your
+   controller does not leave bus-off by itself, restart it after a pause of at least 100 ms. */
 static void bus_state(uint8_t state)
 {
     bus = state;
@@ -59,7 +66,8 @@ static void start(void)
     kcg_repeat(core, now);
 }
 
-/* Hand over what is pending; what finds no room stays pending, and the values of then are sent. */
+/* Sends pending frames until no mailbox is free. The others stay pending and are packed again later
+   with newer values. */
 static void send(int64_t now)
 {
     kcg_frame frames[FRAMES];
@@ -74,7 +82,7 @@ static void send(int64_t now)
     core->gateway[KCG_SENT_FRAMES] += all;
 }
 
-/* Tell the core about lost and returned UARTs. */
+/* Reports lost and restored UARTs to the core. */
 static void follow_uarts(int64_t now)
 {
     for (int esc = 0; esc < KCG_ESCS; esc++) {
@@ -83,12 +91,13 @@ static void follow_uarts(int64_t now)
             continue;
         uart_was_lost[esc] = is_lost;
         if (is_lost)
-            ring[esc].out = ring[esc].in; /* the rest is of no use */
+            ring[esc].out = ring[esc].in; /* Discard the remaining bytes. */
         kcg_port(core, esc, !is_lost, now);
     }
 }
 
-/* Tell the core about the controller's state. What was in a mailbox at bus-off is lost, so that all is sent once more afterwards. */
+/* Reports the state of the CAN controller to the core. Bus-off discards the frames in mailboxes, so
+   messages without a cycle are requested again afterwards. */
 static void follow_bus(int64_t now)
 {
     uint8_t state = bus;
@@ -102,11 +111,12 @@ static void follow_bus(int64_t now)
         kcg_repeat(core, now);
 }
 
-/* One turn of the main loop: at least every few milliseconds, or when an interrupt was there, or at kcg_next_deadline. */
+/* One turn of the main loop. Call it every few milliseconds, or after each interrupt and at
+   kcg_next_deadline. */
 static void turn(void)
 {
     uint8_t data[RING];
-    int64_t now = clock_ns(); /* first: what comes later is of the next turn */
+    int64_t now = clock_ns(); /* Read before the rings: later bytes are left for the next turn. */
     follow_uarts(now);
     follow_bus(now);
     for (int esc = 0; esc < KCG_ESCS; esc++) {
@@ -121,22 +131,23 @@ static void turn(void)
     }
     kcg_advance(core, now);
     if (bus != BUS_OFF)
-        send(now); /* otherwise frames stay pending, and the values of then are sent */
+        send(now); /* In bus-off, frames stay pending and are packed later. */
 }
 
-/* --- the hooks, of a PC ---------------------------------------------------------------------------------------- */
+/* --- the hooks, for a PC
+   --------------------------------------------------------------------------------------- */
 
 #define MS INT64_C(1000000)
 
 static int64_t simulated;
 
-/* Hook 1, the clock: nanoseconds that never go back, of a timer of 64 bits. */
+/* Hook 1, the clock: nanoseconds from a 64-bit timer that never decreases. */
 static int64_t clock_ns(void)
 {
     return simulated;
 }
 
-/* Hook 2, a frame for the bus: 1 if a mailbox took it, 0 if none is free. */
+/* Hook 2, the bus: returns 1 if a mailbox accepted the frame, 0 if no mailbox is free. */
 static int frame_out(const kcg_frame *frame)
 {
     printf("(%lu.%06lu) can0 ", (unsigned long)(simulated / (1000 * MS)), (unsigned long)(simulated % (1000 * MS) / 1000));
@@ -149,7 +160,8 @@ static int frame_out(const kcg_frame *frame)
     return 1;
 }
 
-/* Hook 3, the bytes: here of all files as if they came at once, without a pause, and 3 s of silence after the last. */
+/* Hook 3, the bytes. Here they are read from all files at the speed of the wire, without pauses,
+   followed by 3 s of silence. */
 int main(int argc, char **argv)
 {
     FILE *line[KCG_ESCS] = {NULL};
