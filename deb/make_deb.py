@@ -1,10 +1,12 @@
-"""The Debian packages for amd64, arm64 and armhf, each without need of a network or compiler: make deb.
+"""Builds the Debian packages for amd64, arm64 and armhf, as `make deb` does.
 
     python deb/make_deb.py [FOLDER]
 
-Gateway and core come from the wheel of `make wheels`, with an object for each machine; the libraries of vendored.txt by pip, checked by
-their hashes. The files of the service are those that `service install` writes. SOURCE_DATE_EPOCH, else the time of the last commit, is the
-time of everything in a package: the same sources give the same bytes.
+The packages need neither a network nor a compiler. The gateway and the core are taken from the
+wheel of `make wheels`, which has an object for each machine. pip downloads the libraries in
+vendored.txt and checks their hashes. The files of the service are the ones that `service install`
+writes. All files in a package have the time SOURCE_DATE_EPOCH, or the time of the last commit if it
+is not set, so the same sources give the same bytes.
 """
 
 import gzip
@@ -29,7 +31,7 @@ HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parent
 NAME = "kontronik-can-gw"
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64", "armhf": "armv7l"}
-"""Debian's name of an architecture, and the kernel's of its machine."""
+"""Debian's names of architectures, and the kernel's names of their machines."""
 SCRIPTS = ("postinst", "prerm", "postrm")
 SERVICE = {
     "etc/systemd/system": "usr/lib/systemd/system",
@@ -37,7 +39,7 @@ SERVICE = {
     "etc/tmpfiles.d": "usr/lib/tmpfiles.d",
     "etc/udev/rules.d": "usr/lib/udev/rules.d",
 }
-"""Where `service install` writes, and where a package puts the same."""
+"""Folders of `service install`, and the package's folders for the same files."""
 COMPLETIONS = {
     "bash": f"bash-completion/completions/{NAME}",
     "zsh": f"zsh/vendor-completions/_{NAME}",
@@ -48,12 +50,12 @@ _FOR_ANY = ("--python-version", "3.11", "--platform", "manylinux2014_x86_64")
 
 
 def version() -> str:
-    """Debian's version: what comes before a release, as 0.6.0rc1 and 0.6.0.dev1, sorts before it."""
+    """Return Debian's version. Pre-releases such as 0.6.0rc1 sort before the release."""
     return re.sub(r"\.?(a|b|rc|dev)(\d+)$", r"~\1\2", __version__)
 
 
 def source_time() -> int:
-    """Seconds since 1970 of everything in a package. Exits with one line if it is unknown."""
+    """Return the time of all files in a package, in seconds since 1970. Exits if it is unknown."""
     if given := os.environ.get("SOURCE_DATE_EPOCH"):
         return int(given)
     command = ["git", "-C", str(PROJECT), "log", "-1", "--format=%ct"]
@@ -68,14 +70,14 @@ def source_time() -> int:
 
 
 def download(folder: Path) -> list[Path]:
-    """The wheels of vendored.txt."""
+    """Download the wheels of vendored.txt."""
     command = [*_PIP, "download", "--no-deps", "--only-binary=:all:", "--require-hashes", *_FOR_ANY]
     subprocess.run([*command, "-d", folder, "-r", HERE / "vendored.txt"], check=True)
     return sorted(folder.iterdir())
 
 
 def unpack(wheel: Path, folder: Path, keep: str = "") -> None:
-    """A wheel's modules and licences, without its scripts and without objects but the one named ``keep``."""
+    """Extract a wheel's modules and licences, without scripts, and of the objects only ``keep``."""
     with zipfile.ZipFile(wheel) as file:
         for name in file.namelist():
             is_object = name.endswith(".so") and Path(name).name != keep
@@ -84,7 +86,7 @@ def unpack(wheel: Path, folder: Path, keep: str = "") -> None:
 
 
 def output_of(*command: str) -> str:
-    """What a program prints that uses these sources."""
+    """Return the output of a program that uses these sources."""
     environment = os.environ | {"PYTHONPATH": str(PROJECT), "COLUMNS": "80"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -93,7 +95,7 @@ def output_of(*command: str) -> str:
 
 
 def gateway(*words: str) -> str:
-    """What a command of ours prints."""
+    """Return the output of a command of the gateway."""
     return output_of(sys.executable, "-m", "kontronik_can_gw", *words)
 
 
@@ -104,12 +106,12 @@ def put(path: Path, content: str | bytes, mode: int = 0o644) -> None:
 
 
 def compressed(text: str | bytes) -> bytes:
-    """As gzip -9n."""
+    """Return the same bytes as gzip -9n."""
     return gzip.compress(text.encode() if isinstance(text, str) else text, 9, mtime=0)
 
 
 def put_service(tree: Path) -> None:
-    """Units and the like, as `service install` writes them for a program in /usr/bin."""
+    """Write the files of `service install` for a program in /usr/bin."""
     for place, text in planned(f"/usr/bin/{NAME}"):
         folder = next(folder for folder in SERVICE if place.startswith(folder))
         put(tree / SERVICE[folder] / Path(place).relative_to(folder), text)
@@ -119,7 +121,7 @@ def put_service(tree: Path) -> None:
 
 
 def manual_page() -> str:
-    """Made from the options of all commands."""
+    """Return the manual page, which is generated from the options of all commands."""
     tool = str(Path(sys.executable).with_name("argparse-manpage"))
     words = ["--module", "kontronik_can_gw.cli", "--function", "make_parser", "--prog", NAME]
     words += ["--project-name", NAME, "--version", version(), "--manual-title", "User Commands"]
@@ -128,7 +130,7 @@ def manual_page() -> str:
 
 
 def put_documents(tree: Path, seconds: int) -> None:
-    """Manual page, completion, copyright, changelog."""
+    """Write manual page, completions, copyright and changelog."""
     share = tree / "usr/share"
     for shell, place in COMPLETIONS.items():
         put(share / place, gateway("completion", shell))
@@ -146,7 +148,7 @@ def put_documents(tree: Path, seconds: int) -> None:
 
 
 def make_tree(tree: Path, wheel: Path, libraries: Sequence[Path], seconds: int) -> None:
-    """All that is the same for every machine; of the core's objects none."""
+    """Write all files that are the same for every machine, without the core's objects."""
     modules = tree / "usr/lib" / NAME
     for each in [wheel, *libraries]:
         unpack(each, modules)
@@ -163,7 +165,7 @@ def make_tree(tree: Path, wheel: Path, libraries: Sequence[Path], seconds: int) 
 
 
 def put_control(tree: Path, architecture: str) -> None:
-    """The files in DEBIAN."""
+    """Write the files in DEBIAN."""
     files = sorted(path for path in tree.rglob("*") if path.is_file())
     sums = ""
     for path in files:
@@ -183,7 +185,7 @@ def put_control(tree: Path, architecture: str) -> None:
 
 
 def build(tree: Path, wheel: Path, architecture: str, seconds: int, folder: Path) -> Path:
-    """Make the package of one architecture from a tree of ``make_tree``, which gets its object and is not of use afterwards."""
+    """Build the package of one architecture. This changes ``tree``, a result of ``make_tree``."""
     unpack(wheel, tree / "usr/lib" / NAME, shared_object(MACHINES[architecture]).name)
     put_control(tree, architecture)
     for path in [tree, *tree.rglob("*")]:
@@ -198,7 +200,7 @@ def build(tree: Path, wheel: Path, architecture: str, seconds: int, folder: Path
 
 
 def make(wheel: Path, libraries: Sequence[Path], folder: Path) -> list[Path]:
-    """The packages of all architectures."""
+    """Build the packages of all architectures."""
     seconds, made = source_time(), []
     with tempfile.TemporaryDirectory(prefix="kcg-deb.") as scratch:
         common = Path(scratch, "common")
@@ -211,7 +213,7 @@ def make(wheel: Path, libraries: Sequence[Path], folder: Path) -> list[Path]:
 
 
 def core_wheel(folder: Path) -> Path:
-    """The wheel of `make wheels`, whose objects were all looked at and run."""
+    """Build and return the wheel of `make wheels`, which checks and runs all its objects."""
     subprocess.run([sys.executable, PROJECT / "tests/native/wheels.py", folder], check=True)
     (wheel,) = folder.iterdir()
     return wheel

@@ -154,7 +154,7 @@ def test_lintian_has_nothing_to_say(packages: dict[str, Path]) -> None:
 def test_every_command_works_in_a_fresh_root(packages: dict[str, Path], root: Root) -> None:
     before = root.files()
     said = root.install(packages["amd64"])
-    assert f"Then: systemctl enable --now {make_deb.NAME}" in said
+    assert f"Then run: systemctl enable --now {make_deb.NAME}" in said
     groups = root.run("id", "-nG", "kontronik-can-gw").split()
     assert sorted(groups) == ["dialout", "kontronik-can-gw", "uucp"]
     said = root.run("systemd-analyze", "verify", UNIT, "kontronik-can-gw-mqtt.service")
@@ -249,7 +249,7 @@ def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
     before = root.files()
     configuration = install_0_5_0(root, work)
     said = root.install(packages["amd64"])
-    assert "70-kontronik-can-gw.rules: was changed by hand, kept" in said
+    assert "70-kontronik-can-gw.rules: was changed by hand, so it is kept" in said
     ours = [path for path in (root.path / "etc").rglob("*kontronik*") if not path.is_dir()]
     assert sorted(str(path.relative_to(root.path / "etc")) for path in ours) == [
         *(f"systemd/network/50-kontronik-can-gw-can0.{kind}" for kind in ("link", "network")),

@@ -219,7 +219,7 @@ def test_what_was_changed_by_hand_stays_and_is_named(board: Path) -> None:
     for path in files:
         path.write_text(path.read_text() + "# mine\n")
     said = script(board, "take-over").splitlines()
-    suffix = ": was changed by hand, kept in place of the package's"
+    suffix = ": was changed by hand, so it is kept and used instead of the package's file"
     assert set(said) == {f"{path}{suffix}" for path in files}
     assert all(path.exists() for path in files)
 
@@ -231,7 +231,7 @@ def test_a_purge_leaves_network_files_and_what_another_installation_needs(board:
         make_deb.put(path, "x")
     installed(board)
     said = script(board, "postrm", "purge")
-    assert ".service: is not the package's; configurations" in said and "userdel" not in said
+    assert ".service: is not part of the package. Configurations" in said and "userdel" not in said
     assert all(path.exists() for path in kept)
     script(board, "take-over")
     assert "userdel kontronik-can-gw" in script(board, "postrm", "purge")
