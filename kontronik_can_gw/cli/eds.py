@@ -21,7 +21,7 @@ from kontronik_can_gw.status import UNCONFIGURED
 _NODE_ID = number_from(1, 127, "node-ID", kind=lambda text: int(text, 0))
 # fmt: off
 OPTIONS = (
-    option("-c --config FILE", "use the EDS and the nodes of this configuration (default: gateway.toml if there is one, otherwise the shipped EDS)", type=Path),
+    option("-c --config FILE", "use the EDS and nodes of this configuration (default: gateway.toml, or the shipped EDS)", type=Path),
     option("--node-id N", "write the DCF of the node with this node-ID: the EDS with the values of the node", type=_NODE_ID),
     *OUTPUT,
 )

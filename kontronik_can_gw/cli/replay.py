@@ -38,12 +38,12 @@ OPTIONS = (
     option("FILE", "the recording, or - for standard input", type=Path),
     option("--on", "target: a CAN bus, or a pseudo terminal for each ESC", choices=("can", "pty"), required=True),
     LAYOUT,
-    option("--speed FACTOR", "speed relative to real time, 0.01 to 1000, or max: as fast as possible (default 1)", type=_speed, default=1.0),
+    option("--speed FACTOR", "speed relative to real time, 0.01 to 1000, or max for the greatest (default 1)", type=_speed, default=1.0),
     option("--interface NAME", "--on can: python-can interface (default socketcan)"),
     option("--channel NAME", "--on can: channel of the interface, for example vcan0 (default: can.channel of -c)"),
     option("--unmarked", "--on can: do not mark the frames as replay"),
     option("--link PATH", "--on pty: symbolic link to the terminal; {n} is the number of the ESC, from 1"),
-    option("--delay S", "--on pty: time for a gateway to open the terminals, in seconds (default 1)", type=number_from(0, 3600), default=1.0),
+    option("--delay S", "--on pty: seconds for a gateway to open the terminals (default 1)", type=number_from(0, 3600), default=1.0),
 )
 # fmt: on
 _ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}

@@ -298,5 +298,7 @@ def test_a_long_paragraph_of_any_words_is_read_back_unchanged(paragraph: list[st
 
 
 def test_paragraphs_are_wrapped_at_100_columns() -> None:
-    lines = markdown("All", ["one two three four five six seven eight [nine] " * 9], []).splitlines()
+    lines = markdown(
+        "All", ["one two three four five six seven eight [nine] " * 9], []
+    ).splitlines()
     assert 90 < max(map(len, lines)) <= 100

@@ -45,8 +45,15 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     text = [f"{PurePath(eds.name).name}. {refused}"]
     meanings = meanings_of(escs)
     return [
-        Table("COB-IDs", ["There is a node for each ESC. A node that waits for LSS uses only a few COB-IDs."], ids, by="node"),
-        Table("TPDOs", ["The TPDOs as they are when the node starts."], list(_pdos(named)), by="node"),
+        Table(
+            "COB-IDs",
+            ["There is a node for each ESC. A node that waits for LSS uses only a few COB-IDs."],
+            ids,
+            by="node",
+        ),
+        Table(
+            "TPDOs", ["The TPDOs as they are when the node starts."], list(_pdos(named)), by="node"
+        ),
         Table("Objects", text, [_object(eds, entry, meanings) for entry in eds.entries]),
     ]
 

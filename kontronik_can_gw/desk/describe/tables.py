@@ -207,7 +207,7 @@ LINK_STATES: Mapping[LinkState, Text] = {
         "Switch the ESC on. Check the cable and the telemetry setting of the ESC. A KOSMIK sends after one throttle pulse."),
     LinkState.SEARCHING: Text(
         "bytes are received, but no valid frame yet",
-        "If this state persists: the ESC may be set to another protocol, or the line is disturbed. The log and decode show the probable cause."),
+        "If this persists: the ESC may be set to another protocol, or the line is disturbed. The log and decode show the probable cause."),
     LinkState.OK: Text("valid frames are received"),
     LinkState.DEGRADED: Text("valid frames are received, with many CRC errors or dropped bytes", GatewayError.CRC_RATE.remedy),
     LinkState.LOST: Text("valid frames were received earlier, but none now", GatewayError.TELEMETRY_LOST.remedy),
