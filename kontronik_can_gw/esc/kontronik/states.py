@@ -98,8 +98,7 @@ class OperatingError(ErrorBit):
     UNDERVOLTAGE = (0, _E, "battery voltage too low",
         "Stop soon. Charge or check the battery. Check connectors and cables: long or thin ones lose voltage under load.", 0x3220)
     OVERVOLTAGE = (1, _E, "battery voltage too high",
-        "Check that the number of cells suits the ESC. "
-        "If it occurs while braking: a full battery or a power supply cannot take energy back.",
+        "Check that the number of cells suits the ESC. If it occurs while braking: a full battery or a power supply takes no energy back.",
         0x3210)
     OVERCURRENT_INTEGRAL_ERROR = (2, _E, "current too high for too long: switched off",
         "Stop. Check that motor and drive turn freely. Reduce the load: smaller propeller or pinion, less pitch, less throttle.",
