@@ -87,7 +87,9 @@ def test_locks_of_tests_are_in_a_folder_that_every_user_can_write() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     assert os.access(folder, os.W_OK)
     assert Path(os.environ["XDG_RUNTIME_DIR"], "kontronik-can-gw", "lock") == folder
-    script = "from kontronik_can_gw.runtime.system import folders; print(folders.runtime_folder('lock'))"
+    script = (
+        "from kontronik_can_gw.runtime.system import folders; print(folders.runtime_folder('lock'))"
+    )
     child = [sys.executable, "-c", script]
     found = subprocess.run(child, capture_output=True, text=True, check=True).stdout
     assert found == f"{folder}\n", "also a child of root, which must not use /run"
