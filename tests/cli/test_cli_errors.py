@@ -43,7 +43,7 @@ def terminal() -> Iterator[PtyEsc]:
 
 @pytest.mark.parametrize("words", ["replay a --on=tape --to=tape", "replay -h --to tape"])
 def test_a_removed_option_is_one_line_with_what_to_type_instead(words: str) -> None:
-    assert refused(2, *words.split()).startswith("--to: was removed. Type --on can or --on pty; ")
+    assert refused(2, *words.split()).startswith("--to: was removed. Type --on can or --on pty. ")
     assert "unrecognized arguments: --to" in refused(2, "schema", "--to")
     assert "there is no such file" in refused(2, "decode", "--", "--stats")
 

@@ -135,7 +135,7 @@ def test_vcan_gets_commands_of_its_own_also_without_ip(tree: Tree) -> None:
 def test_what_is_no_can_interface_and_no_driver_is_reported(tree: Tree) -> None:
     interface(tree, {"type": "1"})
     found = only(check_can(tree, PLAIN), "can.exists")
-    assert (found.severity, found.text) == (ERROR, "can0 is no CAN interface")
+    assert (found.severity, found.text) == (ERROR, "can0 is not a CAN interface")
     assert grave(check_can(tree, CanConfig(interface="pcan"))) == {"can.driver": NOTE}
 
 

@@ -113,4 +113,4 @@ def test_why_the_gateway_hears_no_telemetry_is_a_warning(tmp_path: Path, esc: Pt
         | {"monotonic_ns": time.monotonic_ns()}
     )
     written(tmp_path / "status.json", text)
-    assert told() == [f"the gateway hears no telemetry: {why}"]
+    assert told() == [f"the gateway receives no telemetry: {why}"]

@@ -78,7 +78,7 @@ def test_without_a_running_systemd_no_installation_is_advised(tree: Tree, folder
         ("/var/lib", ROOM, "open", OK, f"{STORE}, will be made"),
         ("/var/lib", ROOM, "closed", ERROR, f"chown anna {STORE}"),
         ("/var/lib", ROOM, "of systemd", OK, "made by systemd"),
-        ("/var/lib", ROOM, "of a gateway", NOTE, "perhaps the gateway that runs may"),
+        ("/var/lib", ROOM, "of a gateway", NOTE, "perhaps the running gateway may"),
     ],
 )
 def test_a_folder_must_be_one_that_this_user_or_systemd_can_fill(

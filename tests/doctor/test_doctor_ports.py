@@ -75,7 +75,7 @@ INSTALLED = methodcaller(
         # who may open it
         ([FTDI, closed], BY_ID, "port.permission", ERROR, "sudo usermod -aG dialout anna"),
         ([FTDI, of_root, closed], BY_ID, "port.permission", ERROR, "chmod g+rw"),
-        ([FTDI, of_root, closed, GATEWAY], BY_ID, "port.permission", NOTE, "perhaps the gateway that runs may"),
+        ([FTDI, of_root, closed, GATEWAY], BY_ID, "port.permission", NOTE, "perhaps the running gateway may"),
         # what else is on it
         ([FTDI, methodcaller("process", 78, "/usr/bin/brltty")], BY_ID, "port.brltty", WARNING, "apt remove brltty"),
         ([UART, GETTY], AMA0, "port.getty", ERROR, "systemctl disable --now serial-getty@ttyAMA0"),
