@@ -171,7 +171,6 @@ class CaptureSetup:
         return Gateway(
             *(self.escs, layout, now, self.dbc_settings.silent_on_loss, self.canopen),
             further=[setup.make for setup in self.outputs],
-            packs_at_once=self.version == 1,
         )
 
 

@@ -67,8 +67,6 @@ class Replay:
         found, self._taken = self._taken, []
         try:
             found += self._play(entry)
-            if self.gateway.core.packs_at_once:
-                self.gateway.core.pack(entry.time_ns)
         except Exception:
             # a damaged or hostile capture can hold calls that no gateway ever made, which may raise anything
             self.rejected += 1

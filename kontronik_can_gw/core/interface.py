@@ -51,8 +51,6 @@ class Core(Protocol):
     """ESCs whose link state, layout or device changed; the owner empties it."""
     shortest_timeout_ns: int
     """Of all ESCs: live data of one is not available after this."""
-    packs_at_once: bool
-    """As 0.5.0 did, to replay its captures: with each event, so that one step may make several frames of a message."""
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (esc_stream.py, Arrival)."""
@@ -90,6 +88,3 @@ class Core(Protocol):
 
     def take(self, now: int) -> list[CanFrame]:
         """The frames of what is due, with the values of now: slots, then messages, each in the order in which they became due."""
-
-    def pack(self, now: int) -> None:
-        """Make the frames of what is pending, before ``take`` asks for them."""

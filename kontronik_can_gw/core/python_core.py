@@ -15,7 +15,7 @@ from kontronik_can_gw.times import SECOND
 
 
 class PythonCore:
-    """The core in plain Python. ``silent``: see Messages. ``packs_at_once``: see Core."""
+    """The core in plain Python. ``silent``: see Messages."""
 
     language = "Python"
     note = ""
@@ -26,20 +26,17 @@ class PythonCore:
         layout: Layout,
         now: int,
         silent: bool,
-        packs_at_once: bool = False,
     ) -> None:
         self.escs: list[EscStream] = [EscStream(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
         self.messages = Messages(layout, self.escs, self.status, now, silent)
-        self.slots = Slots(self.escs, self.status, packs_at_once)
+        self.slots = Slots(self.escs, self.status)
         self.slot = self.slots.add
         self.own_ids = own_ids(layout)
         self.gateway_changed = self.messages.on_gateway_change
         self.repeat = self.messages.repeat
         self.stop = self.messages.stop
         self.shortest_timeout_ns = self._shortest_timeout()
-        self.packs_at_once = packs_at_once
-        self._packed: list[CanFrame] = []
         self.followers: Sequence[Follower] = ()
         self.link_changes: list[int] = []
         self._second_ns = now
@@ -100,16 +97,11 @@ class PythonCore:
 
     def take(self, now: int) -> list[CanFrame]:
         slots, messages = self.slots.take(now), self.messages.take(now)
-        if self._packed:
-            messages, self._packed = self._packed + messages, []
         return slots + messages if slots else messages
 
     @property
     def is_pending(self) -> bool:
         return bool(self.messages.pending) or self.slots.is_pending
-
-    def pack(self, now: int) -> None:
-        self._packed += self.messages.take(now)
 
     def _report(self, esc: int, events: int, now: int) -> None:
         self.messages.on_event(esc, events, now)
@@ -121,8 +113,6 @@ class PythonCore:
             if escs_ok != self.status.escs_ok:
                 self.status.escs_ok = escs_ok
                 self.messages.on_gateway_change(now)
-        if self.packs_at_once:
-            self.pack(now)
         for wanted, follow in self.followers:
             if events & wanted:
                 follow(esc, events, now)

@@ -262,19 +262,15 @@ class PythonSlot:
 
 
 class Slots:
-    """All slots of a core. ``packs_at_once``: as Core."""
+    """All slots of a core."""
 
-    def __init__(
-        self, escs: Sequence[EscTelemetry], status: GatewayStatus, packs_at_once: bool = False
-    ) -> None:
+    def __init__(self, escs: Sequence[EscTelemetry], status: GatewayStatus) -> None:
         self.escs = escs
         self.status = status
         self.pending: dict[Place, int] = {}
         """The slots that ``take`` hands over, and the time since when each is pending."""
         self.moved: set[int] = set()
         """ESCs with slots of which ``due`` changed."""
-        self._packs_at_once = packs_at_once
-        self._packed: list[CanFrame] = []
         self._of: list[list[PythonSlot]] = [[] for _ in escs]
         self._due = [NEVER] * len(escs)
 
@@ -306,10 +302,7 @@ class Slots:
 
     def let_go(self, slot: PythonSlot, now: int) -> None:
         """Let a slot be handed over."""
-        if not self._packs_at_once:
-            self.pending.setdefault(slot.place, now)
-        else:
-            self._packed += slot.frames(now)
+        self.pending.setdefault(slot.place, now)
 
     def next_deadline(self) -> int:
         """When ``advance`` has something to do."""
@@ -331,11 +324,11 @@ class Slots:
     @property
     def is_pending(self) -> bool:
         """True while ``take`` has something to do."""
-        return bool(self.pending or self._packed)
+        return bool(self.pending)
 
     def take(self, now: int) -> list[CanFrame]:
         """The frames of pending slots, in their order."""
-        frames, self._packed = self._packed, []
+        frames: list[CanFrame] = []
         for slot in self.take_each(now):
             frames += slot.frames
         return frames

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.core.interface import Core, Follower
 from kontronik_can_gw.core.output import SLOTS, Output
-from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
@@ -38,17 +37,12 @@ class Gateway:
         silent_on_loss: bool = False,
         canopen: "CanopenSetup | None" = None,
         further: Sequence[MakeOutput] = (),
-        packs_at_once: bool = False,
     ) -> None:
         self.core: Core
         self.why_python: str
         """Why the core is the one in Python; empty with the one in C."""
-        if packs_at_once:
-            self.core = PythonCore(escs, layout, now, silent_on_loss, packs_at_once)
-            self.why_python = "a capture of 0.5.0 is replayed"
-        else:
-            slots = SLOTS * len(further) + (0 if canopen is None else canopen.pdos)
-            self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
+        slots = SLOTS * len(further) + (0 if canopen is None else canopen.pdos)
+        self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
         self.layout = layout.fingerprint if layout.messages else None
         """Of the messages, as it stands in a DBC that `dbc -c` writes; None without messages."""
         self.escs, self.status = self.core.escs, self.core.status

@@ -74,7 +74,6 @@ class NativeCore:
         self.choose_events()
         self.link_changes: list[int] = []
         self.shortest_timeout_ns = min(esc.timeout_ns for esc in escs)
-        self.packs_at_once = False
 
     def _make(self, tables: Tables, now: int) -> None:
         """``state``, ``esc_states``: what is in the core's memory."""
@@ -203,9 +202,6 @@ class NativeCore:
 
     def stop(self, now: int) -> None:
         self.library.kcg_stop(self.core, now)
-
-    def pack(self, now: int) -> None:
-        """Nothing: this core packs when it hands over."""
 
     def _follow_all(self, found: int, now: int) -> None:
         """Follow what a call of the core returned, and what else there is."""

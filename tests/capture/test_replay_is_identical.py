@@ -1,10 +1,13 @@
 """What a replay gives is what the live gateway sent: every frame, every byte, every time."""
 
+from pathlib import Path
+
 import pytest
 from capture_bench import START, Bench, made
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import (
+    VERSION,
     Block,
     Entry,
     Kind,
@@ -16,6 +19,10 @@ from kontronik_can_gw.capture.format import (
     read_json,
 )
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
+from kontronik_can_gw.desk.recordings.inputs import open_input
+
+CAPTURES = Path(__file__).resolve().parents[1] / "golden" / "captures"
+OF_0_5_0 = sorted(CAPTURES.glob("wild*.kcap"))
 
 
 def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
@@ -75,3 +82,34 @@ def test_a_marked_replay_differs_in_the_state_and_nowhere_else() -> None:
     assert differing == {"GatewayState"}
     assert states[-1] == "Stopping"
     assert set(states[:-1]) == {"Replay"}
+
+
+def _copy_in_version_2(old: Path, new: Path) -> None:
+    """Write the entries of a capture of 0.5.0 as the current version writes them."""
+    scanner = Scanner()
+    found = [*scanner.feed(old.read_bytes()), *scanner.flush()]
+    written = []
+    for part in found:
+        assert isinstance(part, Block)
+        payload = part.payload
+        if part.kind == b"H":
+            header = read_json(payload)
+            assert header["version"] == 1
+            payload = json_payload(header | {"version": VERSION})
+        elif part.kind == b"D":
+            entries = read_entries(payload, version=1)
+            payload = data_payload(entry._replace(came_ns=entry.time_ns) for entry in entries)
+        written.append(block(part.kind, part.number, payload))
+    new.write_bytes(b"".join(written))
+
+
+@pytest.mark.parametrize("path", OF_0_5_0, ids=lambda path: path.stem)
+def test_a_capture_of_0_5_0_is_replayed_in_the_current_order(path: Path, tmp_path: Path) -> None:
+    _copy_in_version_2(path, tmp_path / "new.kcap")
+    with open_input(path) as old, open_input(tmp_path / "new.kcap") as new:
+        frames = list(old.frames())
+        assert frames == list(new.frames())
+    assert len(frames) > 500
+    messages = [each for each in frames if not (each.received or each.frame.queued)]
+    in_steps = [(each.time_ns, each.frame.key, each.frame.page) for each in messages]
+    assert len(in_steps) == len(set(in_steps)), "a message is sent once in a step"
