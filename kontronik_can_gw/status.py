@@ -10,6 +10,11 @@ UNCONFIGURED = 0xFF
 """The node-ID of a node that has none."""
 
 
+def name_in_words(name: str) -> str:
+    """Return the name of a constant as people read it, such as "error-passive"."""
+    return name.lower().replace("_", "-")
+
+
 class GatewayState(IntEnum):
     STARTING = 0
     RUNNING = 1

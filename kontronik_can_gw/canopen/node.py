@@ -129,10 +129,10 @@ class Node:
             if self.nmt.starts_itself:
                 self.nmt.enter(NmtState.OPERATIONAL, now)
         if parameters.rejected:
-            self._owner.rejected_parameters += [(self._number, key) for key in parameters.rejected]
+            self._owner.reject(self._number, parameters.rejected)
         parameters.verify()
         self._owner.rerouted = True
-        self._owner.state_changes += 1
+        self._owner.revision += 1
 
     # --- what happens
 
@@ -165,7 +165,7 @@ class Node:
         self._owner.send(CanFrame(cob_id, data, queued=True))
 
     def _save(self, stored: Stored) -> None:
-        self._owner.saves.append((self._number, stored))
+        self._owner.save(self._number, stored)
 
     def _send_sdo(self, data: bytes) -> None:
         self._send(SDO_ANSWER + self.node_id, data)
@@ -178,7 +178,7 @@ class Node:
     def _entered(self, now: int) -> None:
         """The NMT state is another one."""
         self.tpdos.stop()
-        self._owner.state_changes += 1
+        self._owner.revision += 1
         if self.state is NmtState.STOPPED:
             self.emergencies.close()
             self.sdo.reset()

@@ -23,12 +23,12 @@ from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, m
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.core.output import Output, Owner
+from kontronik_can_gw.core.output import LogLine, NodeOutput, NodeState, Owner
 from kontronik_can_gw.core.slots import Slot, Slots
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.plan import classic_bits
-from kontronik_can_gw.status import UNCONFIGURED, CanState, GatewayStatus, NmtState
+from kontronik_can_gw.status import UNCONFIGURED, CanState, GatewayStatus, name_in_words
 from kontronik_can_gw.times import NEVER, SECOND
 
 SettingsChanged = Callable[[int, EscSettings], None]
@@ -72,7 +72,7 @@ class CanopenSetup:
         return nodes
 
 
-class Nodes(Output):
+class Nodes(NodeOutput):
     """One node for each ESC. ``slot`` gives a further slot of the core for an ESC.
 
     ``foreign_ids``: 11-bit ids that the gateway sends otherwise; no PDO may be given one. ``settings_changed`` is called
@@ -98,9 +98,11 @@ class Nodes(Output):
         self._routes: dict[int, list[FrameTaker]] = {}
         self.rerouted = True
         """A node uses other COB-IDs now."""
+        self._rejected: list[tuple[int, int]] = []
         self._watched: frozenset[int] = frozenset()
         self._to_watchers: deque[CanFrame] = deque()
         self._started = False
+        self._reported: list[NodeState] = []
         self.nodes = [Node(n, setup, esc, gateway, self) for n, esc in enumerate(escs)]
         self._can_faults = _CanFaults(self.nodes)
 
@@ -161,7 +163,7 @@ class Nodes(Output):
             node.consumer.held_up(now)
         self._after(now)
 
-    def make_anew(self, now: int) -> None:
+    def repeat_measurements(self, now: int) -> None:
         """PDOs that waited to be sent were dropped: send once more what is sent on change only."""
         for node in self.nodes:
             node.tpdos.repeat(now)
@@ -171,11 +173,32 @@ class Nodes(Output):
         self.nodes[esc].emergencies.set(GatewayError.ID_COLLISION, present, now)
         self._after(now)
 
-    def node_states(self) -> list[tuple[int, NmtState, int]]:
+    def node_states(self) -> list[NodeState]:
         return [
-            (node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos))
+            NodeState(node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos))
             for node in self.nodes
         ]
+
+    def take_news(self) -> list[LogLine]:
+        """Return a line for each node whose state or node-ID is not the reported one."""
+        if not self._started:
+            return []
+        reported = self._reported
+        self._reported = states = self.node_states()
+        lines = []
+        for index, (node_id, state, _) in enumerate(states):
+            if reported and reported[index][:2] == (node_id, state):
+                continue
+            subject = f"{self.nodes[index].esc.settings.name}: CANopen node"
+            words = f"{node_id} {name_in_words(state.name)}"
+            if node_id == UNCONFIGURED:
+                words = "waits for LSS"
+            lines.append(LogLine(subject, f"{subject} {words}"))
+        return lines
+
+    def take_rejected_parameters(self) -> list[tuple[int, int]]:
+        rejected, self._rejected = self._rejected, []
+        return rejected
 
     def traffic(self, is_worst: bool = False) -> tuple[float, float]:
         """Frames a second of PDOs and heartbeats, and the bits that they need with the most stuffing.
@@ -222,6 +245,10 @@ class Nodes(Output):
 
     # --- what nodes ask
 
+    def reject(self, esc: int, keys: Sequence[int]) -> None:
+        """Report stored values that a reset rejected."""
+        self._rejected += [(esc, key) for key in keys]
+
     def send(self, frame: CanFrame) -> None:
         """Put a frame out."""
         self.frames.append(frame)
@@ -256,7 +283,7 @@ class Nodes(Output):
             # what we send does not come back from the bus: one of our nodes may watch another
             frame = self._to_watchers.popleft()
             self._route(frame, now, now)
-        if self.rerouted:
+        if self.rerouted and self._started:
             self.rerouted = False
             self._watched = frozenset(
                 HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids

@@ -1,7 +1,7 @@
-"""The seam of an output: what turns events of the ESCs and time into CAN frames, and takes frames from the bus.
+"""The seam of an output: events of the ESCs and time go in, CAN frames come out.
 
-The gateway holds its outputs in a tuple and treats all alike. An output overrides what concerns it; everything else does nothing. ``now``
-is integer nanoseconds of one monotonic clock.
+The gateway holds its outputs in a tuple and treats all of them alike. An output overrides the
+calls that concern it. The others do nothing. ``now`` is integer nanoseconds of one monotonic clock.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.status import CanState
+from kontronik_can_gw.status import CanState, NmtState
 from kontronik_can_gw.times import NEVER
 
 NO_IDS: frozenset[int] = frozenset()
@@ -18,102 +18,154 @@ SLOTS = 4
 
 
 class Owner(NamedTuple):
-    """What sends with an id: ``esc`` is the ESC whose node it is, the first of several; None: no node."""
+    """The user of a CAN id."""
 
     esc: int | None
+    """The ESC whose node sends with the id, or the first ESC of that node. None without a node."""
     what: str
+    """A description for messages, such as "message Voltages"."""
+
+
+class LogLine(NamedTuple):
+    """A line for the log. Lines with one subject are counted together if they are frequent."""
+
+    subject: str
+    text: str
 
 
 class Output:
-    """One way onto the bus. Frames are appended to ``frames``, oldest first; the owner empties it.
+    """One way onto the bus.
 
-    All outputs of a gateway share one list, so that their frames keep their order. Do not replace it.
+    An output appends its frames to ``frames``, oldest first, and the gateway empties the list. All
+    outputs of a gateway share this list, so that their frames keep their order. An output must
+    not replace it.
     """
 
     name = ""
-    """Of what ``facts`` says."""
+    """The key of ``facts`` in the status document."""
     events = Event.ALL
-    """What ``on_event`` is given: with at least one of these. The fewer, the less the core is interrupted."""
+    """``on_event`` is called if at least one of these occurred. Fewer interrupt the core less."""
 
     def __init__(self) -> None:
         self.frames: list[CanFrame] = []
-        self.receive_ids: frozenset[int] = NO_IDS
-        """The ids (29-bit ones with EXTENDED) and blocks of ids (frames.id_block) that ``receive`` is to be given.
+        self.revision = 0
+        """Grows with each change, except for ``frames``, that the runtime has to follow.
 
-        The same object until they or ``own_ids`` change.
+        Such changes are ``receive_ids``, ``own_ids``, lines for the log, and those of a
+        ``NodeOutput``.
         """
-        self.saves: list[tuple[int, Any]] = []
-        """(ESC, parameters) to store; the owner empties it and answers each by ``saved``, in this order."""
-        self.rejected_parameters: list[tuple[int, int]] = []
-        """(ESC, index << 8 | sub-index) of stored values that were rejected at a reset; the owner empties it."""
-        self.state_changes = 0
-        """Grows with each change of a node's state or node-ID."""
-        self.news: list[str] = []
-        """What is to be logged of such a change; the owner empties it."""
+        self._receive_ids = NO_IDS
 
     @property
-    def marks(self) -> tuple[object, ...]:
-        """Others where something has changed that the runtime follows, but for ``frames``."""
-        ids, changes = self.receive_ids, self.state_changes
-        # ids of the same content may be others; as long as they are held, nothing else has their address
-        return id(ids), changes, len(self.saves), len(self.rejected_parameters), ids
+    def receive_ids(self) -> frozenset[int]:
+        """The CAN ids and blocks of ids (``frames.id_block``) that ``receive`` needs.
+
+        29-bit ids contain ``EXTENDED``. Setting them increases ``revision``.
+        """
+        return self._receive_ids
+
+    @receive_ids.setter
+    def receive_ids(self, ids: frozenset[int]) -> None:
+        self._receive_ids = ids
+        self.revision += 1
 
     def own_ids(self) -> Mapping[int, Owner]:
-        """The ids, and blocks of ids, that only this output sends with, and what for."""
+        """Return the ids and blocks of ids that only this output may send with."""
         return {}
 
     def facts(self) -> dict[str, Any]:
-        """What is to be known of this output, as JSON; ``lines`` are for people. Empty: nothing."""
+        """Return the output's part of the status document, or an empty one.
+
+        ``lines`` are shown to people.
+        """
         return {}
 
-    def node_states(self) -> list[tuple[int, Any, int]]:
-        """Of each ESC's node: node-ID, state, frames with measurements so far. Empty without nodes."""
+    def take_news(self) -> list[LogLine]:
+        """Return the lines for the log since the last call."""
         return []
 
     def next_deadline(self) -> int:
-        """When ``advance`` is to be called at the latest."""
+        """Return the time at which ``advance`` must be called. Earlier calls do no harm."""
         return NEVER
 
-    # --- what happens
+    # --- calls of the gateway
 
     def take_slots(self, slot: Callable[[int], Any]) -> None:
         """The gateway is made. ``slot`` gives a further slot of the core (slots.Slot) of an ESC, for frames that need no Python."""
 
     def start(self, now: int, can_open: bool) -> None:
-        """The gateway runs. ``can_open``: there is a bus that can hear it."""
+        """Begin to send. ``can_open`` is True if the CAN interface is open."""
 
     def stop(self, now: int) -> None:
-        """The gateway is about to end."""
+        """Send the last frames, because the gateway ends."""
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        """Something of an ESC changed: bits of telemetry.Event."""
+        """Follow a change of an ESC. ``events`` are bits of ``telemetry.Event``."""
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
-        """The CAN controller's state, as the runtime knows it; DOWN may be followed by DOWN."""
+        """Follow the state of the CAN controller. DOWN may be followed by DOWN."""
 
     def can_returned(self, now: int) -> None:
-        """Frames can be sent again after some were lost, or for the first time."""
+        """Follow an interface that takes frames again after a loss, or for the first time."""
 
     def held_up(self, now: int) -> None:
-        """The process was held up until ``now``."""
+        """Follow a suspension of the process that ended at ``now``."""
 
-    def make_anew(self, now: int) -> None:
-        """Measurements that waited to be sent were dropped."""
+    def repeat_measurements(self, now: int) -> None:
+        """Send measurements again, because those that waited to be sent were discarded."""
 
     def advance(self, now: int) -> None:
         """Let time pass."""
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
-        """A frame from the bus, which came ``at``; it may be none of ``receive_ids``."""
+        """Take a frame that arrived from the bus at ``at``. It need not be in ``receive_ids``."""
 
     def collision(self, esc: int, present: bool, now: int) -> None:
-        """Another device begins, or has ceased, to send with an id of this ESC's node."""
+        """Follow another device that begins or stops to send with an id of this ESC's node."""
 
     def overrun(self, now: int) -> None:
-        """The CAN controller lost received frames."""
+        """Follow a loss of received frames in the CAN controller."""
+
+
+class NodeState(NamedTuple):
+    """The state of one ESC's node."""
+
+    node_id: int
+    """1..127, or 255 for a node that waits for one."""
+    state: NmtState
+    sent: int
+    """Number of frames with measurements so far."""
+
+
+class NodeOutput(Output):
+    """An output with a node for each ESC, whose parameters a master can change and store."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.saves: list[tuple[int, Any]] = []
+        """Parameters to store, as pairs of ESC and content. The gateway empties the list.
+
+        ``saved`` answers each of them, for one ESC in this order.
+        """
+
+    def save(self, esc: int, parameters: Any) -> None:
+        """Ask the runtime to store the parameters of an ESC's node."""
+        self.saves.append((esc, parameters))
+        self.revision += 1
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
-        """The oldest of ``saves`` of this ESC is on disk, or could not be stored and why."""
+        """Follow the end of the oldest save of this ESC. ``error`` is the reason if it failed."""
 
     def parameters_damaged(self, esc: int, now: int) -> None:
-        """What was stored for an ESC could not be read."""
+        """Report that the stored parameters of an ESC could not be read."""
+
+    def node_states(self) -> list[NodeState]:
+        """Return the state of each ESC's node."""
+        return []
+
+    def take_rejected_parameters(self) -> list[tuple[int, int]]:
+        """Return the stored values that resets rejected since the last call.
+
+        A value is a pair of ESC and index << 8 | sub-index.
+        """
+        return []

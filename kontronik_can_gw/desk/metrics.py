@@ -23,8 +23,7 @@ from kontronik_can_gw.desk.monitor.status import (
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import LinkState
-from kontronik_can_gw.runtime.status.snapshot import name_in_words
-from kontronik_can_gw.status import CanState, GatewayState, NmtState
+from kontronik_can_gw.status import CanState, GatewayState, NmtState, name_in_words
 
 Document = Mapping[str, Any]
 Sample = tuple[str, float | None, dict[str, object]]

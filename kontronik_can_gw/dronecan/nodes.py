@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.core.output import Output, Owner
+from kontronik_can_gw.core.output import LogLine, Output, Owner
 from kontronik_can_gw.core.slots import Slot
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.allocation import Allocation
@@ -147,6 +147,7 @@ class Dronecan(Output):
         self._assembler = Assembler()
         self._answered = self._unanswered = self._answers = 0
         self._second_due = NEVER
+        self._news: list[LogLine] = []
         self._follow_ids()
 
     # --- what happens
@@ -156,7 +157,7 @@ class Dronecan(Output):
             report.take_slots(slot, number)
 
     def start(self, now: int, can_open: bool) -> None:
-        self.make_anew(now)
+        self.repeat_measurements(now)
         for node in self._by_id.values():
             node.start(now)
         self._ask(now)
@@ -169,13 +170,13 @@ class Dronecan(Output):
 
     def can_returned(self, now: int) -> None:
         self._log_anew()
-        self.make_anew(now)
+        self.repeat_measurements(now)
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         if before is CanState.BUS_OFF and state not in (CanState.BUS_OFF, CanState.DOWN):
             self._log_anew()
 
-    def make_anew(self, now: int) -> None:
+    def repeat_measurements(self, now: int) -> None:
         self._second_due = now
 
     def next_deadline(self) -> int:
@@ -226,6 +227,10 @@ class Dronecan(Output):
             for number, node in enumerate(self._nodes)
             if node.node_id
         }
+
+    def take_news(self) -> list[LogLine]:
+        news, self._news = self._news, []
+        return news
 
     def facts(self) -> dict[str, Any]:
         nodes, lines = [], []
@@ -286,8 +291,9 @@ class Dronecan(Output):
         if node_id is not None:
             node = next(node for node in self._nodes if not node.node_id)
             node.node_id = node_id
-            self.news.append(f"DroneCAN node {node.setup.name}: has node-ID {node_id}")
-            self.state_changes += 1
+            text = f"DroneCAN node {node.setup.name}: has node-ID {node_id}"
+            self._news.append(LogLine(text, text))
+            self.revision += 1
             self._second_due = now  # it says that it is there
             node.start(now)
             self._ask(now)

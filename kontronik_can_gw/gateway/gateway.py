@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.core.interface import Core, Follower
-from kontronik_can_gw.core.output import SLOTS, Output
+from kontronik_can_gw.core.output import SLOTS, NodeOutput, NodeState, Output
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
@@ -63,7 +63,8 @@ class Gateway:
         """False: nothing but the layout's messages is sent, and no id to receive ever changes."""
         self.core.followers = [Follower(each.events, each.on_event) for each in self.outputs]
         self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
-        self._being_saved: list[tuple[int, Output]] = []
+        self._node_outputs = [each for each in self.outputs if isinstance(each, NodeOutput)]
+        self._being_saved: list[tuple[int, NodeOutput]] = []
         self._dropped = False
 
     @property
@@ -121,7 +122,7 @@ class Gateway:
     def take_saves(self) -> list[tuple[int, Any]]:
         """Parameters to store, (ESC, what), oldest first; each is answered by one call of ``saved`` for that ESC, in this order."""
         found = []
-        for output in self.outputs:
+        for output in self._node_outputs:
             if output.saves:
                 found += output.saves
                 self._being_saved += [(esc, output) for esc, _ in output.saves]
@@ -131,10 +132,8 @@ class Gateway:
     def take_rejected_parameters(self) -> list[tuple[int, int]]:
         """Stored values that were rejected at a node's reset: (ESC, index << 8 | sub-index)."""
         found = []
-        for output in self.outputs:
-            if output.rejected_parameters:
-                found += output.rejected_parameters
-                output.rejected_parameters = []
+        for output in self._node_outputs:
+            found += output.take_rejected_parameters()
         return found
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
@@ -147,7 +146,7 @@ class Gateway:
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """What was stored for an ESC could not be read: its node runs on defaults and reports it."""
-        for output in self.outputs:
+        for output in self._node_outputs:
             output.parameters_damaged(esc, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
@@ -191,7 +190,7 @@ class Gateway:
             self._dropped = False
             self.core.repeat(now)
             for output in self.outputs:
-                output.make_anew(now)
+                output.repeat_measurements(now)
         for output in self.outputs:
             output.advance(now)
 
@@ -227,13 +226,16 @@ class Gateway:
         return changes
 
     @property
-    def node_changes(self) -> int:
-        """Grows with each change of a node's state or node-ID."""
-        return sum([output.state_changes for output in self.outputs])
+    def revision(self) -> int:
+        """A number that grows with each change of an output that the runtime has to follow."""
+        return sum([output.revision for output in self.outputs])
 
-    def node_states(self) -> list[tuple[int, Any, int]]:
-        """Of each ESC's node: node-ID, state, PDOs sent so far. Empty without nodes."""
-        return [state for output in self.outputs for state in output.node_states()]
+    def node_states(self) -> list[NodeState]:
+        """Return the state of each ESC's node. The list is empty without nodes."""
+        states = []
+        for output in self._node_outputs:
+            states += output.node_states()
+        return states
 
 
 def _nodes(setup: "CanopenSetup", layout: Layout, core: Core, status: GatewayStatus) -> "Nodes":

@@ -39,7 +39,7 @@ class IdConflicts:
     def __init__(self, of_gateway: Mapping[int, Owner], outputs: Sequence[Output]) -> None:
         self._of_gateway = of_gateway
         self._outputs = outputs
-        self._routed: list[frozenset[int]] | None = None
+        self._revision = -1
         self._own: dict[int, tuple[Owner, Output | None]] = {}
         self._own_blocks: tuple[int, ...] = ()
         self._receive_ids = NO_IDS
@@ -54,19 +54,18 @@ class IdConflicts:
         return self._receive_ids
 
     def _follow(self) -> None:
-        if self._routed is not None:
-            for output, known in zip(self._outputs, self._routed, strict=True):
-                if output.receive_ids is not known:
-                    break
-            else:
-                return
-        self._routed = [output.receive_ids for output in self._outputs]
+        revision = sum([output.revision for output in self._outputs])
+        if revision == self._revision:
+            return
+        self._revision = revision
         own: dict[int, tuple[Owner, Output | None]]
         own = {key: (owner, None) for key, owner in self._of_gateway.items()}
         for output in self._outputs:
             own |= {key: (owner, output) for key, owner in output.own_ids().items()}
         self._own, self._own_blocks = own, tuple(key for key in own if key >> 32)
-        self._receive_ids = frozenset(own).union(*self._routed)
+        ids = frozenset(own).union(*[output.receive_ids for output in self._outputs])
+        if ids != self._receive_ids:
+            self._receive_ids = ids
 
     def first_own_id(self) -> int | None:
         """The lowest id of ours that is of no ESC's node; None without any."""

@@ -13,13 +13,13 @@ from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.files.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.ports.esc_port import EscPort
 from kontronik_can_gw.runtime.status.facts import CanFacts, ProgramFacts, gateway_facts
-from kontronik_can_gw.runtime.status.snapshot import Moment, name_in_words
+from kontronik_can_gw.runtime.status.snapshot import Moment
 from kontronik_can_gw.runtime.status.statistics import Statistics
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.runtime.system.process import ProcessFacts, process_facts
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.runtime.system.worker import Report
-from kontronik_can_gw.status import UNCONFIGURED, NmtState
+from kontronik_can_gw.status import name_in_words
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
@@ -72,7 +72,6 @@ class Housekeeping:
         self._notify_due = 0
         self._collect_due: int | None = None
         self._process, self._process_due = ProcessFacts(), 0
-        self._node_states: list[tuple[int, NmtState]] = []
 
     def run(self, now: int) -> None:
         """One round."""
@@ -135,12 +134,8 @@ class Housekeeping:
         for name, begins, text in reports:
             (self._conditions.begin if begins else self._conditions.end)(name, text, now)
 
-    def report_nodes(self, now: int) -> None:
-        """Log which nodes have another state or node-ID, and stored values that were rejected."""
-        for output in self._gateway.outputs:
-            for text in output.news:
-                log.info("%s", text)
-            output.news.clear()
+    def report_outputs(self, now: int) -> None:
+        """Log rejected parameters and what the outputs report, such as new states of nodes."""
         for index, key in self._gateway.take_rejected_parameters():
             log.warning(
                 "%s: the stored %04Xh:%02X is ignored: it does not fit this EDS, or clashes",
@@ -148,18 +143,9 @@ class Housekeeping:
                 key >> 8,
                 key & 0xFF,
             )
-        states = [(node_id, state) for node_id, state, _ in self._gateway.node_states()]
-        before, self._node_states = self._node_states, states
-        for index, (node_id, state) in enumerate(states):
-            if before and before[index] == (node_id, state):
-                continue
-            words = (
-                "waits for LSS"
-                if node_id == UNCONFIGURED
-                else f"{node_id} {name_in_words(state.name)}"
-            )
-            name = f"{self._escs[index].name}: CANopen node"
-            self._conditions.event(name, f"{name} {words}", now, logging.INFO)
+        for output in self._gateway.outputs:
+            for subject, text in output.take_news():
+                self._conditions.event(subject, text, now, logging.INFO)
 
     def _log_conflicts(self, now: int) -> None:
         """Others on the bus begin, or cease, to send with our ids."""

@@ -63,7 +63,7 @@ class Loop:
         self._notifier = notifier or Notifier({})
         self._statistics = statistics
         self._recorder = recorder
-        self._now = self._node_changes = self._look_due = 0
+        self._now = self._look_due = self._revision = 0
         self._due: int | None = None  # not known since something was done
         self._stopping = False
         self._reason = "stopped"
@@ -201,11 +201,12 @@ class Loop:
         return now
 
     def _follow_outputs(self, now: int) -> None:
-        """Ids to receive, and the states of nodes, may be others."""
-        self.can.follow_ids()
-        if self.gateway.node_changes != self._node_changes:
-            self._node_changes = self.gateway.node_changes
-            self._housekeeping.report_nodes(now)
+        """Follow changes of the outputs: ids to receive, states of nodes."""
+        revision = self.gateway.revision
+        if revision != self._revision:
+            self._revision = revision
+            self.can.follow_ids()
+            self._housekeeping.report_outputs(now)
 
     def end(self) -> None:
         """A last status is sent and everything is closed."""

@@ -115,13 +115,13 @@ class NativePoller(Poller):
         As a rule nothing but frames comes of it, if anything, and C sends them first.
         """
         gateway, core, turns = self._gateway, self._core, self._turns
-        state, outputs = turns.state, gateway.outputs
-        before = [output.marks for output in outputs]
+        state = turns.state
+        revision = gateway.revision
         if is_due := state.found == OUTPUTS:
             gateway.advance(state.now, with_core=False)
         else:
             core.follow(state.found, state.now)
-        if core.link_changes or core.reports_live or before != [each.marks for each in outputs]:
+        if core.link_changes or core.reports_live or gateway.revision != revision:
             return False
         state.outputs_due = due = gateway.next_deadline(with_core=False)
         state.due = min(state.due, core.deadline_in_python())

@@ -5,9 +5,8 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.link_commands import restart
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts, LinkMonitor, link_monitor
-from kontronik_can_gw.runtime.status.snapshot import name_in_words
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
-from kontronik_can_gw.status import CanState
+from kontronik_can_gw.status import CanState, name_in_words
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 ASK_NS, ASK_OFF_NS = SECOND, 100 * MS

@@ -33,7 +33,7 @@ from kontronik_can_gw.runtime.status.facts import (
     utc,
 )
 from kontronik_can_gw.runtime.system.process import ProcessFacts
-from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus
+from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus, name_in_words
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
@@ -152,11 +152,6 @@ def _rates(moment: Moment, before: Moment | None) -> Document | None:
 
 def _seconds(ns: int) -> float:
     return round(ns / SECOND, 3)
-
-
-def name_in_words(name: str) -> str:
-    """A constant's name as people read it."""
-    return name.lower().replace("_", "-")
 
 
 def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) -> Document:
