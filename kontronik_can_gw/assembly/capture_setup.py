@@ -13,26 +13,31 @@ JSON keys of the header (run and recorder add created_ns, run, part, monotonic_n
 """
 
 import platform
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
-from kontronik_can_gw.capture.limits import END_OF_TIME, HeaderError, check_state, whole_number
+from kontronik_can_gw.capture.limits import END_OF_TIME, check_state
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.core.header_parts import (
+    HeaderError,
+    esc_json,
+    esc_of,
+    file_bytes,
+    reading,
+    short_text,
+    whole_number,
+)
 from kontronik_can_gw.core.output_setup import OUTPUTS, Given, OutputSetup, setup_of
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.times import MS
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -41,8 +46,6 @@ if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup
 
 Header = Mapping[str, Any]
-_UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
-"""Errors of Python if a part of a header is missing or has another type."""
 _LATEST, _SEEDS = 1 << 62, (1 << 64) - 1
 _DBC_KEYS = {
     f.name: {"e2e_data_ids": "data_ids", "send_type": "send_types"}.get(f.name, f.name)
@@ -51,30 +54,6 @@ _DBC_KEYS = {
 }
 """Keys of [dbc] to their names in a header."""
 _KINDS = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
-
-
-@contextmanager
-def _reading(part: str) -> Iterator[None]:
-    """Turn errors of Python into a HeaderError that names this part of the header."""
-    try:
-        yield
-    except (HeaderError, UserError):
-        raise
-    except KeyError as error:
-        raise HeaderError(f"{part}: {str(error.args[0])[:40]!r} is missing") from None
-    except _UNUSABLE:
-        raise HeaderError(f"{part} is not as a recorder writes it") from None
-
-
-def _file_bytes(text: str, part: str) -> bytes:
-    """Return the bytes of a file that a header holds, one character a byte."""
-    try:
-        return text.encode("latin-1")
-    except UnicodeEncodeError as error:
-        character = text[error.start]
-        raise HeaderError(
-            f"{part}: the text of the file has {character!r}, but each character stands for one byte"
-        ) from None
 
 
 @dataclass(frozen=True)
@@ -111,7 +90,7 @@ class CaptureSetup:
             },
             "configuration": self.configuration,
             "file": self.file,
-            "escs": [_esc_json(esc) for esc in self.escs],
+            "escs": [esc_json(esc) for esc in self.escs],
             "ports": list(self.ports),
             "dbc": dbc,
             "canopen": None if self.canopen is None else _canopen_json(self.canopen),
@@ -128,7 +107,7 @@ class CaptureSetup:
                 f"capture version {header.get('version')} is unknown, this program knows versions up to {VERSION}"
             )
         try:
-            with _reading("the header"):
+            with reading("the header"):
                 _check(header)
                 return cls._of(header)
         except (HeaderError, UserError) as error:
@@ -139,12 +118,12 @@ class CaptureSetup:
         dbc = header["dbc"]
         settings, file = DbcConfig(), None
         if dbc is not None:
-            with _reading("dbc"):
-                file = (str(dbc["file"]), _file_bytes(dbc["text"], "dbc"))
+            with reading("dbc"):
+                file = (str(dbc["file"]), file_bytes(dbc["text"], "dbc"))
                 settings = _dbc_settings(dbc)
         found = header["canopen"]
-        with _reading("escs"):
-            escs = tuple(_esc(esc) for esc in header["escs"])
+        with reading("escs"):
+            escs = tuple(esc_of(esc) for esc in header["escs"])
         return cls(
             escs,
             tuple(map(str, header["ports"])),
@@ -181,7 +160,7 @@ def _canopen_json(setup: "CanopenSetup") -> dict[str, Any]:
         "eds": {"file": setup.eds.name, "text": setup.eds.data.decode("latin-1")},
         "nodes": [asdict(node) for node in setup.settings],
         "stored": [encode(stored).decode("ascii") for stored in setup.stored],
-        "escs": [_esc_json(esc) for esc in setup.escs],
+        "escs": [esc_json(esc) for esc in setup.escs],
     }
 
 
@@ -190,14 +169,14 @@ def _canopen(found: Mapping[str, Any]) -> "CanopenSetup":
     from kontronik_can_gw.canopen.nodes import CanopenSetup
     from kontronik_can_gw.canopen.storage import decode
 
-    with _reading("canopen"):
-        eds = eds_of(_file_bytes(found["eds"]["text"], "canopen.eds"), found["eds"]["file"])
-    with _reading("canopen.nodes"):
+    with reading("canopen"):
+        eds = eds_of(file_bytes(found["eds"]["text"], "canopen.eds"), found["eds"]["file"])
+    with reading("canopen.nodes"):
         nodes = tuple(_node(node) for node in found["nodes"])
-    with _reading("canopen.stored"):
+    with reading("canopen.stored"):
         stored = tuple(decode(text.encode("ascii")) for text in found["stored"])
-    with _reading("canopen.escs"):
-        return CanopenSetup(eds, nodes, stored, tuple(_esc(esc) for esc in found["escs"]))
+    with reading("canopen.escs"):
+        return CanopenSetup(eds, nodes, stored, tuple(esc_of(esc) for esc in found["escs"]))
 
 
 def _output_json(given: Given) -> dict[str, Any]:
@@ -208,7 +187,7 @@ def _output(name: str, found: Mapping[str, Any], escs: Sequence[EscSettings]) ->
     """Settings checked like those of a configuration."""
     if name not in OUTPUTS:
         raise HeaderError(f"{str(name)[:40]!r} is no output that this version knows")
-    with _reading(f"outputs.{name}"):
+    with reading(f"outputs.{name}"):
         table = getattr(parse({name: found["table"], "esc": [{"port": "-"}]}, "the capture"), name)
         identity = bytes.fromhex(found["identity"])
         seed = whole_number(found["seed"], 0, _SEEDS)
@@ -225,31 +204,6 @@ def _dbc_settings(found: Mapping[str, Any]) -> DbcConfig:
     return parse({"dbc": given, "esc": [{"port": "-"}]}, "the capture").dbc
 
 
-def _esc_json(esc: EscSettings) -> dict[str, Any]:
-    return asdict(esc) | {"gear": str(esc.gear)}
-
-
-def _esc(found: Mapping[str, Any]) -> EscSettings:
-    """Settings of an ESC, within the ranges of the configuration or those that a master may write."""
-    numerator, _, denominator = found["gear"].partition("/")
-    gear = Fraction(whole_number(numerator, 1, 10**12), whole_number(denominator or "1", 1, 10**12))
-    return EscSettings(
-        _text(found["name"], 12),
-        whole_number(found["pole_pairs"], 1, 0xFFFF),
-        gear,
-        whole_number(found["cell_count"], 0, 255),
-        whole_number(found["timeout_ns"], MS, 65_536 * MS),
-        whole_number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
-        protocol_named(found.get("protocol")).name,  # not in captures of 0.5.0
-    )
-
-
-def _text(value: Any, longest: int) -> str:
-    if not isinstance(value, str) or len(value) > longest or not value.isprintable():
-        raise HeaderError(f"{str(value)[:40]!r} is not a text of at most {longest} characters")
-    return value
-
-
 def _check(header: Header) -> None:
     """Check the parts that readers use unchanged. HeaderError for what a recorder never writes."""
     for name, latest in (
@@ -260,7 +214,7 @@ def _check(header: Header) -> None:
         if header.get(name) is not None:
             whole_number(header[name], 0, latest)
     for name in ("run", "file"):
-        _text(header.get(name, ""), 4096)
+        short_text(header.get(name, ""), 4096)
     whole_number(header.get("part", 0), 0, 1 << 32)
     for name, kind in _KINDS.items():
         if not isinstance(header.get(name, kind()), kind):
@@ -282,6 +236,6 @@ def _node(found: Mapping[str, Any]) -> "NodeSettings":
         bool(found["read_only"]),
         whole_number(found["bitrate"], 1, 100_000_000),
         whole_number(found["segment_ns"], 0, _LATEST),
-        _text(found["version"], 100),
+        short_text(found["version"], 100),
         None if device is None else whole_number(device, 0, 0xFFFF),
     )

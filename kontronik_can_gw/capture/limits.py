@@ -4,16 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from kontronik_can_gw.capture.format import COUNTERS
+from kontronik_can_gw.core.header_parts import whole_number
 
 END_OF_TIME = 1 << 61
 """ns. Later times are not from a gateway; sums of earlier ones stay within 64 bits."""
 MAX_COUNT = 1 << 48
 """Of a counter, and of mW s: at 1 Mbit/s more than a human life."""
 _MAX_MW_NS = MAX_COUNT * 1_000_000_000
-
-
-class HeaderError(ValueError):
-    """A header that no recorder has written. The text is for users."""
 
 
 def check_time(time_ns: int) -> None:
@@ -29,15 +26,6 @@ def check_counters(counters: Sequence[int]) -> None:
     check_time(counters[-1])
     if max(counters[:-1]) >= MAX_COUNT:
         raise ValueError(f"counter {max(counters[:-1])}")
-
-
-def whole_number(value: Any, low: int, high: int) -> int:
-    """Return a number of a header. HeaderError if it is not a whole number in this range."""
-    if isinstance(value, str) and len(value) < 20 and value.isdecimal():
-        value = int(value)
-    if type(value) is not int or not low <= value <= high:
-        raise HeaderError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
-    return value
 
 
 _LIMITS_OF_ESC = {"energy": _MAX_MW_NS, "run_time": END_OF_TIME - 1, "losses": MAX_COUNT - 1}

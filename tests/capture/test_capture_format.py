@@ -36,7 +36,7 @@ from kontronik_can_gw.capture.format import (
     read_frame,
     read_numbers,
 )
-from kontronik_can_gw.capture.limits import HeaderError
+from kontronik_can_gw.core.header_parts import HeaderError
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame

@@ -1,0 +1,93 @@
+"""Parts of a capture's header that several modules read: numbers, texts, files and ESCs.
+
+A header can be damaged or hostile, so every part is checked. The JSON form is described in
+``assembly/capture_setup.py``.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from fractions import Fraction
+from typing import Any
+
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.protocols import protocol_named
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.times import MS
+
+_UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
+"""Errors of Python if a part of a header is missing or has another type."""
+_MAX_NAME = 12
+"""Maximum length of an ESC's name."""
+_MAX_GEAR = 10**12
+
+
+class HeaderError(ValueError):
+    """A header that no recorder has written. The text is for users."""
+
+
+@contextmanager
+def reading(part: str) -> Iterator[None]:
+    """Turn errors of Python into a HeaderError that names this part of the header."""
+    try:
+        yield
+    except (HeaderError, UserError):
+        raise
+    except KeyError as error:
+        raise HeaderError(f"{part}: {str(error.args[0])[:40]!r} is missing") from None
+    except _UNUSABLE:
+        raise HeaderError(f"{part} is not as a recorder writes it") from None
+
+
+def whole_number(value: Any, low: int, high: int) -> int:
+    """Return a number of a header. HeaderError if it is not a whole number in this range."""
+    if isinstance(value, str) and len(value) < 20 and value.isdecimal():
+        value = int(value)
+    if type(value) is not int or not low <= value <= high:
+        raise HeaderError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
+    return value
+
+
+def short_text(value: Any, longest: int) -> str:
+    """Return a text of a header. HeaderError if it is too long or not printable."""
+    if not isinstance(value, str) or len(value) > longest or not value.isprintable():
+        raise HeaderError(f"{str(value)[:40]!r} is not a text of at most {longest} characters")
+    return value
+
+
+def file_bytes(text: str, part: str) -> bytes:
+    """Return the bytes of a file that a header holds, one character a byte."""
+    try:
+        return text.encode("latin-1")
+    except UnicodeEncodeError as error:
+        character = text[error.start]
+        raise HeaderError(
+            f"{part}: the text of the file has {character!r}, but each character stands for one byte"
+        ) from None
+
+
+def esc_json(esc: EscSettings) -> dict[str, Any]:
+    """Return the JSON form of an ESC's settings."""
+    return asdict(esc) | {"gear": str(esc.gear)}
+
+
+def esc_of(found: Mapping[str, Any]) -> EscSettings:
+    """Read the settings of an ESC.
+
+    They must be in the ranges of the configuration, or in those that a CANopen master may write.
+    """
+    numerator, _, denominator = found["gear"].partition("/")
+    gear = Fraction(
+        whole_number(numerator, 1, _MAX_GEAR),
+        whole_number(denominator or "1", 1, _MAX_GEAR),
+    )
+    return EscSettings(
+        name=short_text(found["name"], _MAX_NAME),
+        pole_pairs=whole_number(found["pole_pairs"], 1, 0xFFFF),
+        gear=gear,
+        cell_count=whole_number(found["cell_count"], 0, 255),
+        timeout_ns=whole_number(found["timeout_ns"], MS, 65_536 * MS),
+        crc_error_threshold=whole_number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
+        # Captures of 0.5.0 name no protocol.
+        protocol=protocol_named(found.get("protocol")).name,
+    )
