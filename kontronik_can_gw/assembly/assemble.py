@@ -4,36 +4,29 @@ All mistakes are reported at once.
 """
 
 import os
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw import __version__
+from kontronik_can_gw.assembly.this_machine import ThisMachine, parameter_folder
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
-from kontronik_can_gw.core.output_setup import OUTPUTS, Given, OutputSetup, setup_of
+from kontronik_can_gw.core.output_setup import OUTPUTS, Machine, OutputSetup, setup_module
 from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupplied
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.runtime.can.open_can import check_interface
-from kontronik_can_gw.runtime.system.machine import identity_digest
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import UNCONFIGURED
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
-    from kontronik_can_gw.canopen.nodes import CanopenSetup
-    from kontronik_can_gw.canopen.storage import Stored
     from kontronik_can_gw.runtime.files.store import ParameterStore
-
-
-_NODES = "the CANopen nodes"
 
 
 @contextmanager
@@ -75,8 +68,6 @@ class Loaded:
     database: "Database | None"
     """The DBC, parsed. None without the DBC output."""
     layout: Layout
-    canopen: "CanopenSetup | None"
-    """None without CANopen nodes."""
     damaged: tuple[tuple[int, str], ...]
     """Index of each ESC whose stored parameters cannot be read, and the reason."""
     store: "ParameterStore | None"
@@ -84,7 +75,7 @@ class Loaded:
     dbc: bytes = b""
     """Content of the DBC file."""
     outputs: tuple[OutputSetup, ...] = ()
-    """Setups of the outputs other than DBC and CANopen."""
+    """Setups of the outputs besides the DBC."""
 
 
 def load_configuration(
@@ -106,8 +97,6 @@ def load_configuration(
         raise UserError(*problems)
     if store is None or not config.canopen.enabled:
         return assemble(config)
-    from kontronik_can_gw.assembly.canopen_nodes import parameter_folder
-
     return assemble(config, store(parameter_folder(config)))
 
 
@@ -134,99 +123,26 @@ def check_devices(config: Config) -> None:
         raise UserError(*problems)
 
 
-def _outputs(
-    config: Config, problems: list[str], taken: dict[int, str], bits: dict[str, float]
-) -> tuple[OutputSetup, ...]:
-    """Return the setups of the enabled outputs of ``OUTPUTS``.
+def _configured(config: Config, machine: Machine, problems: list[str]) -> list[OutputSetup]:
+    """Return the setups of the enabled outputs, without stored parameters.
 
-    Adds mistakes in their tables to ``problems``, their CAN ids to ``taken``, and the bits per
-    second that they need to ``bits``.
+    Adds mistakes in their tables and files to ``problems``.
     """
-    found = []
+    setups = []
     for name in OUTPUTS:
-        table = getattr(config, name)
-        if not table.enabled:
-            continue
-        major, minor, *_ = map(int, re.findall(r"\d+", __version__))
-        seed = int.from_bytes(os.urandom(8), "big")
-        given = Given(table, identity_digest(), (major, minor), seed)
-        try:
-            setup = setup_of(name, given, config.escs)
-        except UserError as error:
-            problems += [f"{config.file}: {problem}" for problem in error.problems]
-            continue
-        taken |= setup.taken_ids()
-        bits[setup.title] = setup.traffic()[1]
-        found.append(setup)
-    return tuple(found)
+        if getattr(config, name).enabled:
+            with collecting(problems):
+                setups.append(setup_module(name).configured(config, machine))
+    return setups
 
 
-def _load_warning(
-    config: Config, layout: Layout, bits: Mapping[str, float], worst: Mapping[str, float]
-) -> str | None:
-    """Return a warning of the bus load. ``worst`` has the outputs whose worst load differs."""
+def _load_warning(config: Config, layout: Layout, setups: Sequence[OutputSetup]) -> list[str]:
+    """Return a warning of the bus load in a list, or an empty list. UserError if it is too high."""
     can = config.can
-    return check_load(layout, can.bitrate, can.data_bitrate, bits, {**bits, **worst})
-
-
-@dataclass
-class _NodesRead:
-    """CANopen nodes before their stored parameters are checked."""
-
-    plain: "CanopenSetup"
-    """The nodes without stored parameters."""
-    stored: "list[Stored]"
-    damaged: list[tuple[int, str]]
-    warnings: list[str]
-
-
-def _read_nodes(
-    config: Config,
-    store: "ParameterStore | None",
-    problems: list[str],
-    taken: dict[int, str],
-    bits: dict[str, float],
-    worst: dict[str, float],
-) -> _NodesRead | None:
-    """Read EDS and stored parameters of the CANopen nodes. None without nodes or with problems.
-
-    Adds mistakes, COB-IDs and bits per second as ``_outputs`` does. ``worst`` has the worst load.
-    """
-    if not config.canopen.enabled:
-        return None
-    # Imported only here, so that a start without nodes stays short.
-    from kontronik_can_gw.assembly import canopen_nodes
-
-    with collecting(problems):
-        plain = canopen_nodes.plain_setup(config)
-        escs = plain.esc_settings(config.escs)
-        cob_ids, bits[_NODES], worst[_NODES] = canopen_nodes.needs(plain, escs)
-        taken |= cob_ids
-    if problems:
-        return None
-    stored, damaged, warnings = canopen_nodes.read_stored(config, store)
-    return _NodesRead(plain, stored, damaged, warnings)
-
-
-def _apply_stored(
-    config: Config,
-    read: _NodesRead,
-    layout: Layout,
-    escs: list[EscSettings],
-    bits: dict[str, float],
-    worst: dict[str, float],
-) -> tuple["CanopenSetup", list[str]]:
-    """Return the nodes with the stored parameters that fit, and all warnings about these.
-
-    Updates the usual and the worst bits per second that the nodes need.
-    """
-    from kontronik_can_gw.assembly import canopen_nodes
-
-    foreign = {each.can_id: each.name for each in layout.messages if not each.extended}
-    setup, warnings = canopen_nodes.with_stored(read.plain, read.stored, config, escs, foreign)
-    if setup.stored != read.plain.stored:
-        _, bits[_NODES], worst[_NODES] = canopen_nodes.needs(setup, escs)
-    return setup, [*warnings, *read.warnings]
+    usual = {setup.title: setup.traffic()[1] for setup in setups}
+    worst = {setup.title: setup.traffic(is_worst=True)[1] for setup in setups}
+    warning = check_load(layout, can.bitrate, can.data_bitrate, usual, worst)
+    return [] if warning is None else [warning]
 
 
 @dataclass
@@ -260,40 +176,43 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     fit them are ignored with a warning. Without a store, their files are read and not changed.
     """
     problems: list[str] = []
-    taken: dict[int, str] = {}
-    bits: dict[str, float] = {}
-    worst: dict[str, float] = {}
     with collecting(problems):
         check_devices(config)
-    nodes = _read_nodes(config, store, problems, taken, bits, worst)
+    machine = ThisMachine(config, store)
+    configured = _configured(config, machine, problems)
+    outputs = configured
+    if not problems:
+        outputs = [setup.with_stored(machine) for setup in configured]
     escs = config.escs
-    if nodes is not None:
-        escs = replace(nodes.plain, stored=tuple(nodes.stored)).esc_settings(config.escs)
-    outputs = _outputs(config, problems, taken, bits)
+    taken: dict[int, str] = {}
+    for with_stored in outputs:
+        escs = with_stored.esc_settings(escs)
+    for setup in configured:
+        taken |= setup.taken_ids()
     dbc = _compile_dbc(config, escs, problems, taken)
     if problems:
         raise UserError(*problems)
-    load_warning = _load_warning(config, dbc.layout, bits, worst)
-    canopen = None
+    load_warning = _load_warning(config, dbc.layout, configured)
+    message_ids = {each.can_id: each.name for each in dbc.layout.messages if not each.extended}
+    outputs = [setup.fitted(message_ids) for setup in outputs]
     warnings: list[str] = []
-    if nodes is not None:
-        canopen, warnings = _apply_stored(config, nodes, dbc.layout, escs, bits, worst)
+    if outputs != configured:
         # Stored parameters that overload the bus do not prevent a start.
         with collecting(warnings):
-            load_warning = _load_warning(config, dbc.layout, bits, worst)
-    for output in outputs:
-        warnings += [f"{config.file}: {text}" for text in output.warnings(config.can.bitrate)]
+            load_warning = _load_warning(config, dbc.layout, outputs)
+    damaged: list[tuple[int, str]] = []
+    for fitted in outputs:
+        warnings += fitted.warnings(config.file, config.can.bitrate)
+        damaged += fitted.faults
     mute = [*unreported(dbc.layout, config.dbc.silent_on_loss), *unsupplied(dbc.layout, escs)]
-    load_warnings = [] if load_warning is None else [load_warning]
     return Loaded(
         config=config,
         escs=escs,
         database=dbc.database,
         layout=dbc.layout,
-        canopen=canopen,
-        damaged=() if nodes is None else tuple(nodes.damaged),
+        damaged=tuple(damaged),
         store=store,
-        warnings=(*config.warnings, *dbc.warnings, *mute, *load_warnings, *warnings),
+        warnings=(*config.warnings, *dbc.warnings, *mute, *load_warning, *warnings),
         dbc=dbc.content,
-        outputs=outputs,
+        outputs=tuple(outputs),
     )

@@ -14,7 +14,7 @@ JSON keys of the header (run and recorder add created_ns, run, part, monotonic_n
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
@@ -31,7 +31,7 @@ from kontronik_can_gw.core.header_parts import (
     short_text,
     whole_number,
 )
-from kontronik_can_gw.core.output_setup import OUTPUTS, Given, OutputSetup, setup_of
+from kontronik_can_gw.core.output_setup import OUTPUTS, OutputSetup, setup_module
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
@@ -42,11 +42,10 @@ from kontronik_can_gw.signals.plan import Layout
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
-    from kontronik_can_gw.canopen.node_settings import NodeSettings
-    from kontronik_can_gw.canopen.nodes import CanopenSetup
-
 Header = Mapping[str, Any]
-_LATEST, _SEEDS = 1 << 62, (1 << 64) - 1
+_LATEST = 1 << 62
+_IN_HEADER = ("canopen",)
+"""Outputs that stand in the header itself, as in captures of 0.5.0. The others are in "outputs"."""
 _DBC_KEYS = {
     f.name: {"e2e_data_ids": "data_ids", "send_type": "send_types"}.get(f.name, f.name)
     for f in fields(DbcConfig)
@@ -65,7 +64,6 @@ class CaptureSetup:
     dbc: tuple[str, bytes] | None
     dbc_settings: DbcConfig
     fd: bool
-    canopen: "CanopenSetup | None"
     configuration: str = ""
     file: str = ""
     version: int = VERSION
@@ -80,6 +78,7 @@ class CaptureSetup:
             dbc = {"file": name, "text": data.decode("latin-1"), "fd": self.fd}
             dbc["silent_on_loss"] = self.dbc_settings.silent_on_loss
             dbc |= {name: getattr(self.dbc_settings, key) for key, name in _DBC_KEYS.items()}
+        outputs = {setup.name: setup.header() for setup in self.outputs}
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -93,8 +92,8 @@ class CaptureSetup:
             "escs": [esc_json(esc) for esc in self.escs],
             "ports": list(self.ports),
             "dbc": dbc,
-            "canopen": None if self.canopen is None else _canopen_json(self.canopen),
-            "outputs": {setup.name: _output_json(setup.given) for setup in self.outputs},
+            **{name: outputs.pop(name, None) for name in _IN_HEADER},
+            "outputs": outputs,
         }
 
     @classmethod
@@ -121,7 +120,6 @@ class CaptureSetup:
             with reading("dbc"):
                 file = (str(dbc["file"]), file_bytes(dbc["text"], "dbc"))
                 settings = _dbc_settings(dbc)
-        found = header["canopen"]
         with reading("escs"):
             escs = tuple(esc_of(esc) for esc in header["escs"])
         return cls(
@@ -130,11 +128,10 @@ class CaptureSetup:
             file,
             settings,
             bool(dbc and dbc["fd"]),
-            None if found is None else _canopen(found),
             str(header["configuration"]),
             str(header["file"]),
             header["version"],
-            tuple(_output(name, of, escs) for name, of in header.get("outputs", {}).items()),
+            _outputs_of(header, escs),
         )
 
     def database(self) -> tuple["Database", Layout] | None:
@@ -147,52 +144,20 @@ class CaptureSetup:
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """The gateway in its state before the start."""
-        return Gateway(
-            *(self.escs, layout, now, self.dbc_settings.silent_on_loss, self.canopen),
-            further=[setup.make for setup in self.outputs],
-        )
+        return Gateway(self.escs, layout, now, self.dbc_settings.silent_on_loss, self.outputs)
 
 
-def _canopen_json(setup: "CanopenSetup") -> dict[str, Any]:
-    from kontronik_can_gw.canopen.storage import encode
-
-    return {
-        "eds": {"file": setup.eds.name, "text": setup.eds.data.decode("latin-1")},
-        "nodes": [asdict(node) for node in setup.settings],
-        "stored": [encode(stored).decode("ascii") for stored in setup.stored],
-        "escs": [esc_json(esc) for esc in setup.escs],
-    }
-
-
-def _canopen(found: Mapping[str, Any]) -> "CanopenSetup":
-    from kontronik_can_gw.canopen.eds import load as eds_of
-    from kontronik_can_gw.canopen.nodes import CanopenSetup
-    from kontronik_can_gw.canopen.storage import decode
-
-    with reading("canopen"):
-        eds = eds_of(file_bytes(found["eds"]["text"], "canopen.eds"), found["eds"]["file"])
-    with reading("canopen.nodes"):
-        nodes = tuple(_node(node) for node in found["nodes"])
-    with reading("canopen.stored"):
-        stored = tuple(decode(text.encode("ascii")) for text in found["stored"])
-    with reading("canopen.escs"):
-        return CanopenSetup(eds, nodes, stored, tuple(esc_of(esc) for esc in found["escs"]))
-
-
-def _output_json(given: Given) -> dict[str, Any]:
-    return given._asdict() | {"table": asdict(given.table), "identity": given.identity.hex()}
-
-
-def _output(name: str, found: Mapping[str, Any], escs: Sequence[EscSettings]) -> OutputSetup:
-    """Settings checked like those of a configuration."""
-    if name not in OUTPUTS:
-        raise HeaderError(f"{str(name)[:40]!r} is no output that this version knows")
-    with reading(f"outputs.{name}"):
-        table = getattr(parse({name: found["table"], "esc": [{"port": "-"}]}, "the capture"), name)
-        identity = bytes.fromhex(found["identity"])
-        seed = whole_number(found["seed"], 0, _SEEDS)
-        major, minor = (whole_number(each, 0, 255) for each in found["version"])
-        return setup_of(name, Given(table, identity, (major, minor), seed), escs)
+def _outputs_of(header: Header, escs: Sequence[EscSettings]) -> tuple[OutputSetup, ...]:
+    """Read the outputs of a header."""
+    found = dict(header.get("outputs", {}))
+    for name in found:
+        if name not in OUTPUTS:
+            raise HeaderError(f"{str(name)[:40]!r} is no output that this version knows")
+    for name in _IN_HEADER:
+        if header[name] is not None:
+            found[name] = header[name]
+    names = [name for name in OUTPUTS if name in found]
+    return tuple(setup_module(name).recorded(found[name], escs) for name in names)
 
 
 def _dbc_settings(found: Mapping[str, Any]) -> DbcConfig:
@@ -222,20 +187,3 @@ def _check(header: Header) -> None:
     if not 1 <= len(header["escs"]) <= 1000 or not isinstance(header["configuration"], str):
         raise HeaderError("escs or configuration is not as a recorder writes it")
     check_state(header.get("state", {}))
-
-
-def _node(found: Mapping[str, Any]) -> "NodeSettings":
-    from kontronik_can_gw.canopen.node_settings import NodeSettings
-
-    device, vendor = found["device"], found["vendor_id"]
-    return NodeSettings(
-        whole_number(found["node_id"], 1, 255),
-        whole_number(found["serial"], 0, 0xFFFF_FFFF),
-        None if vendor is None else whole_number(vendor, 0, 0xFFFF_FFFF),
-        bool(found["self_start"]),
-        bool(found["read_only"]),
-        whole_number(found["bitrate"], 1, 100_000_000),
-        whole_number(found["segment_ns"], 0, _LATEST),
-        short_text(found["version"], 100),
-        None if device is None else whole_number(device, 0, 0xFFFF),
-    )

@@ -14,17 +14,14 @@ from kontronik_can_gw.canopen.eds import (
     Entry,
     range_of,
 )
-from kontronik_can_gw.canopen.node_settings import NodeSettings, configured_settings
-from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
+from kontronik_can_gw.canopen.node_settings import NodeSettings, NodeSetup, configured_settings
+from kontronik_can_gw.canopen.nodes import nodes_alone
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAPPING, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import CHECKED, Stored
 from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROFILE
-from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.core.slots import Slots
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.status import GatewayStatus
 
 Place = tuple[int, int]
 Mistake = tuple[Entry, str]
@@ -130,9 +127,8 @@ def _settings(entries: Mapping[Place, Entry], escs: Sequence[EscSettings]) -> It
 
 def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     """Defaults that a download would be refused: of single services, then of the PDOs."""
-    setup = CanopenSetup(eds, (NodeSettings(node_id),), (Stored(),))
-    escs, status = [EscStream(settings, 0)], GatewayStatus()
-    node = Nodes(setup, escs, status, Slots(escs, status).add, lambda *_: None).nodes[0]
+    setup = NodeSetup(eds, NodeSettings(node_id), Stored())
+    node = nodes_alone([setup], [settings], {}).nodes[0]
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():

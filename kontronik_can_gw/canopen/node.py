@@ -15,9 +15,10 @@ from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects
 from kontronik_can_gw.canopen.lss import Identity, LssSlave
 from kontronik_can_gw.canopen.nmt import Consumer, Nmt, Producer
+from kontronik_can_gw.canopen.node_settings import NodeSetup
 from kontronik_can_gw.canopen.pdo import Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
-from kontronik_can_gw.canopen.storage import Parameters, Stored
+from kontronik_can_gw.canopen.storage import Parameters, Stored, encode
 from kontronik_can_gw.canopen.sync import SyncConsumer
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
@@ -25,7 +26,7 @@ from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus, NmtState
 from kontronik_can_gw.times import NEVER
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
+    from kontronik_can_gw.canopen.nodes import Nodes
 
 _WITH_COB_ID = frozenset({0x1005, 0x1014, 0x1016, *range(0x1800, 0x1A00)})
 """Objects whose download may change COB-IDs."""
@@ -37,15 +38,15 @@ class Node:
     def __init__(
         self,
         number: int,
-        setup: "CanopenSetup",
+        setup: NodeSetup,
         esc: EscTelemetry,
         gateway: GatewayStatus,
         owner: "Nodes",
     ) -> None:
         self.esc = esc
-        base = setup.escs[number] if setup.escs else esc.settings
-        self.dictionary = dictionary = setup.dictionary(number, base)
-        self.settings = settings = setup.settings[number]
+        base = esc.settings if setup.base is None else setup.base
+        self.dictionary = dictionary = setup.dictionary(base)
+        self.settings = settings = setup.settings
         self._number = number
         self.due = NEVER
         self._owner = owner
@@ -57,7 +58,7 @@ class Node:
         self.consumer = Consumer(dictionary, self._watch_changed)
         self.sync = SyncConsumer(dictionary, taken)
         self.sdo = SdoServer(dictionary, self._send_sdo, settings.segment_ns)
-        self.parameters = Parameters(dictionary, setup.stored[number], self.sdo, self._save)
+        self.parameters = Parameters(dictionary, setup.stored, self.sdo, self._save)
         self.identity = Identity(
             dictionary,
             settings,
@@ -165,7 +166,7 @@ class Node:
         self._owner.send(CanFrame(cob_id, data, queued=True))
 
     def _save(self, stored: Stored) -> None:
-        self._owner.save(self._number, stored)
+        self._owner.save(self._number, encode(stored))
 
     def _send_sdo(self, data: bytes) -> None:
         self._send(SDO_ANSWER + self.node_id, data)

@@ -86,3 +86,21 @@ def make_dictionary(
     dictionary.read_only = settings.read_only
     dictionary.reset(APPLICATION, settings.node_id, stored.application)
     return dictionary
+
+
+@dataclass(frozen=True)
+class NodeSetup:
+    """Everything from which one node is made."""
+
+    eds: Eds
+    settings: NodeSettings
+    stored: Stored
+    base: EscSettings | None = None
+    """The configured settings of the ESC. None if the ESC has them still."""
+
+    def dictionary(self, esc: EscSettings) -> Dictionary:
+        """Return the dictionary of the node before its first reset.
+
+        ``esc`` are the ESC's settings, from which 2100h is made.
+        """
+        return make_dictionary(self.eds, esc, self.settings, self.stored)

@@ -1,8 +1,7 @@
 """All CANopen nodes of a gateway on one bus: routing by COB-ID, one stream of frames out, no node disturbing another."""
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 from kontronik_can_gw.canopen.cob_ids import (
     HEARTBEAT,
@@ -14,87 +13,31 @@ from kontronik_can_gw.canopen.cob_ids import (
     routes,
     uses,
 )
-from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import ALL_NODES, RESETS, command
 from kontronik_can_gw.canopen.node import Node
-from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
-from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
-from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.core.output import LogLine, NodeOutput, NodeState, Owner
-from kontronik_can_gw.core.slots import Slot, Slots
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
+from kontronik_can_gw.canopen.node_settings import NodeSetup
+from kontronik_can_gw.core.output import LogLine, NodeOutput, NodeState, OutputHost, Owner
+from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.signals.plan import classic_bits
-from kontronik_can_gw.status import UNCONFIGURED, CanState, GatewayStatus, name_in_words
+from kontronik_can_gw.signals.plan import Layout, classic_bits
+from kontronik_can_gw.status import UNCONFIGURED, CanState, name_in_words
 from kontronik_can_gw.times import NEVER, SECOND
-
-SettingsChanged = Callable[[int, EscSettings], None]
-
-
-@dataclass(frozen=True)
-class CanopenSetup:
-    """What nodes are made from: the EDS in use, and for each ESC what the configuration says and what is stored.
-
-    ``escs``: the ESCs as the configuration says, which is what 2100h is restored to; empty: as the gateway is given them.
-    """
-
-    eds: Eds
-    settings: tuple[NodeSettings, ...]
-    stored: tuple[Stored, ...]
-    escs: tuple[EscSettings, ...] = ()
-
-    @property
-    def pdos(self) -> int:
-        """Number of transmit PDOs of a node."""
-        indices = {entry.index for entry in self.eds.entries}
-        return len(indices.intersection(range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)))
-
-    def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
-        """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""
-        return [esc_settings(self.dictionary(n, esc), esc) for n, esc in enumerate(escs)]
-
-    def dictionary(self, number: int, esc: EscSettings) -> Dictionary:
-        """The dictionary of a node before its first reset."""
-        return make_dictionary(self.eds, esc, self.settings[number], self.stored[number])
-
-    def nodes(
-        self, escs: Sequence[EscSettings], foreign_ids: Mapping[int, str] | None = None
-    ) -> "Nodes":
-        """The nodes as they are after power-on, without a gateway around them: to see their COB-IDs and objects."""
-        telemetry = [EscStream(settings, 0) for settings in escs]
-        status = GatewayStatus()
-        slots = Slots(telemetry, status)
-        nodes = Nodes(self, telemetry, status, slots.add, lambda *_: None, foreign_ids)
-        nodes.start(0, can_open=True)
-        return nodes
 
 
 class Nodes(NodeOutput):
-    """One node for each ESC. ``slot`` gives a further slot of the core for an ESC.
+    """One node for each ESC. No PDO may have an id in ``host.own_ids``."""
 
-    ``foreign_ids``: 11-bit ids that the gateway sends otherwise; no PDO may be given one. ``settings_changed`` is called
-    with the ESC's index and its new settings when a master writes 2100h.
-    """
-
+    node_title = "CANopen node"
     events = Event.LINK | Event.STATE
 
-    def __init__(
-        self,
-        setup: CanopenSetup,
-        escs: Sequence[EscTelemetry],
-        gateway: GatewayStatus,
-        slot: Callable[[int], Slot],
-        settings_changed: SettingsChanged,
-        foreign_ids: Mapping[int, str] | None = None,
-    ) -> None:
+    def __init__(self, setups: Sequence[NodeSetup], host: OutputHost) -> None:
         super().__init__()
         self.due = NEVER
-        self.slot = slot
-        self.settings_changed = settings_changed
-        self._foreign_ids = foreign_ids or {}
+        self.slot = host.slot
+        self.settings_changed = host.apply
+        self._foreign_ids = host.own_ids
         self._routes: dict[int, list[FrameTaker]] = {}
         self.rerouted = True
         """A node uses other COB-IDs now."""
@@ -103,7 +46,10 @@ class Nodes(NodeOutput):
         self._to_watchers: deque[CanFrame] = deque()
         self._started = False
         self._reported: list[NodeState] = []
-        self.nodes = [Node(n, setup, esc, gateway, self) for n, esc in enumerate(escs)]
+        self.nodes = [
+            Node(number, setup, esc, host.status, self)
+            for number, (setup, esc) in enumerate(zip(setups, host.escs, strict=True))
+        ]
         self._can_faults = _CanFaults(self.nodes)
 
     # --- what happens
@@ -343,3 +289,15 @@ class _CanFaults:
             self._next_overrun = now + SECOND
             for node in self._nodes:
                 node.emergencies.pulse(GatewayError.RECEIVE_OVERRUN, now)
+
+
+def nodes_alone(
+    setups: Sequence[NodeSetup], escs: Sequence[EscSettings], message_ids: Mapping[int, str]
+) -> Nodes:
+    """Return nodes without a gateway, to read their COB-IDs and objects.
+
+    ``message_ids`` are the 11-bit ids that messages use, with their names.
+    """
+    core = PythonCore(escs, Layout("", "", ()), 0, silent=False)
+    core.own_ids = {can_id: Owner(None, name) for can_id, name in message_ids.items()}
+    return Nodes(setups, core)

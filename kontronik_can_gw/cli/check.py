@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.assembly.assemble import Loaded, load_configuration
-from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file, option
-from kontronik_can_gw.cli.common import say, show
+from kontronik_can_gw.cli.common import canopen_setups, say, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.errors import UserError
@@ -45,21 +44,20 @@ def main(args: argparse.Namespace) -> int:
         if _EXAMPLE_PORT in esc.port
     ]
     warnings = [*loaded.layout.warnings, *loaded.warnings, *examples]
-    nodes = None if loaded.canopen is None else loaded.canopen.nodes(loaded.escs)
-    shown = document(path, loaded, nodes, warnings)
+    shown = document(path, loaded, warnings)
     if args.json:
         print(printable_json(shown, indent=2))
         return 0
     for warning in warnings:
         say(f"warning: {warning}")
-    for line in summary(shown, loaded, nodes):
+    for line in summary(shown, loaded):
         show(line)
     for line in details(loaded) if args.verbose else ():
         show(line)
     return 0
 
 
-def summary(shown: dict[str, Any], loaded: Loaded, nodes: Nodes | None) -> Iterator[str]:
+def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     """What the gateway reads and sends, in a few lines that fit 80 columns."""
     config = loaded.config
     found = _counted(len(shown["warnings"]), "warning") if shown["warnings"] else "no warnings"
@@ -78,11 +76,8 @@ def summary(shown: dict[str, Any], loaded: Loaded, nodes: Nodes | None) -> Itera
         span = f", {' to '.join(dict.fromkeys((ids[0], ids[-1])))}" if ids else ""
         yield f"  DBC       {_counted(len(ids), 'message')}{span}, layout {shown['layout']}"
         yield f"            {shown['dbc']}"
-    for node, each in zip(nodes.nodes if nodes else (), loaded.escs, strict=False):
-        sent = f"node {node.node_id}, {_counted(sum(tpdo.valid for tpdo in node.tpdos), 'TPDO')}"
-        yield f"  CANopen   {each.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else sent}"
     for output in loaded.outputs:
-        for line in output.summary():
+        for line in output.summary(loaded.escs):
             yield f"  {line}"
     if (folder := record_folder(config)) is not None:
         yield f"  captures  {in_words(config, folder)}"
@@ -101,7 +96,8 @@ def details(loaded: Loaded) -> Iterator[str]:
 
     yield from ("", *as_toml(loaded.config).splitlines())
     for output in loaded.outputs:
-        yield from ("", *output.lines())
+        if lines := output.lines():
+            yield from ("", *lines)
     if loaded.database is not None:
         bus = BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
         yield from ("", *markdown("What is sent", [], dbc(bus, loaded.escs)).splitlines())
@@ -111,27 +107,25 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def document(
-    path: Path, loaded: Loaded, nodes: Nodes | None, warnings: list[str]
-) -> dict[str, Any]:
+def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
     """The document of ``--json``, and what the text is made of."""
     config, layout = loaded.config, loaded.layout
     can = config.can
     load = layout.bus_load(can.bitrate, can.data_bitrate)
     frames = sum(message.rate_hz for message in layout.messages)
-    traffic = [output.traffic() for output in loaded.outputs]
     worst = layout.bus_load(can.bitrate, can.data_bitrate, is_worst=True)
     worst_frames = sum(message.worst_rate_hz for message in layout.messages)
-    usual_traffic, worst_traffic = [*traffic], [*traffic]
-    if nodes is not None:
-        usual_traffic.append(nodes.traffic())
-        worst_traffic.append(nodes.traffic(is_worst=True))
-    for more, bits in usual_traffic:
+    for output in loaded.outputs:
+        more, bits = output.traffic()
         load += bits / can.bitrate
         frames += more
-    for more, bits in worst_traffic:
+        more, bits = output.traffic(is_worst=True)
         worst += bits / can.bitrate
         worst_frames += more
+    node_ids = []
+    for setup in canopen_setups(loaded):
+        for node in setup.nodes(loaded.escs).nodes:
+            node_ids.append(None if node.node_id == UNCONFIGURED else node.node_id)
     return {
         "file": str(path),
         "mistakes": [],
@@ -145,9 +139,6 @@ def document(
         "worst_frames_per_second": worst_frames,
         "dbc": layout.file,
         "layout": layout.fingerprint,
-        "outputs": {output.name: output.lines() for output in loaded.outputs},
-        "canopen_nodes": [
-            None if node.node_id == UNCONFIGURED else node.node_id
-            for node in (nodes.nodes if nodes else ())
-        ],
+        "outputs": {each.name: lines for each in loaded.outputs if (lines := each.lines())},
+        "canopen_nodes": node_ids,
     }

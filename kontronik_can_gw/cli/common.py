@@ -16,7 +16,7 @@ from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import UserError
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.nodes import CanopenSetup
+    from kontronik_can_gw.canopen.setup import CanopenSetup
     from kontronik_can_gw.runtime.files.store import ParameterStore
 
 
@@ -87,10 +87,18 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[list[str]]:
             signal.signal(number, old)
 
 
+def canopen_setups(loaded: Loaded) -> "list[CanopenSetup]":
+    """Return the CANopen setup of a configuration in a list, which is empty without nodes."""
+    from kontronik_can_gw.canopen.setup import CanopenSetup
+
+    return [setup for setup in loaded.outputs if isinstance(setup, CanopenSetup)]
+
+
 def canopen_of(loaded: Loaded) -> "CanopenSetup":
-    """The CANopen setup of a configuration. UserError where it has no nodes."""
-    if loaded.canopen is None:
+    """Return the CANopen setup of a configuration. UserError if it has no nodes."""
+    setups = canopen_setups(loaded)
+    if not setups:
         raise UserError(
             f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true."
         )
-    return loaded.canopen
+    return setups[0]

@@ -5,8 +5,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.canopen.dbc import pdo_text, waiting_for_lss
+from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
 from kontronik_can_gw.cli.output import configuration_files, write_output

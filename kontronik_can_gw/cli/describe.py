@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
+from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.cli.arguments import OUTPUT, option
-from kontronik_can_gw.cli.common import announced_config, load_all
+from kontronik_can_gw.cli.common import announced_config, canopen_setups, load_all
 from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
@@ -65,7 +65,7 @@ def _tables(args: argparse.Namespace) -> list[Table]:
         loaded = load_all(args.config)
         escs, found = loaded.escs, loaded.database
         bus = [BusLayout(found, loaded.layout, escs, loaded.config)] if found else []
-        nodes = [loaded.canopen] if loaded.canopen else []
+        nodes = canopen_setups(loaded)
     return [
         *(table for each in bus for table in dbc(each, escs)),
         *(table for each in nodes for table in objects(each, escs)),

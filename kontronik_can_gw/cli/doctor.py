@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.assembly.assemble import Loaded, assemble
-from kontronik_can_gw.assembly.canopen_nodes import parameter_folder
+from kontronik_can_gw.assembly.this_machine import parameter_folder
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.cli.recording import record_folder

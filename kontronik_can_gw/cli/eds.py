@@ -3,13 +3,12 @@
 import argparse
 from pathlib import Path
 
-from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dcf import dcf
 from kontronik_can_gw.canopen.dictionary import SdoAbort, Value
 from kontronik_can_gw.canopen.node import Node
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.canopen.setup import CanopenSetup, shipped_canopen
 from kontronik_can_gw.canopen.storage import VERIFY
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all

@@ -38,10 +38,7 @@ def recorded(
     assert folder is not None
     recorder = Recorder(folder, loaded.config.record)
     recorder.words = in_words(loaded.config, folder)
-    gateway = RecordedGateway(
-        *(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.canopen),
-        further=[setup.make for setup in loaded.outputs],
-    )
+    gateway = RecordedGateway(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.outputs)
     known = {
         "created_ns": now,
         "state": state_of(gateway),
@@ -61,7 +58,6 @@ def setup_of(loaded: Loaded) -> CaptureSetup:
         dbc,
         config.dbc,
         config.can.fd,
-        loaded.canopen,
         as_toml(config),
         config.file,
         outputs=loaded.outputs,

@@ -112,7 +112,7 @@ class _Run:
         program = program_facts(path)
         # what cantools made of the DBC is not needed any more, and leaves its memory to the core
         loaded = replace(load_all(path, _parameter_store), database=None)
-        if loaded.canopen is not None:
+        if loaded.outputs:
             gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config
         wait = self._args.wait or config.run.wait_for_devices
@@ -156,8 +156,7 @@ class _Run:
             return recorded(loaded, self._args.record, now, silent)
         from kontronik_can_gw.gateway.gateway import Gateway
 
-        further = [setup.make for setup in loaded.outputs]
-        return Gateway(loaded.escs, loaded.layout, now, silent, loaded.canopen, further), None
+        return Gateway(loaded.escs, loaded.layout, now, silent, loaded.outputs), None
 
 
 def _begin_realtime(priority: int | None, wait: bool) -> None:

@@ -193,7 +193,7 @@ def _output_problems(config: Config) -> Iterator[str]:
     if config.canopen.enabled:
         yield from _node_id_problems(config)
     elif not config.dbc.enabled and not any(getattr(config, name).enabled for name in OUTPUTS):
-        names = ", ".join(f"{name}.enabled" for name in ("dbc", "canopen", *OUTPUTS))
+        names = ", ".join(f"{name}.enabled" for name in ("dbc", *OUTPUTS))
         yield f"{names}: all are false, so nothing would be sent. Enable one."
 
 

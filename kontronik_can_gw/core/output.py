@@ -4,17 +4,16 @@ The gateway holds its outputs in a tuple and treats all of them alike. An output
 calls that concern it. The others do nothing. ``now`` is integer nanoseconds of one monotonic clock.
 """
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
-from kontronik_can_gw.esc.telemetry import Event
+from kontronik_can_gw.core.slots import Slot
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.status import CanState, NmtState
+from kontronik_can_gw.status import CanState, GatewayStatus, NmtState
 from kontronik_can_gw.times import NEVER
 
 NO_IDS: frozenset[int] = frozenset()
-SLOTS = 4
-"""Slots that an output may have for each ESC and be sent by the core in C; further ones are sent in Python."""
 
 
 class Owner(NamedTuple):
@@ -24,6 +23,28 @@ class Owner(NamedTuple):
     """The ESC whose node sends with the id, or the first ESC of that node. None without a node."""
     what: str
     """A description for messages, such as "message Voltages"."""
+
+
+class OutputHost(Protocol):
+    """The part of the core that an output may use."""
+
+    @property
+    def escs(self) -> Sequence[EscTelemetry]:
+        """The state of each ESC."""
+
+    @property
+    def status(self) -> GatewayStatus:
+        """The gateway's own values."""
+
+    @property
+    def own_ids(self) -> Mapping[int, Owner]:
+        """The ids of the messages. 29-bit ids contain ``EXTENDED``."""
+
+    def slot(self, esc: int) -> Slot:
+        """Return a new slot of an ESC, from which the core sends measurements itself."""
+
+    def apply(self, esc: int, settings: EscSettings) -> None:
+        """Give an ESC other settings."""
 
 
 class LogLine(NamedTuple):
@@ -90,9 +111,6 @@ class Output:
 
     # --- calls of the gateway
 
-    def take_slots(self, slot: Callable[[int], Any]) -> None:
-        """The gateway is made. ``slot`` gives a further slot of the core (slots.Slot) of an ESC, for frames that need no Python."""
-
     def start(self, now: int, can_open: bool) -> None:
         """Begin to send. ``can_open`` is True if the CAN interface is open."""
 
@@ -140,17 +158,20 @@ class NodeState(NamedTuple):
 class NodeOutput(Output):
     """An output with a node for each ESC, whose parameters a master can change and store."""
 
+    node_title = "node"
+    """The words before a node-ID, for example "CANopen node"."""
+
     def __init__(self) -> None:
         super().__init__()
-        self.saves: list[tuple[int, Any]] = []
+        self.saves: list[tuple[int, bytes]] = []
         """Parameters to store, as pairs of ESC and content. The gateway empties the list.
 
         ``saved`` answers each of them, for one ESC in this order.
         """
 
-    def save(self, esc: int, parameters: Any) -> None:
+    def save(self, esc: int, content: bytes) -> None:
         """Ask the runtime to store the parameters of an ESC's node."""
-        self.saves.append((esc, parameters))
+        self.saves.append((esc, content))
         self.revision += 1
 
     def saved(self, esc: int, error: str | None, now: int) -> None:

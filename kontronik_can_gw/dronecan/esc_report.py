@@ -168,9 +168,9 @@ class EscReport:
 
     # --- measurements
 
-    def take_slots(self, slot: Callable[[int], Slot], number: int) -> None:
-        """``number``: of the ESC."""
-        self._slots = {kind: slot(number) for kind in self._plans if self._rates[kind]}
+    def take_slots(self, slot: Callable[[], Slot]) -> None:
+        """Take a slot for each message that is sent. ``slot`` returns a new slot of the ESC."""
+        self._slots = {kind: slot() for kind in self._plans if self._rates[kind]}
 
     def start(self, node_id: int, place: int, now: int) -> None:
         """Send measurements as this node; ``place`` of the ESC among its."""

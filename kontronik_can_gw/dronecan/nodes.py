@@ -1,23 +1,21 @@
 """The DroneCAN output: the gateway's node, or one for each ESC, on one bus; what a node says of itself, what it answers."""
 
 import struct
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
-from kontronik_can_gw.core.output import LogLine, Output, Owner
-from kontronik_can_gw.core.slots import Slot
+from kontronik_can_gw.core.output import LogLine, Output, OutputHost, Owner
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.allocation import Allocation
 from kontronik_can_gw.dronecan.esc_report import EscReport
+from kontronik_can_gw.dronecan.node_setup import Given, NodeSetup
 from kontronik_can_gw.dronecan.wire import NODE, REQUEST, SERVICE, Assembler, DataType
-from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
-from kontronik_can_gw.status import CanState, GatewayStatus
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import NEVER, SECOND
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.dronecan.setup import DronecanSetup, NodeSetup
 
 SERVICES = {kind.number: kind for kind in (wire.GET_NODE_INFO, wire.RESTART_NODE, wire.GET_SET)}
 _HARDWARE = (1, 0)
@@ -34,16 +32,14 @@ _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
 class Node:
     """``node_id`` 0: it waits for one, and says nothing."""
 
-    def __init__(
-        self, setup: "NodeSetup", of_all: "DronecanSetup", reports: Sequence[EscReport]
-    ) -> None:
+    def __init__(self, setup: NodeSetup, given: Given, reports: Sequence[EscReport]) -> None:
         self.setup = setup
         self.node_id = setup.node_id
         self.reports = [reports[number] for number in setup.escs]
         self.is_duplicate = False
         """Another device sends with this node-ID."""
-        self._table = of_all.given.table
-        self._version = of_all.given.version
+        self._table = given.table
+        self._version = given.version
         self._transfer_ids: dict[int, int] = {}
 
     def start(self, now: int) -> None:
@@ -127,23 +123,23 @@ def _get_set(request: bytes, parameters: dict[str, Parameter]) -> bytes:
 
 
 class Dronecan(Output):
-    """All nodes, and the ESCs that they report."""
+    """All nodes, and the ESCs that they report. ``escs`` of a node are numbers of ``host.escs``."""
 
     name = "dronecan"
     events = Event.STATE
 
-    def __init__(
-        self, setup: "DronecanSetup", escs: Sequence[EscTelemetry], gateway: GatewayStatus
-    ) -> None:
+    def __init__(self, setups: Sequence[NodeSetup], given: Given, host: OutputHost) -> None:
         super().__init__()
-        self._gateway = gateway
-        self._table = table = setup.given.table
-        self._reports = [
-            EscReport(esc, table.first_index + number, table) for number, esc in enumerate(escs)
-        ]
-        self._nodes = [Node(each, setup, self._reports) for each in setup.nodes]
+        self._gateway = host.status
+        self._table = table = given.table
+        self._reports = []
+        for number, esc in enumerate(host.escs):
+            report = EscReport(esc, table.first_index + number, table)
+            report.take_slots(partial(host.slot, number))
+            self._reports.append(report)
+        self._nodes = [Node(setup, given, self._reports) for setup in setups]
         self._by_id: dict[int, Node] = {}
-        self._allocation = Allocation(setup.given.seed)
+        self._allocation = Allocation(given.seed)
         self._assembler = Assembler()
         self._answered = self._unanswered = self._answers = 0
         self._second_due = NEVER
@@ -151,10 +147,6 @@ class Dronecan(Output):
         self._follow_ids()
 
     # --- what happens
-
-    def take_slots(self, slot: Callable[[int], Slot]) -> None:
-        for number, report in enumerate(self._reports):
-            report.take_slots(slot, number)
 
     def start(self, now: int, can_open: bool) -> None:
         self.repeat_measurements(now)

@@ -1,21 +1,27 @@
-"""What the DroneCAN output is made from: its nodes, what it needs of the bus, what is to be said about it."""
+"""The DroneCAN nodes of a configuration or a capture, before they are made."""
 
 from binascii import crc32
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
 
-from kontronik_can_gw.core.output_setup import Given
+from kontronik_can_gw.config.keys import Config
+from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.core.header_parts import reading, whole_number
+from kontronik_can_gw.core.output import OutputHost
+from kontronik_can_gw.core.output_setup import Machine, OutputSetup
 from kontronik_can_gw.dronecan.esc_report import MAX_ESC_INDEX, MAX_RPM, SPEEDS
+from kontronik_can_gw.dronecan.node_setup import Given, NodeSetup
 from kontronik_can_gw.dronecan.nodes import Dronecan
 from kontronik_can_gw.dronecan.wire import MAX_NODE_ID, NODE
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import id_block
 from kontronik_can_gw.signals.plan import classic_bits
-from kontronik_can_gw.status import GatewayStatus
 
 _USUAL_BITRATE = 1_000_000
+_MAX_SEED = (1 << 64) - 1
 _LOWEST_RATE_HZ = 10
 """ArduPilot takes a motor for stopped if it hears nothing of it for 210 ms."""
 _STATUS, _BEC = (8, 8, 3), (8, 6)
@@ -26,26 +32,19 @@ _RESOLUTION = (
 )
 
 
-class NodeSetup(NamedTuple):
-    """One node. ``node_id`` 0: an allocator chooses it; ``escs``: numbers of its ESCs."""
-
-    node_id: int
-    name: str
-    unique_id: bytes
-    escs: tuple[int, ...]
-
-
 @dataclass(frozen=True)
-class DronecanSetup:
-    """OutputSetup; ``given.table`` is a DronecanConfig."""
+class DronecanSetup(OutputSetup):
+    """The nodes of all ESCs."""
 
     given: Given
     escs: tuple[EscSettings, ...]
 
     name = "dronecan"
     title = "the DroneCAN nodes"
+    slots = 4
+    """One for each message in ``esc_report``."""
 
-    @property
+    @cached_property
     def nodes(self) -> tuple[NodeSetup, ...]:
         """The gateway's node, or one for each ESC."""
         table, numbers = self.given.table, tuple(range(len(self.escs)))
@@ -64,8 +63,13 @@ class DronecanSetup:
         checks = crc32(machine + of_name).to_bytes(4, "big") + crc32(of_name).to_bytes(4, "big")
         return checks + machine[:8].ljust(8, b"\0")
 
-    def make(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> Dronecan:
-        return Dronecan(self, escs, gateway)
+    def make(self, host: OutputHost, now: int) -> Dronecan:
+        return Dronecan(self.nodes, self.given, host)
+
+    def header(self) -> dict[str, Any]:
+        given = self.given
+        table, identity = asdict(given.table), given.identity.hex()
+        return given._asdict() | {"table": table, "identity": identity}
 
     def taken_ids(self) -> Mapping[int, str]:
         """Whatever parses as a frame of one of our nodes; of a node-ID that is not known yet, everything."""
@@ -76,14 +80,14 @@ class DronecanSetup:
             for node in self.nodes
         }
 
-    def traffic(self) -> tuple[float, float]:
+    def traffic(self, is_worst: bool = False) -> tuple[float, float]:
         table, escs = self.given.table, len(self.escs)
         rates = [*((size, table.rate_hz * escs) for size in _STATUS), (8, table.extended_hz * escs)]
         rates += [*((size, escs) for size in _BEC), (8, len(self.nodes))]
         bits = sum(rate * classic_bits(size, True) for size, rate in rates)
         return sum(rate for _, rate in rates), bits
 
-    def warnings(self, bitrate: int) -> list[str]:
+    def warnings(self, file: str, bitrate: int) -> list[str]:
         found = []
         if bitrate != _USUAL_BITRATE:
             found.append(
@@ -111,9 +115,9 @@ class DronecanSetup:
                 f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: set pole_pairs in [[esc]], "
                 'or dronecan.rpm = "electrical" if it is one'
             )
-        return found
+        return [f"{file}: {text}" for text in found]
 
-    def summary(self) -> list[str]:
+    def summary(self, escs: Sequence[EscSettings]) -> list[str]:
         first = self.given.table.first_index
         return [
             f"DroneCAN  {f'node {node.node_id}' if node.node_id else 'node-ID by an allocator'}, {node.name}: esc_index "
@@ -145,9 +149,29 @@ class DronecanSetup:
         ]
 
 
-def configured(given: Given, escs: Sequence[EscSettings]) -> DronecanSetup:
-    """The setup. UserError with the mistakes in the table of the configuration."""
-    setup, problems = DronecanSetup(given, tuple(escs)), []
+def configured(config: Config, machine: Machine) -> DronecanSetup:
+    """Return the nodes of a configuration. Raises UserError with every mistake in its table."""
+    given = Given(config.dronecan, machine.identity, machine.version, machine.random_number())
+    try:
+        return _checked(given, config.escs)
+    except UserError as error:
+        raise UserError(*[f"{config.file}: {problem}" for problem in error.problems]) from None
+
+
+def recorded(found: Mapping[str, Any], escs: Sequence[EscSettings]) -> DronecanSetup:
+    """Read the nodes from the header of a capture. The table is checked as in a configuration."""
+    with reading("outputs.dronecan"):
+        tables = {"dronecan": found["table"], "esc": [{"port": "-"}]}
+        table = parse(tables, "the capture").dronecan
+        identity = bytes.fromhex(found["identity"])
+        seed = whole_number(found["seed"], 0, _MAX_SEED)
+        major, minor = [whole_number(each, 0, 255) for each in found["version"]]
+        return _checked(Given(table, identity, (major, minor), seed), escs)
+
+
+def _checked(given: Given, escs: Sequence[EscSettings]) -> DronecanSetup:
+    setup = DronecanSetup(given, tuple(escs))
+    problems = []
     last = setup.nodes[-1].node_id
     if last > MAX_NODE_ID:
         highest = MAX_NODE_ID + 1 - len(setup.nodes)

@@ -3,28 +3,25 @@
 ``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
 """
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
 from kontronik_can_gw.core.interface import Core, Follower
-from kontronik_can_gw.core.output import SLOTS, NodeOutput, NodeState, Output
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.core.output import NodeOutput, NodeState
+from kontronik_can_gw.core.output_setup import OutputMaker
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.status import CanState, GatewayState, GatewayStatus
+from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import NEVER
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
-
-MakeOutput = Callable[[Sequence[EscTelemetry], GatewayStatus, int], Output]
-"""ESCs, gateway and time to an output that begins then."""
 
 
 class Gateway:
-    """One gateway: several ESCs in, one CAN bus out. ``canopen`` None: no CANopen nodes; a layout without messages: only nodes."""
+    """One gateway between several ESCs and one CAN bus.
+
+    ``outputs`` are sent besides the messages of the layout. Each of the two may be empty.
+    """
 
     is_recorded = False
     """True where each call is to be known (capture/recorded_gateway.py)."""
@@ -35,35 +32,27 @@ class Gateway:
         layout: Layout,
         now: int,
         silent_on_loss: bool = False,
-        canopen: "CanopenSetup | None" = None,
-        further: Sequence[MakeOutput] = (),
+        outputs: Sequence[OutputMaker] = (),
     ) -> None:
         self.core: Core
         self.why_python: str
         """Why the core is the one in Python; empty with the one in C."""
-        slots = SLOTS * len(further) + (0 if canopen is None else canopen.pdos)
+        slots = sum([maker.slots for maker in outputs])
         self.core, self.why_python = make_core(escs, layout, now, silent_on_loss, slots)
         self.layout = layout.fingerprint if layout.messages else None
         """Of the messages, as it stands in a DBC that `dbc -c` writes; None without messages."""
         self.escs, self.status = self.core.escs, self.core.status
-        self.nodes: Nodes | None = None
-        if canopen is not None:
-            self.nodes = _nodes(canopen, layout, self.core, self.status)
-        self.outputs: tuple[Output, ...] = (
-            *(() if self.nodes is None else (self.nodes,)),
-            *(make(self.escs, self.status, now) for make in further),
-        )
+        self.outputs = tuple([maker.make(self.core, now) for maker in outputs])
         self.output_frames: list[CanFrame] = []
         """Frames of all outputs, oldest first."""
         for output in self.outputs:
             self.output_frames += output.frames
             output.frames = self.output_frames
-            output.take_slots(self.core.slot)
         self.has_outputs = bool(self.outputs)
         """False: nothing but the layout's messages is sent, and no id to receive ever changes."""
         self.core.followers = [Follower(each.events, each.on_event) for each in self.outputs]
         self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
-        self._node_outputs = [each for each in self.outputs if isinstance(each, NodeOutput)]
+        self.node_outputs = [each for each in self.outputs if isinstance(each, NodeOutput)]
         self._being_saved: list[tuple[int, NodeOutput]] = []
         self._dropped = False
 
@@ -119,10 +108,10 @@ class Gateway:
         for output in self.outputs:
             output.overrun(now)
 
-    def take_saves(self) -> list[tuple[int, Any]]:
+    def take_saves(self) -> list[tuple[int, bytes]]:
         """Parameters to store, (ESC, what), oldest first; each is answered by one call of ``saved`` for that ESC, in this order."""
         found = []
-        for output in self._node_outputs:
+        for output in self.node_outputs:
             if output.saves:
                 found += output.saves
                 self._being_saved += [(esc, output) for esc, _ in output.saves]
@@ -132,7 +121,7 @@ class Gateway:
     def take_rejected_parameters(self) -> list[tuple[int, int]]:
         """Stored values that were rejected at a node's reset: (ESC, index << 8 | sub-index)."""
         found = []
-        for output in self._node_outputs:
+        for output in self.node_outputs:
             found += output.take_rejected_parameters()
         return found
 
@@ -146,7 +135,7 @@ class Gateway:
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """What was stored for an ESC could not be read: its node runs on defaults and reports it."""
-        for output in self._node_outputs:
+        for output in self.node_outputs:
             output.parameters_damaged(esc, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
@@ -233,14 +222,6 @@ class Gateway:
     def node_states(self) -> list[NodeState]:
         """Return the state of each ESC's node. The list is empty without nodes."""
         states = []
-        for output in self._node_outputs:
+        for output in self.node_outputs:
             states += output.node_states()
         return states
-
-
-def _nodes(setup: "CanopenSetup", layout: Layout, core: Core, status: GatewayStatus) -> "Nodes":
-    from kontronik_can_gw.canopen.nodes import Nodes  # nothing of it is loaded without CANopen
-
-    ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
-    # settings that come over the bus hold for everything that is sent, the messages too
-    return Nodes(setup, core.escs, status, core.slot, core.apply, ids)

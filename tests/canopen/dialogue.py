@@ -19,8 +19,9 @@ from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.eds import Eds, load
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings
-from kontronik_can_gw.canopen.nodes import CanopenSetup
-from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.canopen.nodes import Nodes
+from kontronik_can_gw.canopen.setup import CanopenSetup
+from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
@@ -120,7 +121,7 @@ class Bench(Talker):
             tuple(stored or [Stored()] * len(node_ids)),
             base,
         )
-        self.gateway = Gateway(self.setup.esc_settings(base), layout, 0, canopen=self.setup)
+        self.gateway = Gateway(self.setup.esc_settings(base), layout, 0, outputs=[self.setup])
         self.on_disk = list(self.setup.stored)
         self.now = 0
         self.heard: list[tuple[int, CanFrame]] = []
@@ -131,9 +132,14 @@ class Bench(Talker):
             self.take()
 
     @property
+    def output(self) -> Nodes:
+        (output,) = self.gateway.outputs
+        assert isinstance(output, Nodes)
+        return output
+
+    @property
     def nodes(self) -> list[Node]:
-        assert self.gateway.nodes is not None
-        return self.gateway.nodes.nodes
+        return self.output.nodes
 
     def restart(self) -> None:
         """The program ends and starts again with what is on disk; time begins anew."""
@@ -180,12 +186,13 @@ class Bench(Talker):
     def answer_saves(self, error: str | None = None) -> list[tuple[int, Stored]]:
         """Store what waits to be stored, or let it fail."""
         saves = self.gateway.take_saves()
-        for esc, stored in saves:
+        stored = [(esc, decode(content)) for esc, content in saves]
+        for esc, parameters in stored:
             self.gateway.saved(esc, error, self.now)
             if error is None:
-                self.on_disk[esc] = stored
+                self.on_disk[esc] = parameters
         self._collect()
-        return saves
+        return stored
 
     def can_state(self, name: str) -> None:
         self.gateway.set_can_state(CanState[name], self.now)
@@ -288,8 +295,7 @@ class Bench(Talker):
             case "state", [node, _]:
                 return f"state {node} {self.nodes[int(node) - 1].state:02X}"
             case "listens", _:
-                assert self.gateway.nodes is not None
-                listened_to = sorted(self.gateway.nodes.receive_ids)
+                listened_to = sorted(self.output.receive_ids)
                 return f"listens {' '.join(f'{cob_id:03X}' for cob_id in listened_to)}"
             case "slave", _:
                 return f"slave {'configuration' if self.nodes[0].lss.configuring else 'waiting'}"

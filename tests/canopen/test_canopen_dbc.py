@@ -42,9 +42,8 @@ NA = "NotAvailable"
 
 def described(bench: dialogue.Bench) -> str:
     """The DBC of the nodes as they are at this moment."""
-    assert bench.gateway.nodes is not None
     settings = [esc.settings for esc in bench.gateway.escs]
-    text = canopen_dbc.pdo_text(bench.gateway.nodes, settings)
+    text = canopen_dbc.pdo_text(bench.output, settings)
     assert text.isascii()
     return text
 

@@ -12,6 +12,7 @@ from kontronik_can_gw.assembly.assemble import Loaded, assemble
 from kontronik_can_gw.canopen.bound_values import message_plan
 from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.system.machine import machine_identity, serial_number
@@ -131,9 +132,10 @@ def loaded_nodes(tmp_path: Path) -> tuple[Loaded, list[Node]]:
     canopen = {"enabled": True, "store": str(tmp_path)}
     tables = {"canopen": canopen, "esc": [{"port": "p1"}, {"port": "p2"}]}
     loaded = assemble(parse(tables, "test"))
-    assert loaded.canopen is not None
-    foreign = {message.can_id: message.name for message in loaded.layout.messages}
-    return loaded, loaded.canopen.nodes(loaded.escs, foreign).nodes
+    (setup,) = loaded.outputs
+    assert isinstance(setup, CanopenSetup)
+    message_ids = {message.can_id: message.name for message in loaded.layout.messages}
+    return loaded, setup.nodes(loaded.escs, message_ids).nodes
 
 
 def keep(tmp_path: Path, **stored: Stored) -> None:

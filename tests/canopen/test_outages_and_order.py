@@ -45,7 +45,7 @@ def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> No
 def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
     """Locks between gateways are taken while nothing has been sent yet."""
     setup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
-    gateway = Gateway([EscSettings(f"esc{n}") for n in range(3)], EMPTY, 0, canopen=setup)
+    gateway = Gateway([EscSettings(f"esc{n}") for n in range(3)], EMPTY, 0, outputs=[setup])
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
     gateway.start(0)
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
@@ -54,8 +54,7 @@ def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
 def test_what_the_bus_has_to_carry_is_reckoned_with_the_pace_of_each_pdo() -> None:
     def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
         bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()
-        assert bench.gateway.nodes is not None
-        return bench.gateway.nodes.traffic()[0]
+        return bench.output.traffic()[0]
 
     assert rate(0x20000210) == 100
     assert rate(CRC_ERRORS) == rate(SENT_FRAMES) == rate(LINK_STATUS) == 1

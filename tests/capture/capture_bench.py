@@ -7,7 +7,6 @@ from pathlib import Path
 
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.capture.format import Entry, block, data_payload, json_payload
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.capture.replay import TimedFrame, in_order
@@ -57,17 +56,13 @@ class Bench:
     sent: list[TimedFrame] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        canopen: CanopenSetup | None = self.setup.canopen
         self.gateway = RecordedGateway(
-            *(
-                self._put,
-                self.setup.escs,
-                self.layout,
-                START,
-                self.setup.dbc_settings.silent_on_loss,
-                canopen,
-            ),
-            further=[setup.make for setup in self.setup.outputs],
+            self._put,
+            self.setup.escs,
+            self.layout,
+            START,
+            self.setup.dbc_settings.silent_on_loss,
+            self.setup.outputs,
         )
         self._waiting = TransmitQueue()
         self._saves: list[int] = []

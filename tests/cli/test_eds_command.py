@@ -9,9 +9,9 @@ import canopen
 import pytest
 from command_line import run, written
 
-from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.telemetry import EscSettings
 

@@ -395,7 +395,7 @@ def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
     old = DbcConfig(bind={"A.B": 1}, base_id=5, e2e_data_ids={"M": 7}, on_loss="silent")
     later: dict[str, Any] = {"units": {"x": "V"}, "messages": ("Motor_*",), "flags_on_loss": 1}
     new = replace(old, send_type={"y": "Event"}, unbound="start_value", **later)
-    setup = CaptureSetup((EscSettings(),), ("-",), ("my.dbc", b""), new, False, None)
+    setup = CaptureSetup((EscSettings(),), ("-",), ("my.dbc", b""), new, False)
     header = json.loads(json.dumps(setup.header()))
     assert CaptureSetup.of(header).dbc_settings == new
     for key in (*later, "send_types", "unbound"):

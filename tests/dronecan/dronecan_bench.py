@@ -101,8 +101,7 @@ class Bench:
         self.loaded = given or loaded(escs, **table)
         self.now = START
         self.gateway = Gateway(
-            *(self.loaded.escs, self.loaded.layout, START, False, self.loaded.canopen),
-            further=[setup.make for setup in self.loaded.outputs],
+            self.loaded.escs, self.loaded.layout, START, False, self.loaded.outputs
         )
         self.live: list[LiveData | None] = [LIVE] * escs
         self.frames: list[tuple[int, CanFrame]] = []

@@ -99,7 +99,7 @@ def test_check_warns_of_what_is_unusual(
 ) -> None:
     """As that a machine has no id, so that unique ids come from names alone."""
     if not given:
-        monkeypatch.setattr("kontronik_can_gw.assembly.assemble.identity_digest", lambda: b"")
+        monkeypatch.setattr("kontronik_can_gw.assembly.this_machine.identity_digest", lambda: b"")
     found, _, err = checked(tmp_path, f"node_id = 42\n{more}", **given)  # type: ignore[arg-type]
     assert found == code
     assert said in err if said else not err
@@ -227,9 +227,8 @@ def test_a_bus_that_is_too_slow_gets_whole_transfers(
     """Of two ESCs, of which the newer values win: what is begun ends as it began."""
     monkeypatch.setenv("KONTRONIK_PURE", is_pure)
     world, setup = wire_world.World(2), loaded(2)
-    (dronecan,) = setup.outputs
     layout = Layout("", "", ())
-    loop = wire_world.loop_in(world, monkeypatch, setup.escs, layout, further=[dronecan.make])
+    loop = wire_world.loop_in(world, monkeypatch, setup.escs, layout, outputs=setup.outputs)
     loop.open()
     loop.begin()
     begun = world.now

@@ -17,7 +17,7 @@ import json
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
+from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.kontronik.codec import Layout
@@ -30,7 +30,7 @@ from kontronik_can_gw.runtime.status.snapshot import (_esc)
 
 esc = [{"port": "/dev/null"}, {"port": "/dev/zero"}]
 config = parse({"can": {"interface": "virtual", "channel": "x"}, "esc": esc}, "x.toml")
-gateway = Gateway(config.escs, assemble(config).layout, 0, canopen=shipped_canopen([1, 2]))
+gateway = Gateway(config.escs, assemble(config).layout, 0, outputs=[shipped_canopen([1, 2])])
 gateway.start(0)
 escs = [SimulatedEsc(EscOptions(device=device, layout=Layout.V4), seed=device) for device in (Device.KOSMIK, Device.JIVEPRO)]
 frames = []

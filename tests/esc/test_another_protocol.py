@@ -14,9 +14,10 @@ import cantools
 import pytest
 
 from kontronik_can_gw.assembly.assemble import assemble
-from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.canopen.dictionary import SdoAbort
+from kontronik_can_gw.canopen.nodes import Nodes
+from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
@@ -132,13 +133,14 @@ def test_value_whose_field_is_missing_is_not_supplied(missing: str, value: str) 
 
 
 def test_node_status_and_tables_show_only_supplied_values() -> None:
-    flight = Flight(canopen=shipped_canopen([1, 2]))
+    flight = Flight(outputs=[shipped_canopen([1, 2])])
     flight.send(OLD, FRAME)
     gateway, esc = flight.gateway, flight.gateway.escs[1]
-    assert gateway.nodes is not None
+    (nodes,) = gateway.outputs
+    assert isinstance(nodes, Nodes)
     found: dict[int, object] = {}
     for sub in range(1, 17):
-        read = gateway.nodes.nodes[1].dictionary.find(0x2000, sub).read
+        read = nodes.nodes[1].dictionary.find(0x2000, sub).read
         assert read is not None
         with suppress(SdoAbort):
             found[sub] = read(flight.now)
@@ -176,7 +178,7 @@ def there(values: dict[Any, Any]) -> dict[Any, Any]:
 def test_a_capture_names_the_protocol() -> None:
     """A capture of version 0.5.0 does not name one, so the first protocol is used."""
     escs = tuple(parse(MIXED, "mixed.toml").escs)
-    setup = CaptureSetup(escs, ("a", "b"), None, DbcConfig(), False, None)
+    setup = CaptureSetup(escs, ("a", "b"), None, DbcConfig(), False)
     assert CaptureSetup.of(setup.header()).escs == escs
     old: Any = setup.header()
     old["escs"] = [{k: v for k, v in esc.items() if k != "protocol"} for esc in old["escs"]]

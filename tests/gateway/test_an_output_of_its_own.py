@@ -1,23 +1,21 @@
 """The recipe for another output: one class, one line in the gateway's tuple. It sends one invented frame a second for each ESC."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.core.output import NO_IDS, Output, Owner
+from kontronik_can_gw.core.output import NO_IDS, Output, OutputHost, Owner
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.esc.values import VALUES, steps
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import SECOND
 
 FIRST_ID, COMMAND_ID = 0x1234500, 0x12
@@ -27,10 +25,10 @@ ESCS = [EscSettings("left"), EscSettings("right")]
 class Voltages(Output):
     """Each ESC's battery voltage in 10 mV, FFFFh: not available; a command by CAN changes the period."""
 
-    def __init__(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> None:
+    def __init__(self, host: OutputHost, now: int) -> None:
         super().__init__()
         self.receive_ids = frozenset({COMMAND_ID})
-        self._escs, self._gateway = escs, gateway
+        self._escs, self._gateway = host.escs, host.status
         self._due, self._period = now + SECOND, SECOND
 
     def own_ids(self) -> dict[int, Owner]:
@@ -59,6 +57,15 @@ class Voltages(Output):
         self.frames.append(CanFrame(FIRST_ID + esc, data, extended=True))
 
 
+class VoltagesMaker:
+    """Makes the output. It needs no slots."""
+
+    slots = 0
+
+    def make(self, host: OutputHost, now: int) -> Voltages:
+        return Voltages(host, now)
+
+
 def test_other_receive_ids_increase_the_revision_even_if_they_are_equal() -> None:
     """Equal ids may stand for other own ids. A set freed before them may have had their address."""
     output = Output()
@@ -70,7 +77,7 @@ def test_other_receive_ids_increase_the_revision_even_if_they_are_equal() -> Non
 
 
 def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
-    gateway = Gateway(ESCS, Layout("", "", ()), 0, further=(Voltages,))
+    gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=[VoltagesMaker()])
     gateway.start(0)
     found = []
     for now in range(0, 4 * SECOND, SECOND // 10):
@@ -93,7 +100,7 @@ def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
 
 
 def test_another_device_with_its_ids_is_noticed() -> None:
-    gateway = Gateway(ESCS, Layout("", "", ()), 0, further=(Voltages,))
+    gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=[VoltagesMaker()])
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
     assert [(each.whose, each.node) for each in gateway.conflicts.take()] == [("voltage", 1)]

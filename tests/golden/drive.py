@@ -10,7 +10,6 @@ from typing import Any
 
 import kontronik_can_gw
 from kontronik_can_gw.assembly.assemble import assemble
-from kontronik_can_gw.canopen.storage import encode
 from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
@@ -67,7 +66,7 @@ class Drive:
             for line in (*loaded.layout.warnings, *loaded.warnings)
         ]
         silent = loaded.config.dbc.silent_on_loss
-        self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
+        self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.outputs)
         self._waiting = TransmitQueue()
         self._open = True
         self._looked = self._now = 0
@@ -139,7 +138,7 @@ class Drive:
         gateway = self._gateway
         found = []
         for esc, stored in gateway.take_saves():
-            content = json.loads(encode(stored).split(b"\n")[1])
+            content = json.loads(stored.split(b"\n")[1])
             found.append(f"store {esc + 1} {json.dumps(content, sort_keys=True)}")
         found += [
             f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}"

@@ -20,14 +20,16 @@ from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.canopen.cob_ids import EMERGENCY, HEARTBEAT
 from kontronik_can_gw.canopen.node_settings import NodeSettings
-from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, Kind
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output import Output
-from kontronik_can_gw.core.output_setup import Given, setup_of
+from kontronik_can_gw.core.output_setup import OutputSetup, ReadyOutput
+from kontronik_can_gw.dronecan.node_setup import Given
+from kontronik_can_gw.dronecan.setup import DronecanSetup
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -107,12 +109,11 @@ class Recorded(InC):
         self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
         self.layout = layout(chance, self.escs)
         given = Given(DronecanConfig(node_id=42, extended_hz=30), b"", (1, 2), 3)
-        self.nodes: dict[str, Any] = {}
+        self.outputs: list[OutputSetup] = []
         if has_nodes:
-            dronecan = setup_of("dronecan", given, self.escs).make
-            self.nodes = {"canopen": _nodes(self.escs), "further": [dronecan]}
+            self.outputs = [_nodes(self.escs), DronecanSetup(given, tuple(self.escs))]
         patch.setattr(wire_world, "Gateway", partial(RecordedGateway, self._put))
-        super().__init__(patch, self.layout, self.escs, **self.nodes)
+        super().__init__(patch, self.layout, self.escs, outputs=self.outputs)
         self.status = self.loop.gateway.status
         for wire in self.world.wires:
             at = self.begun
@@ -138,7 +139,7 @@ class Recorded(InC):
 
     def replayed(self, patch: pytest.MonkeyPatch) -> list[tuple[int, bytes]]:
         patch.setattr(load, "library", lambda: (None, ""))
-        gateway = Gateway(self.escs, self.layout, self.begun, **self.nodes)
+        gateway = Gateway(self.escs, self.layout, self.begun, outputs=self.outputs)
         assert gateway.core.language == "Python"
         replay = Replay(gateway)
         frames = [timed.frame for timed in replay.follow(self.entries)]
@@ -195,7 +196,7 @@ def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebod
     has_nodes: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The loop comes round for housekeeping, and heartbeats; an emergency goes in front of what the core sends in its turn."""
-    it = InC(monkeypatch, canopen=_nodes(ESCS) if has_nodes else None)
+    it = InC(monkeypatch, outputs=[_nodes(ESCS)] if has_nodes else [])
     poller: Any = it.loop._poller
     events: list[int] = []
     _count(monkeypatch, poller, "_follow", lambda: events.append(poller._turns.state.found))
@@ -239,7 +240,7 @@ def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
 ) -> None:
     """With telemetry and without; on a full bus what is queued waits, of what is not the newest alone."""
     beacon = Beacon(queued)
-    it = InC(monkeypatch, further=[lambda *_: beacon])
+    it = InC(monkeypatch, outputs=[ReadyOutput(beacon)])
     it.feed(LiveData(consumed_charge=n) for n in range(300))
     it.run(5)
     sent = [f.data for _, f in it.bus.sent if f.can_id == 0x700]
@@ -258,7 +259,7 @@ def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """That the bus took nothing counts from then on: it is no stall, and nothing is lost."""
-    it = InC(monkeypatch, Layout("", "", ()), canopen=_nodes(ESCS))
+    it = InC(monkeypatch, Layout("", "", ()), outputs=[_nodes(ESCS)])
     it.feed(LiveData(operating_errors=(n >= 530) << 20) for n in range(600))
     it.run(1)
     assert 0x181 in dict(it.bus.take())

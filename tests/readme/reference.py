@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 
-from kontronik_can_gw.assembly.canopen_nodes import shipped_canopen
+from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.cli.arguments import Option, Rows
 from kontronik_can_gw.config.keys import shipped

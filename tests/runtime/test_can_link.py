@@ -77,7 +77,7 @@ class Bench:
     def __init__(self, kernel: Kernel, self_start: bool = True, has_node: bool = True) -> None:
         canopen = {"enabled": has_node, "self_start": self_start, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
-        self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
+        self.gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
         self.kernel, self.now, self.clock = kernel, 0, 0
         self.world = World()
         self.can = CanLink(
@@ -348,9 +348,7 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
     table = {"enabled": True, "node_id": node_id}
     tables = {"dbc": {"enabled": False}, "dronecan": table, "esc": [{"port": "p"}]}
     loaded = assemble(parse(tables, "test"))
-    made.gateway = Gateway(
-        loaded.escs, loaded.layout, 0, further=[setup.make for setup in loaded.outputs]
-    )
+    made.gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
     made.kernel, made.now, made.clock = kernel, 0, 0
     made.can = CanLink(
         *(loaded.config.can, made.gateway, World().poller, FaultLog()), clock=lambda: made.clock

@@ -73,8 +73,8 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
 def test_the_loop_leaves_no_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     """With its ports, conditions and the CAN side; lines that fall silent and speak again, a process that is held up."""
     setup, layout = EVERYTHING
-    world, further = World(2), [each.make for each in setup.outputs]
-    loop = loop_in(world, monkeypatch, setup.escs, layout, setup.canopen, further=further)
+    world = World(2)
+    loop = loop_in(world, monkeypatch, setup.escs, layout, outputs=setup.outputs)
     loop.open()
     loop.begin()
     for second in range(0, 8, 2):

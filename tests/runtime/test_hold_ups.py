@@ -505,7 +505,9 @@ class Bench:
         canopen = {"enabled": True, "self_start": True, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.layout = loaded.layout
-        self.loop: Loop = loop_in(self.world, patch, loaded.escs, loaded.layout, loaded.canopen)
+        self.loop: Loop = loop_in(
+            self.world, patch, loaded.escs, loaded.layout, outputs=loaded.outputs
+        )
         self.wire = self.world.wires[0]
         self.loop.open()
         self.loop.begin()

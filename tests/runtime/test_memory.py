@@ -35,9 +35,7 @@ class Everything:
         self.world = world = World(2)
         self.recorder = Recorder(folder, RecordConfig(), clock=world.clock)
         patch.setattr(wire_world, "Gateway", partial(RecordedGateway, self.recorder.put))
-        further = [each.make for each in setup.outputs]
-        canopen = setup.canopen
-        self.loop = loop_in(world, patch, setup.escs, layout, canopen, further=further)
+        self.loop = loop_in(world, patch, setup.escs, layout, outputs=setup.outputs)
         self.loop._housekeeping._recorder = self.recorder
         self.loop.open()
         self.loop.begin()

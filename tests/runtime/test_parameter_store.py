@@ -50,7 +50,7 @@ def put(store: ParameterStore, name: str, data: bytes) -> str | None:
 
 
 def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterStore) -> None:
-    assert store.load("a") == (Stored(), None)
+    assert store.load("a", decode) == (None, None)
     assert list(tmp_path.iterdir()) == [], "nothing is made by reading"
     assert put(store, "a", OLD) is None
     for number in range(10):
@@ -59,8 +59,10 @@ def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterSt
     assert store.results() == [("a" * 12, None)] * 10
     assert not store.save("a", NEW)
     again = ParameterStore(tmp_path / "params")
-    assert again.load("a") == (decode(OLD), None)
-    assert number_of(again.load("a" * 12)[0]) == 9
+    assert again.load("a", decode) == (decode(OLD), None)
+    stored, _ = again.load("a" * 12, decode)
+    assert stored is not None
+    assert number_of(stored) == 9
     assert again.close(0)
 
 
@@ -106,15 +108,15 @@ def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
     tmp_path: Path, store: ParameterStore, data: bytes
 ) -> None:
     folder = place(tmp_path, b"older rubbish")
-    store.load("esc1")
+    store.load("esc1", decode)
     place(tmp_path, data)
-    stored, reason = store.load("esc1")
-    assert stored == Stored()
+    stored, reason = store.load("esc1", decode)
+    assert stored is None
     assert reason is not None and str(folder / "esc1.params") in reason
     assert [path.name for path in folder.iterdir()] == ["esc1.params.damaged"]
-    assert store.load("esc1") == (Stored(), None)
+    assert store.load("esc1", decode) == (None, None)
     assert put(store, "esc1", NEW) is None
-    assert store.load("esc1") == (decode(NEW), None)
+    assert store.load("esc1", decode) == (decode(NEW), None)
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
@@ -130,9 +132,9 @@ def test_a_file_that_cannot_be_read_now_is_left_alone_and_half_a_new_one_is_neve
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "read_bytes", fail)
-        stored, reason = store.load("esc1")
-    assert stored == Stored() and reason and reason.endswith("Input/output error")
-    assert store.load("esc1") == (decode(OLD), None)
+        stored, reason = store.load("esc1", decode)
+    assert stored is None and reason and reason.endswith("Input/output error")
+    assert store.load("esc1", decode) == (decode(OLD), None)
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
 
 
@@ -271,7 +273,7 @@ def recorded(
     with monkeypatch.context() as patched:
         recorder = Recorder(patched, folder)
         if load:
-            store.load("esc1")
+            store.load("esc1", decode)
         for data in contents:
             problem = put(store, "esc1", data)
             recorder.steps.append(("confirmed" if problem is None else problem, data.decode()))
@@ -351,7 +353,7 @@ def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
     assert (folder / "esc1.params").read_bytes() == (NEW if failing == ("fsync", "params") else OLD)
     assert put(store, "esc1", NEW) is None
-    assert store.load("esc1") == (decode(NEW), None)
+    assert store.load("esc1", decode) == (decode(NEW), None)
 
 
 # --- two gateways

@@ -13,8 +13,8 @@ import pytest
 from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -22,7 +22,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway.gateway import Gateway, MakeOutput
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime.can import can_opener
@@ -340,9 +340,8 @@ def loop_in(
     patch: pytest.MonkeyPatch,
     escs: Sequence[EscSettings] = (EscSettings("esc1"),),
     layout: Layout | None = None,
-    canopen: CanopenSetup | None = None,
     notifier: Notifier | None = None,
-    further: Sequence[MakeOutput] = (),
+    outputs: Sequence[OutputMaker] = (),
 ) -> Loop:
     """A loop whose ports, bus, and time are the world's. Not open yet."""
 
@@ -358,7 +357,7 @@ def loop_in(
     if in_c := os.environ.get(load.PURE, "1") != "1":
         patch.setattr(load, "library", lambda: (native_world.library(), ""))
     layout = layout or layout_of(escs)
-    gateway = Gateway(escs, layout, world.now, canopen=canopen, further=further)
+    gateway = Gateway(escs, layout, world.now, outputs=outputs)
     config = CanConfig(interface="virtual", channel="world")
     paths = list(by_path)
     poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller

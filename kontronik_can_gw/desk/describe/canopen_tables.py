@@ -13,8 +13,8 @@ from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import TYPE_NAMES, Eds, Entry
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.node import Node
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.describe.tables import meanings_of, number, protocols_of
 from kontronik_can_gw.esc.telemetry import EscSettings

@@ -48,7 +48,7 @@ class BytesInput(PlayedInput):
         self._path = path
         timeout_ns = max(layout.escs[0].timeout_ns, 3 * PERIOD_NS)
         escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
-        setup = CaptureSetup(escs, (str(path),), None, DbcConfig(), False, None)
+        setup = CaptureSetup(escs, (str(path),), None, DbcConfig(), False)
         super().__init__(str(path), layout, setup)
         self.stream = stream
         self._head = b""

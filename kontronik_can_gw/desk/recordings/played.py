@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any, cast
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import Entry
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.core.output import Output, OutputHost
+from kontronik_can_gw.core.output_setup import OutputMaker, ReadyOutput
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample, timed
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.gateway.gateway import Gateway, MakeOutput
+from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import load
 from kontronik_can_gw.signals.plan import Layout
 
@@ -23,6 +25,20 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.player import Player
 
 NO_MESSAGES = Layout("", "", ())
+
+
+class _RowOutput:
+    """Makes the output that forms rows of ``fields``, and keeps it as ``maker``."""
+
+    slots = 0
+
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self._fields = fields
+        self.maker: RowMaker
+
+    def make(self, host: OutputHost, now: int) -> Output:
+        self.maker = RowMaker(self._fields, host.escs, host.status, now)
+        return self.maker
 
 
 class PlayedInput(Input):
@@ -55,24 +71,18 @@ class PlayedInput(Input):
             yield from timed(frames)
 
     def batches(self) -> "Iterator[list[TimedFrame] | Frames]":
-        def make(_: Sequence[MakeOutput] = ()) -> Gateway:
+        def make(_: Sequence[OutputMaker] = ()) -> Gateway:
             return self.setup.gateway(self.sent_layout, self.created_ns)
 
-        has_frames_of_its_own = self.setup.canopen is not None or self.setup.outputs
-        found = None if has_frames_of_its_own else self._player_of(make, None)
+        found = None if self.setup.outputs else self._player_of(make, None)
         return self._play(*(found or (make(),)))
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         fields = [self.fields[index] for index in chosen]
-        makers: list[RowMaker] = []
-
-        def make(*of_gateway: Any) -> RowMaker:
-            makers.append(RowMaker(fields, *of_gateway))
-            return makers[0]
-
-        for _ in self._play(self._silent_gateway((make,))):
-            yield from makers[0].take_rows()
-        yield from makers[0].finish()
+        rows = _RowOutput(fields)
+        for _ in self._play(self._silent_gateway((rows,))):
+            yield from rows.maker.take_rows()
+        yield from rows.maker.finish()
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
         fields = self.fields if chosen is None else [self.fields[index] for index in chosen]
@@ -99,19 +109,21 @@ class PlayedInput(Input):
             wall_ns = self.wall_ns(times[first])
             yield PlayedBlock(rows, first, end, None if wall_ns is None else wall_ns - times[first])
 
-    def _silent_gateway(self, further: Sequence[MakeOutput]) -> Gateway:
-        """Without messages; nodes are there, because they may change pole pairs and gear."""
+    def _silent_gateway(self, readers: Sequence[OutputMaker]) -> Gateway:
+        """Return a gateway without messages, whose outputs include ``readers``.
+
+        Recorded outputs are there if they may have changed pole pairs and gear.
+        """
         # the caller shows names, pole pairs and gears
         escs = [
             replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
             for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
         ]
-        return Gateway(
-            *(escs, NO_MESSAGES, self.created_ns), canopen=self.setup.canopen, further=further
-        )
+        changing = [setup for setup in self.setup.outputs if setup.changes_escs]
+        return Gateway(escs, NO_MESSAGES, self.created_ns, outputs=[*changing, *readers])
 
     def _player_of(
-        self, make: Callable[[Sequence[MakeOutput]], Gateway], fields: Sequence[Field] | None
+        self, make: Callable[[Sequence[OutputMaker]], Gateway], fields: Sequence[Field] | None
     ) -> "tuple[Gateway, Player] | None":
         """A gateway, and what plays it at once for rows of ``fields`` or for frames (None). None: Python must."""
         if self.setup.version == 1 or load.library()[0] is None:
@@ -124,7 +136,7 @@ class PlayedInput(Input):
         if fields is not None:
             columns = [ColumnOf(cast(Any, field.value), field.esc) for field in fields]
         player = Player(columns)
-        gateway = make(() if fields is None else (lambda *_: player,))
+        gateway = make(() if fields is None else (ReadyOutput(player),))
         if gateway.core.language != "C":
             return None
         try:

@@ -28,13 +28,9 @@ class ParameterSaver:
 
     def save(self, now: int) -> None:
         """Hand over what is to be stored."""
-        for index, stored in self._gateway.take_saves():
-            from kontronik_can_gw.canopen.storage import (
-                encode,
-            )  # only nodes have something to store
-
+        for index, content in self._gateway.take_saves():
             name = self._escs[index].name
-            if self._store is not None and self._store.save(name, encode(stored)):
+            if self._store is not None and self._store.save(name, content):
                 self._waiting += 1
             else:
                 self._take(index, "no store", now)

@@ -10,13 +10,16 @@ the old one (the new one, if only the last step failed).
 
 import contextlib
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
-from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.files.disk import reason_of, sync_folder, write_new
 from kontronik_can_gw.runtime.system.locks import Taken, lock_file
 from kontronik_can_gw.runtime.system.worker import Handover, Worker
+
+_Content = TypeVar("_Content")
 
 
 class ParameterStore:
@@ -45,12 +48,15 @@ class ParameterStore:
             return f"{path}: {reason_of(error)}"
         return None
 
-    def load(self, name: str) -> tuple[Stored, str | None]:
-        """Read what a node kept; to be called before its first saving.
+    def load(
+        self, name: str, decode: Callable[[bytes], _Content]
+    ) -> tuple[_Content | None, str | None]:
+        """Read the parameters of a node. Must be called before the first ``save`` for it.
 
-        A missing file is an empty ``Stored``, a damaged or unreadable one too, and then the reason is there. A damaged file is kept as
-        ``NAME.params.damaged``, in place of an older one of that name; an unreadable one, which may be so only now, stays until something
-        is saved. What a killed writer left half is removed.
+        Returns the content, and the reason if it cannot be read. Both are None if there is no file.
+        A damaged file, for which ``decode`` raises ValueError, is renamed to
+        ``NAME.params.damaged`` and replaces an older one of that name. A file that cannot be read
+        now stays until parameters are saved. A file that a killed writer left is removed.
         """
         path = parameter_file(self._folder, name)
         with contextlib.suppress(OSError):
@@ -58,14 +64,14 @@ class ParameterStore:
         try:
             return decode(path.read_bytes()), None
         except FileNotFoundError:
-            return Stored(), None
+            return None, None
         except OSError as error:
-            return Stored(), f"{path}: {reason_of(error)}"
+            return None, f"{path}: {reason_of(error)}"
         except ValueError as error:
             with contextlib.suppress(OSError):
                 path.replace(path.with_name(path.name + ".damaged"))
                 sync_folder(path.parent)
-            return Stored(), f"{path}: {error}"
+            return None, f"{path}: {error}"
 
     def save(self, name: str, data: bytes) -> bool:
         """Let ``data`` become the file's content; never blocks. True: exactly one result follows; results come in the order of the savings.

@@ -113,11 +113,11 @@ class Locks:
 def names_of(gateway: Gateway, channel: str) -> list[str]:
     """The names of the locks on the ids that a gateway has now."""
     conflicts = gateway.conflicts
-    names = [
-        f"CANopen node {node_id}"
-        for node_id, _, _ in gateway.node_states()
-        if node_id != UNCONFIGURED
-    ]
+    names = []
+    for output in gateway.node_outputs:
+        for node in output.node_states():
+            if node.node_id != UNCONFIGURED:
+                names.append(f"{output.node_title} {node.node_id}")
     if (first := conflicts.first_own_id()) is not None:
         names.append(f"messages from {first:X}h on")
     names += [ids_in_words(block) for block in conflicts.own_blocks()]
