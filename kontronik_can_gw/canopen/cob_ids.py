@@ -1,25 +1,17 @@
-"""COB-IDs: predefined and restricted ones (CiA 301, 7.3.3 and 7.3.5), which of them a node uses, and what takes the frames that come."""
+"""COB-IDs: the predefined and the restricted ones (CiA 301, 7.3.3 and 7.3.5)."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from kontronik_can_gw.canopen import nmt
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
-from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.canopen.nmt import Command
-from kontronik_can_gw.status import UNCONFIGURED
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.node import Node
 
 FrameTaker = Callable[[bytes, int, int], None]
-"""Is given a frame's data, the time, and when the frame came."""
+"""Takes the data of a frame, the current time and the time of arrival."""
 Taken = Callable[[int, object], bool]
-"""Whether another user than this has a COB-ID, see ``Use``."""
+"""Returns True if a COB-ID has another user than the given one, see ``Use``."""
 
 NMT, EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
-"""Those of EMERGENCY and after are first ids: the node-ID is added."""
+"""From EMERGENCY on, the node-ID is added."""
 LSS_ANSWER, LSS_REQUEST = 0x7E4, 0x7E5
 OF_NODE_ID = (EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
 INVALID_BIT = 1 << 31
@@ -27,7 +19,7 @@ SYNC = "SYNC"
 
 
 def restricted(cob_id: int) -> bool:
-    """True for COB-IDs that no PDO, SYNC or EMCY may use (CiA 301, table of restricted CAN-IDs)."""
+    """Return True if no PDO, SYNC or EMCY may use the COB-ID (CiA 301, restricted CAN-IDs)."""
     return (
         cob_id <= 0x07F
         or 0x101 <= cob_id <= 0x180
@@ -39,7 +31,10 @@ def restricted(cob_id: int) -> bool:
 
 
 def check_free(cob_id: int, user: object, taken: Taken) -> None:
-    """Whether a service may have a COB-ID. SdoAbort 06090030h for a restricted one, 06040043h for one in use."""
+    """Check that a service may have a COB-ID.
+
+    Raises SdoAbort 06090030h for a restricted COB-ID, and 06040043h for one in use.
+    """
     if restricted(cob_id):
         raise SdoAbort(Abort.VALUE)
     if taken(cob_id, user):
@@ -47,7 +42,7 @@ def check_free(cob_id: int, user: object, taken: Taken) -> None:
 
 
 def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int, int]]:
-    """Valid COB-IDs of emergencies and PDOs by their defaults: index, sub-index, id."""
+    """Yield index, sub-index and COB-ID of each valid default of emergencies and PDOs."""
     if dictionary.get(0x1014) is None:
         yield 0x1014, 0, EMERGENCY + node_id
     for number, variable in dictionary.variables.items():
@@ -64,63 +59,9 @@ class Use(NamedTuple):
     cob_id: int
     what: str
     user: object = None
-    """The service for which a master can choose it; that of SYNC is one for all nodes. None: it cannot be chosen."""
+    """The service for which a master can choose the COB-ID. None if it cannot be chosen.
+
+    ``SYNC`` stands for the SYNC services of all nodes, which share one COB-ID.
+    """
     own: bool = False
-    """No other device on the bus may send with it."""
-
-
-def uses(node: "Node") -> Iterator[Use]:
-    """All COB-IDs that a node sends with or listens to as its own."""
-    yield Use(NMT, "NMT")
-    yield Use(LSS_REQUEST, "LSS")
-    yield Use(LSS_ANSWER, "LSS")
-    if node.node_id == UNCONFIGURED:
-        return
-    name = f"CANopen node {node.node_id}"
-    yield Use(node.sync.cob_id, "SYNC", SYNC)
-    yield Use(SDO_REQUEST + node.node_id, f"SDO requests to {name}")
-    yield Use(HEARTBEAT + node.node_id, f"the heartbeat of {name}", own=True)
-    yield Use(SDO_ANSWER + node.node_id, f"SDO answers of {name}", own=True)
-    emergencies = node.emergencies
-    if not emergencies.cob_id & INVALID_BIT:
-        yield Use(emergencies.cob_id & 0x7FF, f"emergencies of {name}", emergencies, own=True)
-    for tpdo in node.tpdos:
-        if tpdo.valid:
-            yield Use(tpdo.cob_id, f"TPDO {tpdo.number + 1} of {name}", tpdo, own=True)
-
-
-def routes(node: "Node") -> Iterator[tuple[int, FrameTaker]]:
-    """COB-IDs the node listens to, those of heartbeats that it watches too, and what takes their frames."""
-    yield LSS_REQUEST, lambda data, now, _at: node.lss.receive(data, now)
-    if node.node_id != UNCONFIGURED:
-        yield NMT, partial(_on_nmt, node)
-        yield node.sync.cob_id, partial(_on_sync, node)
-        yield SDO_REQUEST + node.node_id, partial(_on_sdo, node)
-        for node_id in node.consumer.node_ids:
-            yield HEARTBEAT + node_id, partial(node.consumer.receive, node_id)
-
-
-def _on_nmt(node: "Node", data: bytes, now: int, _at: int) -> None:
-    match nmt.command(data, node.node_id):
-        case None:
-            pass
-        case Command.RESET_NODE:
-            node.reset_node(now)
-        case Command.RESET_COMMUNICATION:
-            node.reset_communication(now)
-        case command:
-            node.nmt.enter(nmt.STATE_AFTER[command], now)
-
-
-def _on_sdo(node: "Node", data: bytes, now: int, _at: int) -> None:
-    if node.nmt.communicates:
-        node.sdo.receive(data, now)
-
-
-def _on_sync(node: "Node", data: bytes, now: int, at: int) -> None:
-    if not node.nmt.communicates:
-        return
-    counter = node.sync.counter(data)
-    node.emergencies.set(GatewayError.SYNC_LENGTH, counter is None, now, at=at)
-    if counter is not None:
-        node.tpdos.on_sync(counter, now, at)
+    """True if no other device on the bus may send with it."""

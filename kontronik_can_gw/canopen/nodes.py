@@ -1,4 +1,7 @@
-"""All CANopen nodes of a gateway on one bus: routing by COB-ID, one stream of frames out, no node disturbing another."""
+"""The CANopen output: all nodes of a gateway on one bus.
+
+Received frames are routed to the nodes by COB-ID, and all nodes share one list of frames to send.
+"""
 
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -10,8 +13,6 @@ from kontronik_can_gw.canopen.cob_ids import (
     OF_NODE_ID,
     FrameTaker,
     default_ids,
-    routes,
-    uses,
 )
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import ALL_NODES, RESETS, command
@@ -25,9 +26,12 @@ from kontronik_can_gw.signals.plan import Layout, classic_bits
 from kontronik_can_gw.status import UNCONFIGURED, CanState, name_in_words
 from kontronik_can_gw.times import NEVER, SECOND
 
+_HEARTBEAT_BYTES = 1
+_PDO_BYTES = 8
+
 
 class Nodes(NodeOutput):
-    """One node for each ESC. No PDO may have an id in ``host.own_ids``."""
+    """One node for each ESC of ``host``. No PDO may have an id of ``host.own_ids``."""
 
     node_title = "CANopen node"
     events = Event.LINK | Event.STATE
@@ -35,37 +39,37 @@ class Nodes(NodeOutput):
     def __init__(self, setups: Sequence[NodeSetup], host: OutputHost) -> None:
         super().__init__()
         self.due = NEVER
-        self.slot = host.slot
-        self.settings_changed = host.apply
-        self._foreign_ids = host.own_ids
+        self._message_ids = host.own_ids
         self._routes: dict[int, list[FrameTaker]] = {}
-        self.rerouted = True
-        """A node uses other COB-IDs now."""
-        self._rejected: list[tuple[int, int]] = []
+        self._has_changed = True
+        """True if a node's state or COB-IDs may have changed since the routes were made."""
         self._watched: frozenset[int] = frozenset()
+        """COB-IDs of the heartbeats that nodes watch."""
         self._to_watchers: deque[CanFrame] = deque()
-        self._started = False
+        """Heartbeats of our nodes, for those of our nodes that watch them."""
+        self._is_on = False
         self._reported: list[NodeState] = []
+        """The states in the log."""
+        numbers = range(len(host.escs))
         self.nodes = [
-            Node(number, setup, esc, host.status, self)
-            for number, (setup, esc) in enumerate(zip(setups, host.escs, strict=True))
+            Node(number, setup, host, self) for number, setup in zip(numbers, setups, strict=True)
         ]
         self._can_faults = _CanFaults(self.nodes)
 
-    # --- what happens
+    # --- calls of the gateway
 
     def start(self, now: int, can_open: bool) -> None:
-        """Power on; without a bus that can hear it the nodes boot when there is one."""
+        """Power on. Without an open interface, the nodes boot later, in ``can_returned``."""
         if not can_open:
             return
-        self._started = True
+        self._is_on = True
         self._can_faults.power_on()
         for node in self.nodes:
             node.reset_node(now)
-        self._after(now)
+        self._finish(now)
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
-        """A frame from the bus, which came ``at``. 29-bit and RTR frames are not CANopen frames of ours."""
+        """Take a frame from the bus that arrived ``at``. Only 11-bit data frames are CANopen."""
         if frame.extended or frame.remote or frame.fd:
             return
         begin = len(self.frames)
@@ -74,9 +78,9 @@ class Nodes(NodeOutput):
                 node.tpdos.release_ids()
         self._route(frame, now, at)
         if frame.can_id == LSS_REQUEST:
-            # what several slaves send at the same time is one frame on a bus
+            # Equal answers that several slaves send at once are one frame on a bus.
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
-        self._after(now)
+        self._finish(now)
 
     def next_deadline(self) -> int:
         return self.due
@@ -84,102 +88,43 @@ class Nodes(NodeOutput):
     def on_event(self, esc: int, events: int, now: int) -> None:
         node = self.nodes[esc]
         node.on_event(events, now)
-        if self.rerouted or self._to_watchers:
-            self._after(now)
+        if self._has_changed or self._to_watchers:
+            self._finish(now)
         self.due = min(self.due, node.due)
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
-        """The CAN controller's state changed, or it is down again before a frame was sent."""
+        """Follow the CAN controller: another state, or DOWN again before a frame was sent."""
         if state is before and state is not CanState.DOWN:
             return
         self._can_faults.on_state(state, now)
-        self._after(now)
+        self._finish(now)
 
     def can_returned(self, now: int) -> None:
-        """Frames can be sent again after some were lost, or for the first time."""
-        if not self._started:
+        if not self._is_on:
             self.start(now, can_open=True)
             return
         self._can_faults.frames_pass(now)
-        self._after(now)
+        self._finish(now)
 
     def held_up(self, now: int) -> None:
         for node in self.nodes:
             node.tpdos.held_up(now)
             node.consumer.held_up(now)
-        self._after(now)
+        self._finish(now)
 
     def repeat_measurements(self, now: int) -> None:
-        """PDOs that waited to be sent were dropped: send once more what is sent on change only."""
+        """Send PDOs again that are sent on change only, because waiting ones were discarded."""
         for node in self.nodes:
             node.tpdos.repeat(now)
-        self._after(now)
+        self._finish(now)
 
     def collision(self, esc: int, present: bool, now: int) -> None:
         self.nodes[esc].emergencies.set(GatewayError.ID_COLLISION, present, now)
-        self._after(now)
-
-    def node_states(self) -> list[NodeState]:
-        return [
-            NodeState(node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos))
-            for node in self.nodes
-        ]
-
-    def take_news(self) -> list[LogLine]:
-        """Return a line for each node whose state or node-ID is not the reported one."""
-        if not self._started:
-            return []
-        reported = self._reported
-        self._reported = states = self.node_states()
-        lines = []
-        for index, (node_id, state, _) in enumerate(states):
-            if reported and reported[index][:2] == (node_id, state):
-                continue
-            subject = f"{self.nodes[index].esc.settings.name}: CANopen node"
-            words = f"{node_id} {name_in_words(state.name)}"
-            if node_id == UNCONFIGURED:
-                words = "waits for LSS"
-            lines.append(LogLine(subject, f"{subject} {words}"))
-        return lines
-
-    def take_rejected_parameters(self) -> list[tuple[int, int]]:
-        rejected, self._rejected = self._rejected, []
-        return rejected
-
-    def traffic(self, is_worst: bool = False) -> tuple[float, float]:
-        """Frames a second of PDOs and heartbeats, and the bits that they need with the most stuffing.
-
-        ``is_worst``: with all that is sent on change changing all the time.
-        """
-        rates: list[tuple[int, float]] = []
-        for node in (node for node in self.nodes if node.node_id != UNCONFIGURED):
-            if period := node.dictionary.number(0x1017):
-                rates.append((1, 1000 / period))
-            rates += [(8, t.worst_rate_hz if is_worst else t.rate_hz) for t in node.tpdos]
-        return sum(rate for _, rate in rates), sum(classic_bits(n) * rate for n, rate in rates)
-
-    def own_ids(self) -> dict[int, Owner]:
-        """COB-IDs that only our nodes send with."""
-        return {
-            use.cob_id: Owner(index, use.what)
-            for index, node in enumerate(self.nodes)
-            for use in uses(node)
-            if use.own
-        }
+        self._finish(now)
 
     def overrun(self, now: int) -> None:
         self._can_faults.overrun(now)
-        self._after(now)
-
-    def parameters_damaged(self, esc: int, now: int) -> None:
-        """A node's parameter file could not be read: it runs on defaults."""
-        self.nodes[esc].emergencies.set(GatewayError.PARAMETER_FILE, True, now)
-        self._after(now)
-
-    def saved(self, esc: int, error: str | None, now: int) -> None:
-        """The oldest request of an ESC's node to store is on disk, or failed for a reason."""
-        self.nodes[esc].saved(error, now)
-        self._after(now)
+        self._finish(now)
 
     def advance(self, now: int) -> None:
         if now < self.due:
@@ -187,29 +132,86 @@ class Nodes(NodeOutput):
         for node in self.nodes:
             if now >= node.due:
                 node.advance(now)
-        self._after(now)
+        self._finish(now)
 
-    # --- what nodes ask
+    # --- states and parameters of nodes
 
-    def reject(self, esc: int, keys: Sequence[int]) -> None:
-        """Report stored values that a reset rejected."""
-        self._rejected += [(esc, key) for key in keys]
+    def node_states(self) -> list[NodeState]:
+        states = []
+        for node in self.nodes:
+            sent = sum(tpdo.sent for tpdo in node.tpdos)
+            states.append(NodeState(node.claimed_node_id, node.state, sent))
+        return states
+
+    def take_news(self) -> list[LogLine]:
+        """Return a line for each node whose state or node-ID is not the reported one."""
+        if not self._is_on:
+            return []
+        reported = self._reported
+        self._reported = states = self.node_states()
+        lines = []
+        for index, (node_id, state, _) in enumerate(states):
+            if reported and reported[index][:2] == (node_id, state):
+                continue
+            subject = f"{self.nodes[index].esc.settings.name}: {self.node_title}"
+            words = f"{node_id} {name_in_words(state.name)}"
+            if node_id == UNCONFIGURED:
+                words = "waits for LSS"
+            lines.append(LogLine(subject, f"{subject} {words}"))
+        return lines
+
+    def take_rejected_parameters(self) -> list[tuple[int, int]]:
+        rejected = []
+        for esc, node in enumerate(self.nodes):
+            rejected += [(esc, key) for key in node.rejected]
+            node.rejected = []
+        return rejected
+
+    def parameters_damaged(self, esc: int, now: int) -> None:
+        """Report an unreadable parameter file, because of which a node runs on defaults."""
+        self.nodes[esc].emergencies.set(GatewayError.PARAMETER_FILE, True, now)
+        self._finish(now)
+
+    def saved(self, esc: int, error: str | None, now: int) -> None:
+        self.nodes[esc].saved(error, now)
+        self._finish(now)
+
+    # --- ids
+
+    def own_ids(self) -> dict[int, Owner]:
+        owners = {}
+        for index, node in enumerate(self.nodes):
+            for use in node.uses():
+                if use.own:
+                    owners[use.cob_id] = Owner(index, use.what)
+        return owners
+
+    # --- calls of the nodes (NodeHost)
 
     def send(self, frame: CanFrame) -> None:
-        """Put a frame out."""
         self.frames.append(frame)
         if frame.can_id in self._watched:
             self._to_watchers.append(frame)
 
-    def cob_id_taken(self, cob_id: int, user: object) -> bool:
-        """Whether something else of the gateway uses this id; ``user`` as in ``Use``."""
-        used = (use for node in self.nodes for use in uses(node))
-        return cob_id in self._foreign_ids or any(
-            use.cob_id == cob_id and use.user is not user for use in used
-        )
+    def note_change(self) -> None:
+        self._has_changed = True
+        self.revision += 1
 
-    def node_id_taken(self, node_id: int, node: Node) -> bool:
-        """Whether another node has this node-ID, now or from its next reset on, or another message a COB-ID of it."""
+    def is_cob_id_used(self, cob_id: int, user: object) -> bool:
+        if cob_id in self._message_ids:
+            return True
+        for node in self.nodes:
+            for use in node.uses():
+                if use.cob_id == cob_id and use.user is not user:
+                    return True
+        return False
+
+    def is_node_id_used(self, node_id: int, node: Node) -> bool:
+        """Return True if a node cannot have this node-ID.
+
+        Another node has it, now or from its next reset on, or one of the COB-IDs that follow from
+        it has another user.
+        """
         if node_id == UNCONFIGURED:
             return False
         others = [other for other in self.nodes if other is not node]
@@ -217,76 +219,90 @@ class Nodes(NodeOutput):
             return True
         wanted = {first + node_id for first in OF_NODE_ID}
         wanted |= {cob_id for _, _, cob_id in default_ids(node.dictionary, node_id)}
-        used = {use.cob_id for other in others for use in uses(other)}
-        return not wanted.isdisjoint(used | self._foreign_ids.keys())
+        used = set(self._message_ids)
+        for other in others:
+            used |= {use.cob_id for use in other.uses()}
+        return not wanted.isdisjoint(used)
 
-    def _route(self, frame: CanFrame, now: int, at: int) -> None:
-        for taker in self._routes.get(frame.can_id, ()):
-            taker(frame.data, now, at)
+    # --- after each call
 
-    def _after(self, now: int) -> None:
+    def _finish(self, now: int) -> None:
+        """Pass on watched heartbeats, make the routes if they have changed, compute ``due``."""
         while self._to_watchers:
-            # what we send does not come back from the bus: one of our nodes may watch another
+            # Own frames do not come back from the bus, but one of our nodes may watch another.
             frame = self._to_watchers.popleft()
             self._route(frame, now, now)
-        if self.rerouted and self._started:
-            self.rerouted = False
-            self._watched = frozenset(
-                HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids
-            )
-            self._routes = {}
-            for node in self.nodes:
-                for cob_id, taker in routes(node):
-                    self._routes.setdefault(cob_id, []).append(taker)
-            self.receive_ids = frozenset(self._routes)
+        if self._has_changed and self._is_on:
+            self._has_changed = False
+            self._make_routes()
         for node in self.nodes:
             node.set_due()
         self.due = min([node.due for node in self.nodes])
 
+    def _route(self, frame: CanFrame, now: int, at: int) -> None:
+        for take in self._routes.get(frame.can_id, ()):
+            take(frame.data, now, at)
+
+    def _make_routes(self) -> None:
+        self._watched = frozenset(
+            HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids
+        )
+        self._routes = {}
+        for node in self.nodes:
+            for cob_id, take in node.routes():
+                self._routes.setdefault(cob_id, []).append(take)
+        self.receive_ids = frozenset(self._routes)
+
 
 class _CanFaults:
-    """Trouble of the CAN controller: emergencies 8110h, 8120h, 8140h and error behaviour 1029h:1 of all nodes (CiA 301, 7.5.2.27)."""
+    """Faults of the CAN controller.
+
+    They cause the emergencies 8110h, 8120h and 8140h and the error behaviour 1029h:1 of all nodes
+    (CiA 301, 7.5.2.27).
+    """
 
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._nodes = nodes
-        self._next_overrun = 0
-        self._off_bus = False
-        self._outage = False
+        self._next_overrun_ns = 0
+        self._was_off = False
+        self._has_outage = False
 
     def power_on(self) -> None:
-        """What was before the start counts no more."""
-        self._off_bus = self._outage = False
+        """Forget faults from before the start."""
+        self._was_off = False
+        self._has_outage = False
 
     def on_state(self, state: CanState, now: int) -> None:
-        """The CAN controller's state changed."""
-        # bus-off is worse than passive, not its end
+        """Follow a new state of the CAN controller."""
+        # Bus-off is worse than error-passive, so it does not end the emergency.
         if state in (CanState.ERROR_PASSIVE, CanState.ERROR_ACTIVE, CanState.ERROR_WARNING):
             for node in self._nodes:
                 is_passive = state is CanState.ERROR_PASSIVE
                 node.emergencies.set(GatewayError.CAN_PASSIVE, is_passive, now)
         if state in (CanState.BUS_OFF, CanState.DOWN):
-            self._off_bus = self._off_bus or state is CanState.BUS_OFF
-            self._outage = True
+            self._was_off = self._was_off or state is CanState.BUS_OFF
+            self._has_outage = True
             for node in self._nodes:
                 node.nmt.behave(1, now)
-        elif self._outage and state is not CanState.UNKNOWN:
+        elif self._has_outage and state is not CanState.UNKNOWN:
             self.frames_pass(now)
 
     def frames_pass(self, now: int) -> None:
-        """Frames can be sent again after some were lost."""
+        """Follow an interface that takes frames again after some were lost."""
         for node in self._nodes:
-            if self._outage:
+            if self._has_outage:
                 node.returned(now)
             else:
                 node.repeat(now)
-            if self._off_bus:
+            if self._was_off:
                 node.emergencies.pulse(GatewayError.BUS_OFF_LEFT, now)
-        self._off_bus = self._outage = False
+        self._was_off = False
+        self._has_outage = False
 
     def overrun(self, now: int) -> None:
-        """Received frames were lost in the controller: reported once a second at most."""
-        if now >= self._next_overrun:
-            self._next_overrun = now + SECOND
+        """Report a loss of received frames in the controller, at most once a second."""
+        if now >= self._next_overrun_ns:
+            self._next_overrun_ns = now + SECOND
             for node in self._nodes:
                 node.emergencies.pulse(GatewayError.RECEIVE_OVERRUN, now)
 
@@ -301,3 +317,21 @@ def nodes_alone(
     core = PythonCore(escs, Layout("", "", ()), 0, silent=False)
     core.own_ids = {can_id: Owner(None, name) for can_id, name in message_ids.items()}
     return Nodes(setups, core)
+
+
+def traffic(nodes: Sequence[Node], is_worst: bool) -> tuple[float, float]:
+    """Return PDOs and heartbeats per second, and the bits per second with the most stuffing.
+
+    ``is_worst`` means that everything sent on change changes all the time.
+    """
+    rates: list[tuple[int, float]] = []
+    for node in nodes:
+        if node.node_id == UNCONFIGURED:
+            continue
+        period_ms = node.dictionary.number(0x1017)
+        if period_ms:
+            rates.append((_HEARTBEAT_BYTES, 1000 / period_ms))
+        for tpdo in node.tpdos:
+            rates.append((_PDO_BYTES, tpdo.worst_rate_hz if is_worst else tpdo.rate_hz))
+    frames = sum(rate for _, rate in rates)
+    return frames, sum(classic_bits(size) * rate for size, rate in rates)

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds
-from kontronik_can_gw.canopen.cob_ids import Use, uses
+from kontronik_can_gw.canopen.cob_ids import Use
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.node_settings import NodeSettings, NodeSetup, esc_settings
-from kontronik_can_gw.canopen.nodes import Nodes, nodes_alone
+from kontronik_can_gw.canopen.nodes import Nodes, nodes_alone, traffic
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.config.keys import Config, shipped
@@ -126,9 +126,12 @@ class CanopenSetup(OutputSetup):
     @cached_property
     def _needs(self) -> _Needs:
         # The nodes are built once, and only these facts are kept.
-        nodes = self.nodes(self._escs_in_effect())
-        ids = {use.cob_id: use.what for node in nodes.nodes for use in uses(node)}
-        return _Needs(ids, nodes.traffic(), nodes.traffic(is_worst=True))
+        nodes = self.nodes(self._escs_in_effect()).nodes
+        ids = {}
+        for node in nodes:
+            for use in node.uses():
+                ids[use.cob_id] = use.what
+        return _Needs(ids, traffic(nodes, is_worst=False), traffic(nodes, is_worst=True))
 
     def _escs_in_effect(self) -> list[EscSettings]:
         escs = self.escs or (EscSettings(),) * len(self.settings)
@@ -182,7 +185,7 @@ class CanopenSetup(OutputSetup):
         """
         users: dict[int, list[tuple[int, Use]]] = {}
         for number, node in enumerate(self.nodes(escs, message_ids).nodes):
-            for use in uses(node):
+            for use in node.uses():
                 users.setdefault(use.cob_id, []).append((number, use))
         clashing: set[int] = set()
         for cob_id, users_of_id in users.items():

@@ -17,7 +17,6 @@ from packer_oracle import ERROR_BITS, KNOWN, pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.writer import copies_text
@@ -114,7 +113,7 @@ class Bench(dialogue.Bench):
         self.seen.setdefault(message.name, []).append(values)
         if "Tpdo" not in message.name:
             return
-        used = [{use.cob_id for use in uses(node)} for node in self.nodes]
+        used = [{use.cob_id for use in node.uses()} for node in self.nodes]
         esc = next(n for n, cob_ids in enumerate(used) if sent.can_id in cob_ids)
         known = self.expected(self.gateway.escs[esc])
         for signal in message.signals:

@@ -10,7 +10,6 @@ from script import MS
 
 from kontronik_can_gw.assembly.assemble import Loaded, assemble
 from kontronik_can_gw.canopen.bound_values import message_plan
-from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, encode
@@ -171,7 +170,7 @@ def test_nothing_a_master_stored_keeps_the_gateway_from_starting(
     loaded, nodes = loaded_nodes(tmp_path)
     ids = {message.can_id: message.name for message in loaded.layout.messages}
     for node in nodes:
-        for cob_id, what, *_ in uses(node):
+        for cob_id, what, *_ in node.uses():
             assert ids.setdefault(cob_id, what) == what
     # said at start, or by the node when it boots
     assert loaded.warnings or any(node.parameters.rejected for node in nodes)

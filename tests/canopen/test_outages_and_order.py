@@ -2,6 +2,7 @@
 
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
+from kontronik_can_gw.canopen.nodes import traffic
 from kontronik_can_gw.canopen.objects import GATEWAY, LINK
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -54,7 +55,7 @@ def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
 def test_what_the_bus_has_to_carry_is_reckoned_with_the_pace_of_each_pdo() -> None:
     def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
         bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()
-        return bench.output.traffic()[0]
+        return traffic(bench.nodes, is_worst=False)[0]
 
     assert rate(0x20000210) == 100
     assert rate(CRC_ERRORS) == rate(SENT_FRAMES) == rate(LINK_STATUS) == 1

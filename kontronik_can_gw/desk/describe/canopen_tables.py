@@ -8,7 +8,6 @@ from fractions import Fraction
 from pathlib import PurePath
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.cob_ids import uses
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import TYPE_NAMES, Eds, Entry
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
@@ -37,7 +36,7 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     ids = [
         {"node": name, "cob_id": cob_id, "use": use}
         for name, node in named
-        for cob_id, use in sorted({use.cob_id: use.what for use in uses(node)}.items())
+        for cob_id, use in sorted({use.cob_id: use.what for use in node.uses()}.items())
     ]
     refused = ""
     if any(settings.read_only for settings in setup.settings):
