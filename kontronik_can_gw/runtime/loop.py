@@ -8,7 +8,7 @@ another thread). Threads of their own (worker.py) have the parameter store (stor
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
@@ -29,6 +29,7 @@ from kontronik_can_gw.times import MS, SECOND
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.files.recorder import Recorder
     from kontronik_can_gw.runtime.files.store import ParameterStore
+    from kontronik_can_gw.runtime.native_poller import NativePoller
 
 _WAKES_PER_TIMEOUT = 4
 """The loop wakes at least this often within the shortest telemetry time-out: by how much of it a value may go early.
@@ -154,7 +155,8 @@ class Loop:
         ready = None
         if self._poller.is_native:
             leave = self._housekeeping.due  # what the controller says is asked for with it
-            ready = self._poller.turn(self.can, self._now, self._own_deadline(), leave, period)
+            native = cast("NativePoller", self._poller)
+            ready = native.turn(self.can, self._now, self._own_deadline(), leave, period)
         if in_python := ready is None:
             if self._due is None:
                 self._due = self._next_deadline()

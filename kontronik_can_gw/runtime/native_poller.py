@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native.turns import OUTPUTS
-from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller, PortInput
+from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
+from kontronik_can_gw.runtime.port_input import PortInput
 
 if TYPE_CHECKING:
     from kontronik_can_gw.capture.recorded_gateway import RecordedGateway

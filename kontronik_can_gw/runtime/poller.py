@@ -9,14 +9,9 @@ import contextlib
 import select
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-from kontronik_can_gw.times import MS, NEVER, SECOND
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.can.can_link import CanLink
-    from kontronik_can_gw.runtime.can.can_port import CanPort
-    from kontronik_can_gw.runtime.ports.serial_port import SerialPort
+from kontronik_can_gw.runtime.port_input import PortInput
+from kontronik_can_gw.times import MS, SECOND
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (select.POLLIN, POLLOUT)."""
@@ -24,63 +19,7 @@ Handler = Callable[[int, int], None]
 
 MIN_HELD_UP_NS = 20 * MS
 """A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
-FIRST_RETRY_NS = 100 * MS
 _IN = select.POLLIN
-
-
-class PortInput:
-    """What is noted while a port is read; the core in C has its own with the same attributes (native/turns.py).
-
-    ``empty_ns``: the port was empty then. ``undrained_ns``: the last read left something, which came after this; NEVER: it left
-    nothing. ``is_plain``: what comes is to be read and nothing else. ``served``: it was read since this was set to False.
-    ``settings``: as the port was set; ``restored``: C has set it so again, since this was set to False.
-    """
-
-    def __init__(self) -> None:
-        self.empty_ns, self.undrained_ns = 0, NEVER
-        self.is_plain = False
-        self.served = True
-        self.settings = bytearray()
-        self.restored = False
-
-
-class StuckCheck:
-    """Whether a port is served."""
-
-    def __init__(self, noted: PortInput) -> None:
-        self._noted = noted
-        noted.served = True
-        self._seen_waiting = False
-
-    def is_stuck(self, port: "SerialPort | CanPort | None") -> bool:
-        """True if something has waited since the last call but one and nothing was read."""
-        waiting = port is not None and not self._noted.served and port.waits_to_be_read
-        stuck = waiting and self._seen_waiting
-        self._noted.served, self._seen_waiting = False, waiting
-        return stuck
-
-
-class Retry:
-    """When to try again what failed: soon at first, then more and more seldom, up to a bound, for ever.
-
-    ``due`` is None while nothing is to be tried.
-    """
-
-    def __init__(self, longest_ns: int) -> None:
-        self.due: int | None = None
-        self._longest = longest_ns
-        self._pause = FIRST_RETRY_NS
-
-    def failed(self, now: int) -> int:
-        """Try later, at the time that is returned: each time twice as late."""
-        self.due = due = now + self._pause
-        self._pause = min(self._pause * 2, self._longest)
-        return due
-
-    def succeeded(self) -> None:
-        """Nothing is to be tried; the next failure begins with the shortest pause."""
-        self.due = None
-        self._pause = FIRST_RETRY_NS
 
 
 class Poller:
@@ -88,7 +27,7 @@ class Poller:
 
     ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
     ``late``: by how much more than its pause the last turn and the wait took. ``changes`` grows with each change of what is watched.
-    ``is_native``: ``turn`` can do something. ``is_over``: it has left nothing to do, but for what is ready.
+    ``is_native``: it is a ``NativePoller``, which has turns. ``is_over``: it has left nothing to do, but for what is ready.
     """
 
     is_native = False
@@ -155,11 +94,6 @@ class Poller:
 
     def begin(self) -> None:
         """The loop begins."""
-
-    def turn(
-        self, can: "CanLink", last: int, due: int, leave: int, period: int
-    ) -> list[tuple[Handler, int]] | None:
-        """Nothing: turns are made in C by native_poller.py."""
 
     def watched(self) -> list[tuple[int, int, int | None]]:
         """The descriptors that are watched, for what, and whose port each is."""

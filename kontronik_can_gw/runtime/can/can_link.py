@@ -20,7 +20,9 @@ from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.can.transmitter import Transmitter
-from kontronik_can_gw.runtime.poller import Poller, PortInput, Retry, StuckCheck
+from kontronik_can_gw.runtime.poller import Poller
+from kontronik_can_gw.runtime.port_input import PortInput, StuckCheck
+from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.runtime.system.locks import IdLocks
 from kontronik_can_gw.status import CanState

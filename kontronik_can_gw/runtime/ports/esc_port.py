@@ -9,7 +9,8 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.poller import Poller, Retry, StuckCheck
+from kontronik_can_gw.runtime.poller import Poller
+from kontronik_can_gw.runtime.port_input import StuckCheck
 from kontronik_can_gw.runtime.ports.serial_port import (
     NoPort,
     PortLost,
@@ -18,6 +19,7 @@ from kontronik_can_gw.runtime.ports.serial_port import (
     is_mini_uart,
 )
 from kontronik_can_gw.runtime.ports.usb_adapters import Identity, find_adapter, identity_at
+from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.status.facts import PortFacts
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS, NEVER, SECOND
