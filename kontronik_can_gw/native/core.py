@@ -7,14 +7,21 @@ from typing import Any, cast
 from kontronik_can_gw.core.interface import Follower
 from kontronik_can_gw.core.messages import own_ids
 from kontronik_can_gw.core.output import Owner
-from kontronik_can_gw.core.slots import Slot, Slots
+from kontronik_can_gw.core.slots import PendingSlot, Slot, Slots, SlotSettings
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, held_settings
 from kontronik_can_gw.native.scale import END_OF_TIME
-from kontronik_can_gw.native.slots import NativeSlot, merge, reserve
+from kontronik_can_gw.native.slots import (
+    NativeSlot,
+    Place,
+    frame_count,
+    reserve,
+    slot_rows,
+    write_message,
+)
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
@@ -22,6 +29,7 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import GatewayStatus
 
 _MAX_FRAMES = 256
+_WORD = (1 << 64) - 1
 _LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"
 _Plan, _Esc, _Core = structure("kcg_plan"), structure("kcg_esc"), structure("kcg")
 _Sending = structure("kcg_sending")
@@ -125,6 +133,29 @@ class NativeCore:
         places = self._places[esc]
         return NativeSlot(self, places.pop(0) if places else None, esc, self._slots.add(esc))
 
+    def write_slot(self, place: Place, esc: int, settings: SlotSettings) -> bool:
+        """Write the rows of a slot. Return False if the core in C cannot express it."""
+        plan = settings.plan
+        try:
+            rows = slot_rows(plan, self.escs[esc].settings.protocol)
+        except NotInCore:
+            return False
+        for number, row in enumerate(rows.signals):
+            self.signals[place.signal + number] = row
+            signal = self.signals[place.signal + number]
+            signal.first_piece += place.piece
+            if row.esc == 0:
+                signal.esc = esc
+        for number, row in enumerate(rows.pieces):
+            self.pieces[place.piece + number] = row
+        self.watched[place.number] = plan.watched
+        message = self.messages[place.message]
+        write_message(message, settings, len(rows.signals))
+        for word in range(2):
+            fill = settings.fill >> 64 * word & _WORD
+            self.constants[message.first_word + word] = fill
+        return True
+
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         _check(esc, now, len(self.escs))
         receive, core = self.library.kcg_receive, self.core
@@ -181,7 +212,7 @@ class NativeCore:
         library, core = self.library, self.core
         while count := library.kcg_take(core, now, self._frames, _MAX_FRAMES):
             found = frames_in(self._raw, 0, count)
-            frames += merge(self, found, in_python) if in_python else found
+            frames += _merged(self, found, in_python) if in_python else found
             library.kcg_sent(core, now, count)
         for slot in in_python:
             frames += slot.frames
@@ -216,3 +247,29 @@ class NativeCore:
             if events & wanted:
                 follow(esc, events, now)
         self._slots.on_event(esc, events, now)
+
+
+def _merged(
+    core: NativeCore, frames: list[CanFrame], in_python: list[PendingSlot]
+) -> list[CanFrame]:
+    """Return the frames of kcg_take, with those of slots in Python at their places.
+
+    Slots that were placed are removed from ``in_python``. The others come after all frames.
+    """
+    merged: list[CanFrame] = []
+    first_slot = core.plan.messages
+    at = 0
+    place = 0
+    while at < len(frames):
+        index = core.pending[place]
+        place += 1
+        key = None
+        if index >= first_slot:
+            which = divmod(index - first_slot, core.slots_of_esc)
+            key = core.sending[index].since, which
+        while in_python and (key is None or in_python[0][:2] < key):
+            merged += in_python.pop(0).frames
+        end = at + frame_count(core.messages[index])
+        merged += frames[at:end]
+        at = end
+    return merged

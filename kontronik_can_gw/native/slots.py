@@ -1,24 +1,20 @@
 """Slots of the core in C (core.h, kcg_slot_start ...): their rows in its tables, and each as its owner sees it."""
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from kontronik_can_gw.core.slots import PendingSlot, PythonSlot, SlotPlan, SlotSettings
+from kontronik_can_gw.core.slots import PythonSlot, SlotPlan, SlotSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
 
-if TYPE_CHECKING:
-    from kontronik_can_gw.native.core import NativeCore
-
 MAX_SIGNALS = 8
 """Of a slot."""
 _MAX_PLANS = 256
 """Kept."""
-_WORD = (1 << 64) - 1
 _MAX_IN_ONE_FRAME = 7
 """Bytes of a transfer of one frame."""
 
@@ -67,39 +63,15 @@ def _add(tables: Tables, esc: int) -> Place:
     return place
 
 
-def merge(
-    core: "NativeCore", frames: list[CanFrame], in_python: list[PendingSlot]
-) -> list[CanFrame]:
-    """The frames that kcg_take returned, with Python's slots at their places among them.
-
-    Slots that were placed are removed from ``in_python``; slots that remain come after all frames.
-    """
-    merged: list[CanFrame] = []
-    first_slot = core.plan.messages
-    at = place = 0
-    while at < len(frames):
-        index = core.pending[place]
-        place += 1
-        key = None
-        if index >= first_slot:
-            key = core.sending[index].since, divmod(index - first_slot, core.slots_of_esc)
-        while in_python and (key is None or in_python[0][:2] < key):
-            merged += in_python.pop(0).frames
-        end = at + _count_frames(core.messages[index])
-        merged += frames[at:end]
-        at = end
-    return merged
-
-
-def _count_frames(message: Any) -> int:
-    """The number of frames of a row of kcg_message."""
+def frame_count(message: Any) -> int:
+    """Return the number of frames of a row of kcg_message."""
     is_long = message.flags & KCG.TRANSFER and message.length > _MAX_IN_ONE_FRAME
     return (int(message.length) + 8) // 7 if is_long else 1
 
 
 @lru_cache(_MAX_PLANS)
-def _rows(plan: SlotPlan, protocol: str) -> Tables:
-    """The rows of a slot for ESC 0. NotInCore where the core in C cannot express it."""
+def slot_rows(plan: SlotPlan, protocol: str) -> Tables:
+    """Return the rows of a slot for ESC 0. NotInCore if the core in C cannot express it."""
     if plan.only_python:
         raise NotInCore(plan.only_python)
     tables = Tables(Layout("", "", (plan.message,)), (EscSettings(protocol=protocol),))
@@ -108,13 +80,45 @@ def _rows(plan: SlotPlan, protocol: str) -> Tables:
     return tables
 
 
-class NativeSlot:
-    """As Slot: in C where it can be, else ``python`` is at work."""
+def write_message(message: Any, settings: SlotSettings, signals: int) -> None:
+    """Write a row of kcg_message for a slot with this number of signals."""
+    plan = settings.plan
+    is_transfer = plan.seed is not None
+    message.id = settings.can_id | (EXTENDED if is_transfer else 0)
+    message.length = plan.message.length
+    message.words = 2 if plan.message.length > 8 else 1
+    message.crc_at = settings.page
+    message.data_id = plan.seed or 0
+    flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live
+    message.flags = flags | KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
+    message.triggers = plan.triggers
+    message.signals = signals
+    message.cycle = settings.timer_ns
+    message.delay = settings.inhibit_ns
 
-    def __init__(
-        self, core: "NativeCore", place: Place | None, esc: int, python: PythonSlot
-    ) -> None:
-        self._core = core
+
+class SlotHost(Protocol):
+    """The part of ``NativeCore`` that a slot needs."""
+
+    library: Any
+    core: Any
+    """The address of kcg."""
+
+    def write_slot(self, place: Place, esc: int, settings: SlotSettings) -> bool:
+        """Write the rows of a slot. Return False if the core in C cannot express it."""
+
+    def choose_events(self) -> None:
+        """Ask C for the events that slots in Python follow now."""
+
+
+class NativeSlot:
+    """A slot (``core.slots.Slot``) that C sends, or ``python`` if C cannot express it.
+
+    ``place`` is None if C has no room for it.
+    """
+
+    def __init__(self, host: SlotHost, place: Place | None, esc: int, python: PythonSlot) -> None:
+        self._host = host
         self._place = place
         self._esc = esc
         self._python = python
@@ -135,27 +139,29 @@ class NativeSlot:
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
         was_in_c = self.is_in_c
-        self.is_in_c = settings is not None and self._write(settings)
+        self.is_in_c = False
+        if settings is not None and self._place is not None:
+            self.is_in_c = self._host.write_slot(self._place, self._esc, settings)
         self._python.configure(None if self.is_in_c else settings, now)
         if was_in_c and not self.is_in_c:
             self._call("stop")
         elif self.is_in_c and self._started:
             self._call("changed" if was_in_c else "start", now)
-        self._core.choose_events()
+        self._host.choose_events()
 
     def start(self, now: int) -> None:
         self._started = True
         self._python.start(now)
         if self.is_in_c:
             self._call("start", now)
-        self._core.choose_events()
+        self._host.choose_events()
 
     def stop(self) -> None:
         self._started = False
         self._python.stop()
         if self.is_in_c:
             self._call("stop")
-        self._core.choose_events()
+        self._host.choose_events()
 
     def news(self, now: int) -> None:
         if self.is_in_c:
@@ -171,37 +177,6 @@ class NativeSlot:
 
     def _call(self, name: str, *arguments: int) -> int:
         assert self._place is not None
-        function = getattr(self._core.library, f"kcg_slot_{name}")
-        found: int = function(self._core.core, self._place.number, *arguments)
+        function = getattr(self._host.library, f"kcg_slot_{name}")
+        found: int = function(self._host.core, self._place.number, *arguments)
         return found
-
-    def _write(self, settings: SlotSettings) -> bool:
-        """Write the rows; False where the slot cannot be in C."""
-        plan, place, core = settings.plan, self._place, self._core
-        if place is None:
-            return False
-        try:
-            rows = _rows(plan, core.escs[self._esc].settings.protocol)
-        except NotInCore:
-            return False
-        for number, row in enumerate(rows.signals):
-            core.signals[place.signal + number] = row
-            signal = core.signals[place.signal + number]
-            signal.first_piece += place.piece
-            if row.esc == 0:
-                signal.esc = self._esc
-        for number, row in enumerate(rows.pieces):
-            core.pieces[place.piece + number] = row
-        core.watched[place.number] = plan.watched
-        message: Any = core.messages[place.message]
-        is_transfer, length = plan.seed is not None, plan.message.length
-        message.id = settings.can_id | EXTENDED * is_transfer
-        message.length, message.words = length, 1 + (length > 8)
-        message.crc_at, message.data_id = settings.page, plan.seed or 0
-        for word in range(2):
-            core.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
-        message.flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live
-        message.flags |= KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
-        message.triggers, message.signals = plan.triggers, len(rows.signals)
-        message.cycle, message.delay = settings.timer_ns, settings.inhibit_ns
-        return True

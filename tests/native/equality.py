@@ -39,7 +39,7 @@ from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import GATEWAY, MAX_GEAR, NotInCore
-from kontronik_can_gw.native.slots import _rows
+from kontronik_can_gw.native.slots import slot_rows
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.status import GatewayStatus
@@ -234,7 +234,7 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
     seed, paced = chance.randrange(1 << 16), chance.random() < 0.7
     found = SlotPlan(plan, compile_pack(plan), Event.LIVE, 0, None, False, "", seed, paced)
     try:
-        _rows(found, EscSettings().protocol)
+        slot_rows(found, EscSettings().protocol)
     except NotInCore:
         return transfer_plan(chance)
     return found
