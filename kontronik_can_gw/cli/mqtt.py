@@ -19,7 +19,8 @@ from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.config.keys import Config, MqttConfig
 from kontronik_can_gw.config.kinds import BROKER
 from kontronik_can_gw.desk.libraries import missing_library
-from kontronik_can_gw.desk.mqtt.messages import Publisher, Topics
+from kontronik_can_gw.desk.mqtt.messages import Publisher
+from kontronik_can_gw.desk.mqtt.topics import Topics
 from kontronik_can_gw.desk.sources import Bus, can_config
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.system.fault_log import FaultLog

@@ -3,13 +3,12 @@
 No I/O, no clock.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.desk.mqtt.published import Published
+from kontronik_can_gw.desk.mqtt.topics import Topics
 from kontronik_can_gw.esc.values import VALUES, Group
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.desk.mqtt.messages import Published, Topics
 
 PROGRAM = "kontronik-can-gw"
 _UNITS: dict[str, tuple[str | None, str | None, str]] = {
@@ -69,7 +68,7 @@ _ERROR_ENTITIES: dict[str, dict[str, Any]] = {
 }
 
 
-def device(topics: "Topics", member: "Published") -> dict[str, Any]:
+def device(topics: Topics, member: Published) -> dict[str, Any]:
     """Return the discovery payload of the gateway or an ESC: one device with all its entities."""
     identifier = topics.identifier(member.name)
     online = {"topic": topics.of("online")}
@@ -99,7 +98,7 @@ def device(topics: "Topics", member: "Published") -> dict[str, Any]:
     }
 
 
-def _about(topics: "Topics", member: "Published") -> dict[str, Any]:
+def _about(topics: Topics, member: Published) -> dict[str, Any]:
     if member.index is None:
         return {"name": f"KONTRONIK gateway {topics.gateway}", "model": PROGRAM}
     model, firmware = member.identity or (None, None)
@@ -114,7 +113,7 @@ def _about(topics: "Topics", member: "Published") -> dict[str, Any]:
     return about
 
 
-def entity(source: str, member: "Published") -> dict[str, Any]:
+def entity(source: str, member: Published) -> dict[str, Any]:
     """Return Home Assistant's entity of a value."""
     value = VALUES[source]
     column = member.view.reader.columns[member.columns[source]]
