@@ -1,4 +1,4 @@
-"""Others on the bus that send with ids that only this gateway may send with."""
+"""Detects other devices on the bus that transmit with this gateway's CAN ids."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,36 +8,41 @@ from kontronik_can_gw.frames import block_of, ids_in_words
 from kontronik_can_gw.times import NEVER, SECOND
 
 _OVER_NS = 10 * SECOND
-"""A conflict is over when no further frame has come for so long."""
+"""A conflict ends if no further frame arrives for this long."""
 _ECHO_NS = SECOND // 5
+"""After the interface was opened, it may return own earlier frames for this long."""
 
 
 @dataclass
 class Conflict:
-    """Another device sends with an id of ours. ``whose``: what it is here; ``output``: that has it, None: the gateway.
-
-    ``over``: that has ceased.
-    """
+    """Another device that sends with an own id, or with an id of an own block."""
 
     key: int
+    """The id or block. 29-bit ids contain ``EXTENDED``."""
     whose: str
+    """Our use of the id, such as "message Voltages"."""
     node: int | None
+    """The ESC whose node sends with the id. None if no node does."""
     output: Output | None
+    """The output that uses the id. None if a message does."""
     last: int
+    """The time of the last frame."""
     count: int = 0
+    """Number of frames of the other device."""
     over: bool = False
+    """True if the conflict has ended."""
 
     @property
     def ids(self) -> str:
-        """The id, or the ids of a block, in words."""
+        """The id, or the ids of the block, as text."""
         return ids_in_words(self.key)
 
 
 class IdConflicts:
-    """Watches the ids of the gateway's messages, ``of_gateway``, and of all outputs."""
+    """Watches the ids of the messages and of all outputs."""
 
-    def __init__(self, of_gateway: Mapping[int, Owner], outputs: Sequence[Output]) -> None:
-        self._of_gateway = of_gateway
+    def __init__(self, message_ids: Mapping[int, Owner], outputs: Sequence[Output]) -> None:
+        self._message_ids = message_ids
         self._outputs = outputs
         self._revision = -1
         self._own: dict[int, tuple[Owner, Output | None]] = {}
@@ -49,42 +54,45 @@ class IdConflicts:
 
     @property
     def receive_ids(self) -> frozenset[int]:
-        """The ids (29-bit ones with EXTENDED) of all frames that concern us; the same object until they change."""
+        """As ``Gateway.receive_ids``."""
         self._follow()
         return self._receive_ids
 
     def _follow(self) -> None:
+        """Compute the ids again if an output has changed."""
         revision = sum([output.revision for output in self._outputs])
         if revision == self._revision:
             return
         self._revision = revision
-        own: dict[int, tuple[Owner, Output | None]]
-        own = {key: (owner, None) for key, owner in self._of_gateway.items()}
+        own: dict[int, tuple[Owner, Output | None]] = {}
+        for key, owner in self._message_ids.items():
+            own[key] = (owner, None)
         for output in self._outputs:
-            own |= {key: (owner, output) for key, owner in output.own_ids().items()}
-        self._own, self._own_blocks = own, tuple(key for key in own if key >> 32)
+            for key, owner in output.own_ids().items():
+                own[key] = (owner, output)
+        self._own = own
+        self._own_blocks = tuple(key for key in own if key >> 32)
         ids = frozenset(own).union(*[output.receive_ids for output in self._outputs])
         if ids != self._receive_ids:
             self._receive_ids = ids
 
     def first_own_id(self) -> int | None:
-        """The lowest id of ours that is of no ESC's node; None without any."""
+        """Return the lowest own id that belongs to no node, or None."""
         self._follow()
-        return min(
-            (key for key, (owner, _) in self._own.items() if owner.esc is None), default=None
-        )
+        without_node = [key for key, (owner, _) in self._own.items() if owner.esc is None]
+        return min(without_node, default=None)
 
     def own_blocks(self) -> tuple[int, ...]:
-        """The blocks of ids that only we send with."""
+        """Return the own blocks of ids."""
         self._follow()
         return self._own_blocks
 
     def can_opened(self, now: int) -> None:
-        """The interface was opened (again): what we sent before may still come back, and is no conflict."""
+        """Ignore own frames that an interface may return after it was opened."""
         self._echoes_until = now + _ECHO_NS
 
     def receive(self, key: int, now: int) -> bool:
-        """A data frame of another device; True where its id is ours."""
+        """Take a data frame of another device. Return True if it has an own id."""
         self._follow()
         own = key if key in self._own else block_of(key, self._own_blocks)
         if own is None or now < self._echoes_until:
@@ -92,7 +100,8 @@ class IdConflicts:
         conflict = self._present.get(own)
         if conflict is None:
             owner, output = self._own[own]
-            conflict = self._present[own] = Conflict(own, owner.what, owner.esc, output, now)
+            conflict = Conflict(own, owner.what, owner.esc, output, now)
+            self._present[own] = conflict
             self._news.append(conflict)
             self._report(conflict, True, now)
         conflict.count += 1
@@ -100,28 +109,28 @@ class IdConflicts:
         return True
 
     def advance(self, now: int) -> None:
-        """End the conflicts of which no frame has come for ten seconds."""
+        """End the conflicts without a frame for ten seconds."""
         if not self._present:
             return
         for conflict in [c for c in self._present.values() if now - c.last > _OVER_NS]:
             conflict.over = True
             del self._present[conflict.key]
             self._news.append(conflict)
-            if not any(
-                (each.output, each.node) == (conflict.output, conflict.node)
-                for each in self._present.values()
-            ):
+            node = (conflict.output, conflict.node)
+            others = [(each.output, each.node) for each in self._present.values()]
+            if node not in others:
                 self._report(conflict, False, now)
 
     def next_deadline(self) -> int:
-        """When ``advance`` has something to do at the earliest."""
+        """Return the earliest time at which ``advance`` can have something to do."""
         if not self._present:
             return NEVER
         return min(each.last + _OVER_NS + 1 for each in self._present.values())
 
     def take(self) -> list[Conflict]:
-        """Conflicts that have begun, or are over, since the last call."""
-        news, self._news = self._news, []
+        """Return the conflicts that began or ended since the last call."""
+        news = self._news
+        self._news = []
         return news
 
     def _report(self, conflict: Conflict, present: bool, now: int) -> None:

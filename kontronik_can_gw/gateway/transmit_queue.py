@@ -1,4 +1,7 @@
-"""Frames that wait to be sent. For each CAN id and multiplexer page the newest frame wins; ``queued`` frames are all sent, in order."""
+"""Frames that wait to be sent.
+
+For each CAN id and multiplexer page the newest frame wins. ``queued`` frames are all sent, in order.
+"""
 
 from collections.abc import Iterable, Sequence
 from enum import Enum
@@ -13,46 +16,59 @@ _is_queued = itemgetter(_place("queued"))
 
 
 class Sent(Enum):
-    """What became of a frame: accepted, not now (queue full), or the interface is down or gone."""
+    """The answer of a CAN interface to a frame."""
 
     OK = 1
+    """The frame was accepted."""
     BUSY = 2
+    """The queue of the interface is full. The frame must be sent later."""
     FULL = 3
-    """Not now: our own share of the queue is full. The port becomes writable when it is not."""
+    """Our own share of the queue is full. The port becomes writable when there is room."""
     DOWN = 4
+    """The interface is down."""
     GONE = 5
+    """The interface was removed."""
     LATE = 6
-    """Not sent: it has become old while it was to be handed over."""
+    """The frame became too old before it could be handed over, and was not sent."""
 
 
 class TransmitQueue:
     """Frames that wait to be sent.
 
-    1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that frame's place.
-    2. Frames of a step are sent in the order of ``put_all``: those of the outputs, then slots, then messages.
-    3. If the interface did not take all of them, queued and other frames alternate until nothing waits. Neither a flood
-       of answers nor fast measurements can then keep the other kind from the bus.
+    1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that
+       frame's place.
+    2. Frames of a step are sent in the order of ``put_all``: outputs, then slots, then messages.
+    3. If the interface did not take all of them, queued and other frames alternate until nothing
+       waits. Neither a flood of answers nor fast measurements can then keep the other kind from the
+       bus.
+
+    The queue of the loop in C (``native/linux.c``) follows the same rules.
     """
 
     def __init__(self) -> None:
         self._waiting: dict[tuple[int, ...], CanFrame] = {}
-        """In the order of ``put_all``. The key of a queued frame is a number of its own."""
+        """The frames in the order of ``put_all``. The key of a queued frame is a unique number."""
         self._queued = 0
         """Number of queued frames in ``_waiting``."""
         self._next_number = 0
         self._has_leftovers = False
-        """The interface took only a part of what waited."""
+        """True if the interface took only some of the waiting frames."""
         self._queue_has_turn = True
         self.replaced = 0
-        """Frames that were replaced by a newer one, or gave way to an older transfer, or were cleared. The owner may reset it."""
+        """Number of frames that were not sent: replaced by a newer one, dropped in favour of an
+        older transfer, or cleared. The owner may reset it.
+        """
         self.dropped = 0
-        """Queued frames that were lost because the queue was full, or cleared. The owner may reset it."""
+        """Number of queued frames that were lost because the queue was full, or cleared.
+
+        The owner may reset it.
+        """
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def put_all(self, frames: Sequence[CanFrame]) -> int:
-        """Adds frames. Returns how many frames were lost: replaced, or queued beyond ``QUEUE_LENGTH``."""
+        """Add frames. Return how many were lost: replaced, or queued beyond ``QUEUE_LENGTH``."""
         waiting = self._waiting
         count = len(waiting) + len(frames)
         dropped = 0
@@ -69,7 +85,7 @@ class TransmitQueue:
         return lost
 
     def _put_with_queued(self, frames: Iterable[CanFrame]) -> int:
-        """Adds frames, some of them queued. Returns how many queued frames found no room."""
+        """Add frames, some of them queued. Return how many queued frames found no room."""
         dropped = 0
         for frame in frames:
             if not frame.queued:
@@ -84,7 +100,10 @@ class TransmitQueue:
         return dropped
 
     def _has_begun(self, frame: CanFrame) -> bool:
-        """True for a part of a transfer while an older one is being sent: its first frame has left, others wait."""
+        """Return True for a part of a transfer while an older transfer is being sent.
+
+        Then the first frame of the older one was sent, and others wait.
+        """
         can_id, _, extended, _, page, _, _ = frame
         if page < FIRST_PART:
             return False
@@ -93,19 +112,25 @@ class TransmitQueue:
         return any(waiting) and not waiting[0]
 
     def in_order(self) -> list[CanFrame]:
-        """All waiting frames, in the order in which they are to be sent."""
+        """Return all waiting frames in the order in which they must be sent."""
         frames = list(self._waiting.values())
         if not (self._has_leftovers and self._queued):
             return frames
         queued = [frame for frame in frames if frame.queued]
         others = [frame for frame in frames if not frame.queued]
-        first, second = (queued, others) if self._queue_has_turn else (others, queued)
-        alternating = [frame for pair in zip(first, second, strict=False) for frame in pair]
-        both = len(alternating) // 2
-        return alternating + first[both:] + second[both:]
+        first = queued if self._queue_has_turn else others
+        second = others if self._queue_has_turn else queued
+        alternating: list[CanFrame] = []
+        for pair in zip(first, second, strict=False):
+            alternating += pair
+        count = len(alternating) // 2
+        return alternating + first[count:] + second[count:]
 
     def remove(self, frames: Sequence[CanFrame], count: int) -> None:
-        """Removes the first ``count`` of ``frames``, which ``in_order`` returned: they were sent. A next frame keeps its turn."""
+        """Remove the first ``count`` of ``frames``, which were sent. ``in_order`` returned them.
+
+        The kind of the frame that follows has the next turn.
+        """
         if self._queued and count and len(frames) > 1:
             self._queue_has_turn = not frames[count - 1].queued
         self._has_leftovers = count < len(frames)
@@ -122,20 +147,20 @@ class TransmitQueue:
                 del self._waiting[_slot_of(frame)]
 
     def take_all(self) -> list[CanFrame]:
-        """Removes and returns all waiting frames, in order."""
+        """Remove and return all waiting frames, in order."""
         frames = self.in_order()
         self.remove(frames, len(frames))
         return frames
 
     def drop_measurements(self) -> bool:
-        """Drops all frames that are not queued. Returns True if there were any."""
+        """Drop all frames that are not queued. Return True if there were any."""
         count = len(self._waiting) - self._queued
         self.replaced += count
         self._waiting = {key: frame for key, frame in self._waiting.items() if frame.queued}
         return bool(count)
 
     def clear(self) -> None:
-        """Drops all frames: they would be too old by the time they could be sent."""
+        """Drop all frames, because they would be too old when they could be sent."""
         self.drop_measurements()
         self.dropped += self._queued
         self._waiting.clear()
