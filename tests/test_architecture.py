@@ -2,7 +2,8 @@
 
 import ast
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,32 @@ def test_imports_run_one_way_and_each_library_stays_in_its_room(path: Path) -> N
             assert name.startswith(ONLY_IN[library]), f"{name} imports {library}"
         if library == NAME and inside and own not in ("__init__", "__main__"):
             assert _level(inside) <= _level(own), f"{own} imports {inside}"
+
+
+def _module_name(path: Path) -> str:
+    parts = (NAME, *path.relative_to(PACKAGE).with_suffix("").parts)
+    return ".".join(parts).removesuffix(".__init__")
+
+
+def _imported_modules(path: Path, modules: Collection[str]) -> set[str]:
+    """Return the modules of the package that a file imports, also those for types only."""
+    found = set(_imports(path))
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            submodules = names.intersection(modules)
+            if submodules:
+                found.discard(node.module)
+                found |= submodules
+    return found.intersection(modules) - {_module_name(path)}
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """Imports for types count, too: modules in a circle cannot be read one after the other."""
+    files = {_module_name(path): path for path in MODULES}
+    graph = {name: _imported_modules(path, files) for name, path in files.items()}
+    assert graph[f"{NAME}.runtime.loop"] >= {f"{NAME}.runtime.native_poller", f"{NAME}.times"}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 def _calls(path: Path) -> set[str]:

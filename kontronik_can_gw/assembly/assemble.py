@@ -75,7 +75,7 @@ class Loaded:
     dbc: bytes = b""
     """Content of the DBC file."""
     outputs: tuple[OutputSetup, ...] = ()
-    """Setups of the outputs besides the DBC."""
+    """Setups of the outputs that send other frames than those of the DBC."""
 
 
 def load_configuration(
@@ -117,7 +117,8 @@ def check_devices(config: Config) -> None:
     channel = os.path.realpath(config.can.channel.partition("@")[0])
     if "/" in config.can.channel and channel in ports:
         problems.append(
-            f"{config.file}: can.channel {config.can.channel} is the port of {ports[channel]}: nothing may be sent to an ESC."
+            f"{config.file}: can.channel {config.can.channel} is the port of {ports[channel]}: "
+            "nothing may be sent to an ESC."
         )
     if problems:
         raise UserError(*problems)

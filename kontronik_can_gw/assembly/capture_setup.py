@@ -1,15 +1,21 @@
-"""The gateway's setup in a capture's header: enough to rebuild the same gateway on any machine.
+"""The gateway's setup in a capture's header: enough to make the same gateway on any machine.
 
-JSON keys of the header (run and recorder add created_ns, run, part, monotonic_ns, wall_ns, devices, state, layout)::
+JSON keys of the header::
 
-    format, version      "kontronik-can-gw capture", 2
-    program              version, python, machine
-    configuration        the effective TOML text; file: its path
-    escs                 settings of each ESC (gear as "31/4") that were in effect
-    ports                their serial ports
-    dbc                  file, text (one character a byte), fd, silent_on_loss and the keys of [dbc]; null without it
-    canopen              eds (file, text), nodes, stored, escs (settings as configured); null without it
-    outputs              further ones by their names: table (as in the configuration), identity, version, seed; not in captures of 0.5.0
+    format, version  "kontronik-can-gw capture", 2
+    program          version, python, machine
+    configuration    the effective TOML text
+    file             the path of the configuration
+    escs             settings of each ESC that were in effect, with a gear such as "31/4"
+    ports            the serial ports of the ESCs
+    dbc              file, text (one character a byte), fd, silent_on_loss and the keys of [dbc].
+                     null without a DBC
+    canopen          eds (file, text), nodes, stored, escs (settings as configured).
+                     null without nodes
+    outputs          the other outputs by name, each with table (as in the configuration),
+                     identity, version and seed. Missing in captures of 0.5.0
+
+The recorder adds created_ns, run, part, monotonic_ns, wall_ns, devices, state and layout.
 """
 
 import platform
@@ -43,42 +49,45 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
 Header = Mapping[str, Any]
-_LATEST = 1 << 62
+_LATEST_NS = 1 << 62
+_MAX_PATH = 4096
+_MAX_ESCS = 1000
 _IN_HEADER = ("canopen",)
-"""Outputs that stand in the header itself, as in captures of 0.5.0. The others are in "outputs"."""
+"""Outputs with a key in the header itself, as in captures of 0.5.0. Others are in "outputs"."""
+_OTHER_DBC_NAMES = {"e2e_data_ids": "data_ids", "send_type": "send_types"}
 _DBC_KEYS = {
-    f.name: {"e2e_data_ids": "data_ids", "send_type": "send_types"}.get(f.name, f.name)
-    for f in fields(DbcConfig)
-    if f.name not in ("enabled", "file", "on_loss")
+    field.name: _OTHER_DBC_NAMES.get(field.name, field.name)
+    for field in fields(DbcConfig)
+    if field.name not in ("enabled", "file", "on_loss")
 }
-"""Keys of [dbc] to their names in a header."""
-_KINDS = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
+"""For each key of [dbc], its name in a header."""
+_TYPES = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
 
 
 @dataclass(frozen=True)
 class CaptureSetup:
-    """Everything that a gateway is built from. ``dbc``: name and bytes of the DBC file, None without DBC output."""
+    """Everything from which a gateway is made."""
 
     escs: tuple[EscSettings, ...]
+    """The settings in effect."""
     ports: tuple[str, ...]
     dbc: tuple[str, bytes] | None
+    """Name and content of the DBC file. None without a DBC."""
     dbc_settings: DbcConfig
     fd: bool
+    """True if the interface allows CAN FD."""
     configuration: str = ""
+    """The effective TOML text."""
     file: str = ""
+    """The path of the configuration."""
     version: int = VERSION
-    """Of the capture's format; 1: of 0.5.0."""
+    """The version of the capture's format. 0.5.0 wrote version 1."""
     outputs: tuple[OutputSetup, ...] = ()
 
     def header(self) -> dict[str, Any]:
-        """The header's JSON content."""
-        dbc = None
-        if self.dbc is not None:
-            name, data = self.dbc
-            dbc = {"file": name, "text": data.decode("latin-1"), "fd": self.fd}
-            dbc["silent_on_loss"] = self.dbc_settings.silent_on_loss
-            dbc |= {name: getattr(self.dbc_settings, key) for key, name in _DBC_KEYS.items()}
+        """Return the header's JSON content."""
         outputs = {setup.name: setup.header() for setup in self.outputs}
+        in_header = {name: outputs.pop(name, None) for name in _IN_HEADER}
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -91,19 +100,31 @@ class CaptureSetup:
             "file": self.file,
             "escs": [esc_json(esc) for esc in self.escs],
             "ports": list(self.ports),
-            "dbc": dbc,
-            **{name: outputs.pop(name, None) for name in _IN_HEADER},
+            "dbc": self._dbc_json(),
+            **in_header,
             "outputs": outputs,
         }
 
+    def _dbc_json(self) -> dict[str, Any] | None:
+        if self.dbc is None:
+            return None
+        file, data = self.dbc
+        settings = self.dbc_settings
+        found = {"file": file, "text": data.decode("latin-1"), "fd": self.fd}
+        found["silent_on_loss"] = settings.silent_on_loss
+        for key, name in _DBC_KEYS.items():
+            found[name] = getattr(settings, key)
+        return found
+
     @classmethod
     def of(cls, header: Header) -> "CaptureSetup":
-        """Read a capture's header. HeaderError with the reason if it is not ours or invalid."""
+        """Read a capture's header. Raises HeaderError with the reason if it cannot be used."""
         if header.get("format") != FORMAT:
             raise HeaderError("the header does not belong to a capture")
-        if header.get("version") not in VERSIONS:
+        version = header.get("version")
+        if version not in VERSIONS:
             raise HeaderError(
-                f"capture version {header.get('version')} is unknown, this program knows versions up to {VERSION}"
+                f"capture version {version} is unknown, this program knows versions up to {VERSION}"
             )
         try:
             with reading("the header"):
@@ -115,27 +136,28 @@ class CaptureSetup:
     @classmethod
     def _of(cls, header: Header) -> "CaptureSetup":
         dbc = header["dbc"]
-        settings, file = DbcConfig(), None
+        settings = DbcConfig()
+        dbc_file = None
         if dbc is not None:
             with reading("dbc"):
-                file = (str(dbc["file"]), file_bytes(dbc["text"], "dbc"))
+                dbc_file = (str(dbc["file"]), file_bytes(dbc["text"], "dbc"))
                 settings = _dbc_settings(dbc)
         with reading("escs"):
             escs = tuple(esc_of(esc) for esc in header["escs"])
         return cls(
-            escs,
-            tuple(map(str, header["ports"])),
-            file,
-            settings,
-            bool(dbc and dbc["fd"]),
-            str(header["configuration"]),
-            str(header["file"]),
-            header["version"],
-            _outputs_of(header, escs),
+            escs=escs,
+            ports=tuple(map(str, header["ports"])),
+            dbc=dbc_file,
+            dbc_settings=settings,
+            fd=bool(dbc and dbc["fd"]),
+            configuration=str(header["configuration"]),
+            file=str(header["file"]),
+            version=header["version"],
+            outputs=_outputs_of(header, escs),
         )
 
     def database(self) -> tuple["Database", Layout] | None:
-        """The DBC that was sent by and its layout; None without DBC output. UserError if this version refuses it."""
+        """Return the recorded DBC and its layout, or None. UserError if this version refuses it."""
         if self.dbc is None:
             return None
         name, data = self.dbc
@@ -143,7 +165,7 @@ class CaptureSetup:
         return database, prepare(database, name, self.escs, self.dbc_settings, self.fd)
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
-        """The gateway in its state before the start."""
+        """Return the gateway in its state before the start."""
         return Gateway(self.escs, layout, now, self.dbc_settings.silent_on_loss, self.outputs)
 
 
@@ -151,7 +173,7 @@ def _outputs_of(header: Header, escs: Sequence[EscSettings]) -> tuple[OutputSetu
     """Read the outputs of a header."""
     found = dict(header.get("outputs", {}))
     for name in found:
-        if name not in OUTPUTS:
+        if name not in OUTPUTS or name in _IN_HEADER:
             raise HeaderError(f"{str(name)[:40]!r} is no output that this version knows")
     for name in _IN_HEADER:
         if header[name] is not None:
@@ -161,29 +183,37 @@ def _outputs_of(header: Header, escs: Sequence[EscSettings]) -> tuple[OutputSetu
 
 
 def _dbc_settings(found: Mapping[str, Any]) -> DbcConfig:
-    """Settings checked like those of a configuration. Captures of 0.5.0 have fewer."""
-    keys = {key: found.get(name) for key, name in _DBC_KEYS.items()}
-    given = {key: value for key, value in keys.items() if value not in (None, {}, [])}
-    given |= {key: found[_DBC_KEYS[key]] for key in ("bind", "e2e_data_ids")}
+    """Read the keys of [dbc], and check them as in a configuration.
+
+    Captures of 0.5.0 have fewer keys. Two of them are always there.
+    """
+    given = {}
+    for key, name in _DBC_KEYS.items():
+        value = found.get(name)
+        if value not in (None, {}, []):
+            given[key] = value
+    for key in ("bind", "e2e_data_ids"):
+        given[key] = found[_DBC_KEYS[key]]
     given["on_loss"] = "silent" if found["silent_on_loss"] else "not_available"
     return parse({"dbc": given, "esc": [{"port": "-"}]}, "the capture").dbc
 
 
 def _check(header: Header) -> None:
-    """Check the parts that readers use unchanged. HeaderError for what a recorder never writes."""
+    """Check the parts that readers use unchanged. HeaderError if no recorder writes them so."""
     for name, latest in (
         ("monotonic_ns", END_OF_TIME - 1),
         ("created_ns", END_OF_TIME - 1),
-        ("wall_ns", _LATEST),
+        ("wall_ns", _LATEST_NS),
     ):
         if header.get(name) is not None:
             whole_number(header[name], 0, latest)
     for name in ("run", "file"):
-        short_text(header.get(name, ""), 4096)
+        short_text(header.get(name, ""), _MAX_PATH)
     whole_number(header.get("part", 0), 0, 1 << 32)
-    for name, kind in _KINDS.items():
-        if not isinstance(header.get(name, kind()), kind):
+    for name, part_type in _TYPES.items():
+        if not isinstance(header.get(name, part_type()), part_type):
             raise HeaderError(f"{name} is not as a recorder writes it")
-    if not 1 <= len(header["escs"]) <= 1000 or not isinstance(header["configuration"], str):
+    has_escs = 1 <= len(header["escs"]) <= _MAX_ESCS
+    if not has_escs or not isinstance(header["configuration"], str):
         raise HeaderError("escs or configuration is not as a recorder writes it")
     check_state(header.get("state", {}))

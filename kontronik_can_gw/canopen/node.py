@@ -260,7 +260,7 @@ class Node:
         """Follow the end of bus-off, or the return of the interface.
 
         With 1029h:1 = 0 the node boots, so that its master configures it again. CiA 301 asks for
-        PRE-OPERATIONAL. The boot-up also brings a self-starting node without a master to work again.
+        PRE-OPERATIONAL. After the boot-up, a self-starting node without a master works again, too.
         """
         if self.nmt.boots_after_outage and self.node_id != UNCONFIGURED:
             self.reset_communication(now)

@@ -1,4 +1,8 @@
-"""What the configuration says of a node; how it, the EDS and stored values make the dictionary and the ESC's settings (2100h)."""
+"""The settings of a node, and how the object dictionary is made from them.
+
+The dictionary comes from the EDS, the configuration and stored values. The settings of the ESC
+(2100h) follow from it.
+"""
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -11,32 +15,33 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.times import MS
 
 _SELF_START_OFF = 4
-# whatever the limits of an EDS are
-_MIN_TIMEOUT_MS, _MAX_TIMEOUT_MS = 20, 60_000
+# These limits hold whatever the EDS allows.
+_MIN_TIMEOUT_MS = 20
+_MAX_TIMEOUT_MS = 60_000
 _MAX_CELLS = 0xFF
 
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """What the configuration says of a node.
-
-    ``node_id``: 1..127, or 255 for a node that waits for LSS. ``vendor_id`` None: as the EDS says. ``segment_ns``: distance of the
-    segments of a block upload. ``device``: number of the device that is expected on the line, None for any.
-    """
+    """The settings of a node in the configuration."""
 
     node_id: int
+    """1..127, or 255 for a node that waits for LSS."""
     serial: int = 0
     vendor_id: int | None = None
+    """None for the vendor-ID of the EDS."""
     self_start: bool = False
     read_only: bool = False
     bitrate: int = 500_000
     segment_ns: int = 0
+    """Minimum time between segments of a block upload."""
     version: str = ""
     device: int | None = None
+    """The expected device number, or None for any device."""
 
 
 def _entries(settings: EscSettings) -> dict[int, int]:
-    """Settings of an ESC as the sub-indices of 2100h."""
+    """Return the settings of an ESC by sub-index of 2100h."""
     return {
         1: settings.pole_pairs,
         2: settings.gear.numerator,
@@ -48,8 +53,10 @@ def _entries(settings: EscSettings) -> dict[int, int]:
 
 
 def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
-    """The settings of 2100h; ``base`` where the EDS has no object for one."""
-    held = {sub: dictionary.number(at.SETTINGS, sub, own) for sub, own in _entries(base).items()}
+    """Return the settings of 2100h, with those of ``base`` for objects that the EDS lacks."""
+    held = {}
+    for sub, own in _entries(base).items():
+        held[sub] = dictionary.number(at.SETTINGS, sub, own)
     return replace(
         base,
         pole_pairs=max(1, held[1]),
@@ -61,7 +68,7 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
 
 
 def configured_settings(base: EscSettings) -> dict[int, int]:
-    """Sub-indices of 2100h that the configuration sets, and to what."""
+    """Return the values that the configuration gives to sub-indices of 2100h."""
     standard = _entries(EscSettings())
     return {sub: given for sub, given in _entries(base).items() if given != standard[sub]}
 
@@ -69,9 +76,10 @@ def configured_settings(base: EscSettings) -> dict[int, int]:
 def make_dictionary(
     eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored
 ) -> Dictionary:
-    """The dictionary of a node before its first reset, the configuration's values as power-on values and the stored ones in place.
+    """Return the dictionary of a node before its first reset.
 
-    Where the configuration leaves a setting at its default, the EDS's default holds.
+    Values of the configuration are power-on values, and stored values are current values. The EDS
+    has the defaults of settings that the configuration does not change.
     """
     dictionary = Dictionary(eds)
     power_on = {(at.SETTINGS, sub): given for sub, given in configured_settings(base).items()}

@@ -172,7 +172,8 @@ class CanopenSetup(OutputSetup):
             for number in to_ignore:
                 name = self.escs[number].name
                 warnings.append(
-                    f"{name}: the stored node-ID and COB-IDs are ignored: one of them is used otherwise now"
+                    f"{name}: the stored node-ID and COB-IDs are ignored: "
+                    "one of them is used otherwise now"
                 )
                 kept[number] = kept[number].without_ids()
             setup = replace(setup, stored=tuple(kept))
@@ -251,9 +252,11 @@ def configured(config: Config, machine: Machine) -> CanopenSetup:
         settings.append(node)
     notes: tuple[str, ...] = ()
     if canopen.serial is None and not machine.identity:
-        notes = (
-            "this machine has no id, so serial numbers (1018h:4) are 0 and LSS cannot distinguish the nodes: set canopen.serial",
+        note = (
+            "this machine has no id, so serial numbers (1018h:4) are 0 "
+            "and LSS cannot distinguish the nodes: set canopen.serial"
         )
+        notes = (note,)
     nothing_stored = (Stored(),) * len(settings)
     return CanopenSetup(eds, tuple(settings), nothing_stored, tuple(config.escs), notes=notes)
 

@@ -62,7 +62,8 @@ def file_bytes(text: str, part: str) -> bytes:
     except UnicodeEncodeError as error:
         character = text[error.start]
         raise HeaderError(
-            f"{part}: the text of the file has {character!r}, but each character stands for one byte"
+            f"{part}: the text of the file has {character!r}, "
+            "but each character stands for one byte"
         ) from None
 
 

@@ -1,9 +1,10 @@
-"""The interface of the core: bytes of ESCs and time go in, CAN frames and deadlines come out.
+"""The interface of the core, which turns bytes of ESCs and time into CAN frames and deadlines.
 
 There are two implementations with the same behaviour: ``core.python_core.PythonCore`` and, in C,
-``native.core.NativeCore``. A core holds the telemetry of each ESC, the messages of a layout and their
-schedule. ``receive`` decodes and marks messages as pending, ``advance`` lets cycles and timeouts
-pass, and ``take`` packs the pending messages. ``now`` is integer nanoseconds of one monotonic clock.
+``native.core.NativeCore``. A core holds the telemetry of each ESC, the messages of a layout and
+their schedule. ``receive`` decodes and marks messages as pending, ``advance`` lets cycles and
+time-outs pass, and ``take`` packs the pending messages. ``now`` is integer nanoseconds of one
+monotonic clock.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,23 +17,28 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.status import GatewayStatus
 
 OnEvent = Callable[[int, int, int], None]
-"""ESC, bits of telemetry.Event, time."""
+"""Takes the ESC, bits of ``telemetry.Event``, and the time."""
 
 
 class Follower(NamedTuple):
-    """``on_event`` is given what happens, as it happens, with at least one of ``events``."""
+    """A function that is called as soon as at least one of ``events`` occurs."""
 
     events: int
     on_event: OnEvent
 
 
 class Core(Protocol):
-    """The seam of the core: what the gateway asks of it. In Python it is PythonCore, in C native.core.NativeCore."""
+    """All that the gateway uses of a core. Calls must be in the order of their times."""
 
     language: str
     """``Python`` or ``C``."""
     note: str
-    """What live frames need Python for although the core is in C, in words; empty: nothing."""
+    """The reason why Python works on live frames although the core is in C, or ""."""
+    followers: Sequence[Follower]
+    link_changes: list[int]
+    """ESCs whose link state, layout or device changed. The owner empties the list."""
+    shortest_timeout_ns: int
+    """The shortest time-out of all ESCs, after which live data are not available."""
 
     @property
     def escs(self) -> Sequence[EscTelemetry]:
@@ -40,51 +46,65 @@ class Core(Protocol):
 
     @property
     def status(self) -> GatewayStatus:
-        """The gateway's own values; the runtime writes the CAN side, then ``gateway_changed`` where that cannot wait."""
+        """The gateway's own values.
+
+        The runtime writes the values of the CAN interface. Messages with them follow at their next
+        cycle, or at once after ``gateway_changed``.
+        """
 
     @property
     def own_ids(self) -> Mapping[int, Owner]:
-        """The ids of the messages (29-bit ones with EXTENDED), and what for."""
-
-    followers: Sequence[Follower]
-    link_changes: list[int]
-    """ESCs whose link state, layout or device changed; the owner empties it."""
-    shortest_timeout_ns: int
-    """Of all ESCs: live data of one is not available after this."""
-
-    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
-        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (esc_stream.py, Arrival)."""
-
-    def port(self, esc: int, is_open: bool, now: int) -> None:
-        """An ESC's port was opened (again), or cannot be used: its values are not available from now on."""
-
-    def apply(self, esc: int, settings: EscSettings) -> None:
-        """Other settings of an ESC from now on."""
+        """The ids of the messages. 29-bit ids contain ``EXTENDED``."""
 
     def slot(self, esc: int) -> Slot:
-        """A further slot of an ESC."""
+        """Return a new slot of an ESC, from which the core sends measurements of an output."""
+
+    # --- ESCs
+
+    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
+        """Take bytes of one ESC that were read at ``now``.
+
+        ``since`` is a time at which none of these bytes had arrived yet. Their age counts from it
+        (``core/esc_stream.py``, Arrival).
+        """
+
+    def port(self, esc: int, is_open: bool, now: int) -> None:
+        """Follow an ESC's port that was opened or lost. In both cases its values are dropped."""
+
+    def apply(self, esc: int, settings: EscSettings) -> None:
+        """Give an ESC other settings."""
+
+    # --- time
 
     def expire(self, now: int) -> None:
-        """What is too old by now goes."""
+        """Drop expired values."""
 
     def advance(self, now: int) -> None:
-        """Let time pass: time-outs, cyclic messages."""
+        """Let time pass: drop expired values, and mark messages and slots whose cycle is due."""
 
     def next_deadline(self) -> int:
-        """When ``advance`` is to be called at the latest."""
+        """Return the time at which ``advance`` must be called. Earlier calls do no harm."""
+
+    # --- messages
 
     def gateway_changed(self, now: int) -> None:
-        """``status`` has changed: messages that hold it follow."""
+        """Mark the messages that follow changes of ``status``."""
 
     def repeat(self, now: int) -> None:
-        """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
+        """Mark every message without a cycle.
+
+        So no receiver keeps values from before a restart or an outage.
+        """
 
     def stop(self, now: int) -> None:
-        """What the gateway says of itself goes out once more, all pages at once, without regard to minimum distances."""
+        """Mark the messages with values of the gateway, all pages, without minimum distances."""
 
     @property
     def is_pending(self) -> bool:
         """True while ``take`` has something to do."""
 
     def take(self, now: int) -> list[CanFrame]:
-        """The frames of what is due, with the values of now: slots, then messages, each in the order in which they became due."""
+        """Return the frames of pending slots and messages, packed with current values.
+
+        Slots are first. Both are in the order in which they became due.
+        """

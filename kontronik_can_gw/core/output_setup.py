@@ -1,4 +1,4 @@
-"""An output before it is made: its settings, the CAN ids that it uses, the traffic that it causes."""
+"""An output before it is made: its settings, its CAN ids and the traffic that it causes."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence

@@ -15,7 +15,10 @@ from kontronik_can_gw.times import SECOND
 
 
 class PythonCore:
-    """The core in plain Python. ``silent``: see Messages."""
+    """The core in plain Python. See ``core.interface.Core`` for its methods.
+
+    With ``silent``, messages stop while telemetry is lost (``core.messages.Messages``).
+    """
 
     language = "Python"
     note = ""
@@ -41,7 +44,12 @@ class PythonCore:
         self.link_changes: list[int] = []
         self._second_ns = now
         self._next_expiry = 0
-        """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
+        """No ESC has a deadline before this time.
+
+        Deadlines only become later, except when a link comes up. Then this time is computed again.
+        """
+
+    # --- ESCs
 
     def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
         state = self._expired(esc, now)
@@ -49,22 +57,15 @@ class PythonCore:
             self._report(esc, events, now)
 
     def accept(self, esc: int, reading: Reading, now: int) -> None:
-        """A reading that came at ``now``; its ESC's decoder has counted it."""
-        if events := self._expired(esc, now).accept(reading, now, now):
+        """Take a reading that arrived at ``now`` and that the ESC's decoder has counted."""
+        events = self._expired(esc, now).accept(reading, now, now)
+        if events:
             self._report(esc, events, now)
-
-    def _expired(self, esc: int, now: int) -> EscStream:
-        """An ESC that is about to bring something, after what is too old by now went. IndexError where there is none, and nothing went."""
-        state = self.escs[esc]
-        if now >= self._next_expiry:
-            self.expire(now, but=esc)  # a message may hold values of several ESCs
-            if events := state.expire(now):
-                self._report(esc, events, now)
-        return state
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         state = self.escs[esc]
-        if events := state.port_opened() if is_open else state.port_lost():
+        events = state.port_opened() if is_open else state.port_lost()
+        if events:
             self._report(esc, events, now)
 
     def apply(self, esc: int, settings: EscSettings) -> None:
@@ -72,17 +73,37 @@ class PythonCore:
         self.shortest_timeout_ns = self._shortest_timeout()
         self._next_expiry = 0
 
+    def _shortest_timeout(self) -> int:
+        return min(esc.settings.timeout_ns for esc in self.escs)
+
+    # --- time
+
     def expire(self, now: int, but: int | None = None) -> None:
-        """What is too old by now goes, of all ESCs ``but`` one that is about to bring something."""
+        """Drop the expired values of all ESCs except ``but``."""
         if now < self._next_expiry:
             return
         for index, esc in enumerate(self.escs):
-            if index != but and now >= esc.next_deadline() and (events := esc.advance(now)):
-                self._report(index, events, now)
+            if index != but and now >= esc.next_deadline():
+                events = esc.advance(now)
+                if events:
+                    self._report(index, events, now)
         self._next_expiry = min(esc.next_deadline() for esc in self.escs)
         if now - self._second_ns >= SECOND:
             self._second_ns = now
             self.messages.on_gateway_change(now, each_second=True)
+
+    def _expired(self, esc: int, now: int) -> EscStream:
+        """Drop expired values, and return the state of an ESC that takes new ones.
+
+        IndexError if there is no such ESC. Then nothing was dropped.
+        """
+        state = self.escs[esc]
+        if now >= self._next_expiry:
+            self.expire(now, but=esc)  # a message may hold values of several ESCs
+            events = state.expire(now)
+            if events:
+                self._report(esc, events, now)
+        return state
 
     def advance(self, now: int) -> None:
         if now >= self._next_expiry:
@@ -95,28 +116,33 @@ class PythonCore:
         due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
         return min(due, self.messages.next_due, self.slots.next_deadline())
 
-    def take(self, now: int) -> list[CanFrame]:
-        slots, messages = self.slots.take(now), self.messages.take(now)
-        return slots + messages if slots else messages
+    # --- frames
 
     @property
     def is_pending(self) -> bool:
         return bool(self.messages.pending) or self.slots.is_pending
 
+    def take(self, now: int) -> list[CanFrame]:
+        slots = self.slots.take(now)
+        messages = self.messages.take(now)
+        return slots + messages if slots else messages
+
     def _report(self, esc: int, events: int, now: int) -> None:
+        """Pass events of an ESC to messages, followers and slots."""
         self.messages.on_event(esc, events, now)
         if events & (Event.LINK | Event.INFO):
-            if events & Event.LINK:
-                self.link_changes.append(esc)
-            self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
-            escs_ok = sum([e.live is not None for e in self.escs])
-            if escs_ok != self.status.escs_ok:
-                self.status.escs_ok = escs_ok
-                self.messages.on_gateway_change(now)
+            self._follow_link(esc, events, now)
         for wanted, follow in self.followers:
             if events & wanted:
                 follow(esc, events, now)
-        self.slots.on_event(esc, events, now)  # what followers know may be in one
+        # Slots are last, because they may hold values that followers have just changed.
+        self.slots.on_event(esc, events, now)
 
-    def _shortest_timeout(self) -> int:
-        return min(esc.settings.timeout_ns for esc in self.escs)
+    def _follow_link(self, esc: int, events: int, now: int) -> None:
+        if events & Event.LINK:
+            self.link_changes.append(esc)
+        self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
+        escs_ok = sum([each.live is not None for each in self.escs])
+        if escs_ok != self.status.escs_ok:
+            self.status.escs_ok = escs_ok
+            self.messages.on_gateway_change(now)

@@ -1,6 +1,7 @@
 """Frames that wait to be sent.
 
-For each CAN id and multiplexer page the newest frame wins. ``queued`` frames are all sent, in order.
+For each CAN id and multiplexer page the newest frame wins. All ``queued`` frames are sent, in
+order.
 """
 
 from collections.abc import Iterable, Sequence
