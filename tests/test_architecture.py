@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from kontronik_can_gw.core.output_setup import OUTPUTS
+
 PACKAGE = Path(__file__).resolve().parents[1] / "kontronik_can_gw"
 NAME = "kontronik_can_gw"
 ORDER = (
@@ -181,6 +183,22 @@ def test_nothing_outside_its_folder_knows_the_wire() -> None:
             known.discard(f"{wire}.protocol")
         if not name.startswith("esc/kontronik/"):
             assert not known, f"{name} knows the wire"
+
+
+OUTPUT_TOOLS = ("cli/common.py", "cli/dbc.py", "cli/describe.py", "cli/eds.py", "desk/describe/")
+"""Modules that describe CANopen nodes: commands for EDS and DBC files, and tables."""
+
+
+def test_only_its_own_tools_import_an_output() -> None:
+    """Everything else uses an output through core/output.py and core/output_setup.py."""
+    rooms = tuple(f"{NAME}.{output}" for output in OUTPUTS)
+    importers = set()
+    for path in MODULES:
+        name = path.relative_to(PACKAGE).as_posix()
+        if _room(path) not in OUTPUTS and any(each.startswith(rooms) for each in _imports(path)):
+            importers.add(name)
+    assert importers
+    assert [name for name in sorted(importers) if not name.startswith(OUTPUT_TOOLS)] == []
 
 
 MAX_LINES = {"file": 450, "class": 300, "function": 50}

@@ -6,7 +6,8 @@ import pytest
 
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.core.output import NO_IDS, Output, OutputHost, Owner
+from kontronik_can_gw.core.output import NO_IDS, NodeOutput, NodeState, Output, OutputHost, Owner
+from kontronik_can_gw.core.output_setup import ReadyOutput
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -15,7 +16,9 @@ from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.esc.values import VALUES, steps
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.runtime.system.locks import names_of
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.status import NmtState
 from kontronik_can_gw.times import SECOND
 
 FIRST_ID, COMMAND_ID = 0x1234500, 0x12
@@ -74,6 +77,55 @@ def test_other_receive_ids_increase_the_revision_even_if_they_are_equal() -> Non
         output.receive_ids = NO_IDS
         output.receive_ids = frozenset((number // 2,))
         assert output.revision == before + 2
+
+
+class Memory(NodeOutput):
+    """An output whose one node stores a number that a frame brings, and rejects odd ones."""
+
+    node_title = "memory node"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.receive_ids = frozenset({COMMAND_ID})
+        self.answers: list[tuple[int, str | None]] = []
+        self.rejected: list[tuple[int, int]] = []
+
+    def receive(self, frame: CanFrame, now: int, at: int) -> None:
+        if frame.data[0] % 2:
+            self.rejected.append((0, frame.data[0]))
+            self.revision += 1
+        else:
+            self.save(0, frame.data)
+
+    def saved(self, esc: int, error: str | None, now: int) -> None:
+        self.answers.append((esc, error))
+
+    def node_states(self) -> list[NodeState]:
+        return [NodeState(5, NmtState.OPERATIONAL, 7)]
+
+    def take_rejected_parameters(self) -> list[tuple[int, int]]:
+        rejected, self.rejected = self.rejected, []
+        return rejected
+
+
+def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
+    memory, plain = Memory(), Output()
+    makers = [ReadyOutput(plain), ReadyOutput(memory)]
+    gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=makers)
+    assert gateway.node_outputs == [memory]
+    for number in (2, 3, 4):
+        before = gateway.revision
+        gateway.receive_frame(CanFrame(COMMAND_ID, bytes((number,))), 0, 0)
+        assert gateway.revision > before
+    assert gateway.take_saves() == [(0, b"\x02"), (0, b"\x04")]
+    assert gateway.take_saves() == []
+    gateway.saved(0, None, 0)
+    gateway.saved(0, "disk full", 0)
+    gateway.saved(0, "one too many", 0)
+    assert memory.answers == [(0, None), (0, "disk full")]
+    assert gateway.take_rejected_parameters() == [(0, 3)]
+    assert gateway.node_states() == [(5, NmtState.OPERATIONAL, 7)]
+    assert names_of(gateway, "can0") == ["can0: memory node 5"]
 
 
 def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
