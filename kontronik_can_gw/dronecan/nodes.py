@@ -1,4 +1,7 @@
-"""The DroneCAN output: the gateway's node, or one for each ESC, on one bus; what a node says of itself, what it answers."""
+"""The DroneCAN output: the gateway's node, or one for each ESC.
+
+A node reports its own status and answers requests. The core sends the measurements of its ESCs.
+"""
 
 import struct
 from collections.abc import Sequence
@@ -20,44 +23,48 @@ from kontronik_can_gw.times import NEVER, SECOND
 SERVICES = {kind.number: kind for kind in (wire.GET_NODE_INFO, wire.RESTART_NODE, wire.GET_SET)}
 _HARDWARE = (1, 0)
 _VALUE_SIZES = (0, 8, 4, 1)
-"""Bytes of a parameter's value by the tag of its union: none, integer, real, boolean."""
+"""Bytes of a parameter's value, by the tag of its union: empty, integer, real, boolean."""
 _STRING = 4
 Parameter = int | float | str
 MAX_ANSWERS = 50
-"""Requests that are answered in a second: nobody keeps the bus busy by asking."""
+"""Maximum number of answers per second, so that requests cannot fill the bus."""
 _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
-"""Ids of Allocation messages: of an allocator, of others that ask."""
+"""Ids of Allocation messages: of an allocator, and of other nodes that ask for a node-ID."""
 
 
 class Node:
-    """``node_id`` 0: it waits for one, and says nothing."""
+    """One node. While its ``node_id`` is 0 it waits for one and is silent."""
 
     def __init__(self, setup: NodeSetup, given: Given, reports: Sequence[EscReport]) -> None:
         self.setup = setup
         self.node_id = setup.node_id
         self.reports = [reports[number] for number in setup.escs]
         self.is_duplicate = False
-        """Another device sends with this node-ID."""
+        """True while another device sends with this node-ID."""
         self._table = given.table
         self._version = given.version
         self._transfer_ids: dict[int, int] = {}
 
     def start(self, now: int) -> None:
-        """It has its node-ID: let the core send what its ESCs measure."""
+        """Let the core send the measurements of its ESCs, because it has its node-ID."""
         for place, report in enumerate(self.reports):
             report.start(self.node_id, place, now)
 
     def message(
         self, kind: DataType, payload: bytes, queued: bool = False, priority: int = wire.LOW
     ) -> list[CanFrame]:
-        """The frames of a message to all. ``queued`` as in CanFrame."""
+        """Return the frames of a broadcast message. ``queued`` as in ``CanFrame``."""
         count = self._transfer_ids.get(kind.number, 0)
         self._transfer_ids[kind.number] = count + 1 & TRANSFER_ID
         can_id = wire.message_id(kind.number, self.node_id, priority)
         return transfer(can_id, kind.seed, payload, count, queued)
 
     def status(self, uptime_s: int, mode: int, bus_is_well: bool) -> bytes:
-        """NodeStatus. The ESCs' health counts by choice only: an autopilot does not arm beside a node that is not well."""
+        """Return a NodeStatus.
+
+        The health of the ESCs is included only if it is configured, because an autopilot does not
+        arm while a node is not healthy.
+        """
         health = wire.OK if bus_is_well and not self.is_duplicate else wire.WARNING
         code = 0
         for report in self.reports:
@@ -69,7 +76,10 @@ class Node:
     def answer(
         self, request_id: int, kind: DataType, request: bytes, transfer_id: int, status: bytes
     ) -> list[CanFrame]:
-        """The response; empty to what is no request. ``request_id``: its CAN id; ``status``: the NodeStatus of now."""
+        """Return the frames of the response, or none if the request is invalid.
+
+        ``request_id`` is the CAN id of the request, ``status`` the current NodeStatus.
+        """
         if kind is wire.GET_NODE_INFO:
             versions = *self._version, 0, 0, 0, *_HARDWARE
             answer = wire.GET_NODE_INFO.pack(status, *versions, self.setup.unique_id, 0)
@@ -96,7 +106,10 @@ class Node:
 
 
 def _get_set(request: bytes, parameters: dict[str, Parameter]) -> bytes:
-    """The response of param.GetSet: the parameter that is named, else that of the index; nobody sets one. Empty to what is no request."""
+    """Return the response of param.GetSet, or b"" if the request is invalid.
+
+    The parameter is found by name, or by index if the name is empty. Nothing can be set.
+    """
     if len(request) < 2:
         return b""
     index, tag = request[0] | request[1] >> 3 << 8, request[1] & 7
@@ -110,7 +123,7 @@ def _get_set(request: bytes, parameters: dict[str, Parameter]) -> bytes:
     if not name:
         name = next(iter([*parameters][index : index + 1]), "")
     value = parameters.get(name)
-    # without a default and limits: nobody can set it
+    # Without default and limits, because it cannot be set.
     if value is None:
         return bytes(4)
     if isinstance(value, str):
@@ -123,7 +136,7 @@ def _get_set(request: bytes, parameters: dict[str, Parameter]) -> bytes:
 
 
 class Dronecan(Output):
-    """All nodes, and the ESCs that they report. ``escs`` of a node are numbers of ``host.escs``."""
+    """All nodes, and the ESCs of ``host`` that they report."""
 
     name = "dronecan"
     events = Event.STATE
@@ -184,7 +197,9 @@ class Dronecan(Output):
         if now >= self._allocation.due:
             self.frames += self._allocation.advance(now)
         if now >= (due := self._second_due):
-            self._second_due = SECOND + (now if now - due >= SECOND else due)  # none is made up for
+            self._second_due = SECOND + (
+                now if now - due >= SECOND else due
+            )  # missed ones are skipped
             self._say_second(now)
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
@@ -213,7 +228,7 @@ class Dronecan(Output):
             self.frames += answer
 
     def own_ids(self) -> dict[int, Owner]:
-        """Whatever has one of our nodes as its source."""
+        """Return the blocks of ids whose source is one of our nodes."""
         return {
             id_block(node.node_id, NODE): Owner(number, f"DroneCAN node-ID {node.node_id}")
             for number, node in enumerate(self._nodes)
@@ -270,7 +285,7 @@ class Dronecan(Output):
     # --- node-IDs
 
     def _ask(self, now: int) -> None:
-        """Ask for the node-ID of the first node without one."""
+        """Ask for the node-ID of the first node that has none."""
         waiting = [node.setup.unique_id for node in self._nodes if not node.node_id]
         self._allocation.ask(waiting[0] if waiting else b"", now)
         self._follow_ids()
@@ -286,12 +301,12 @@ class Dronecan(Output):
             text = f"DroneCAN node {node.setup.name}: has node-ID {node_id}"
             self._news.append(LogLine(text, text))
             self.revision += 1
-            self._second_due = now  # it says that it is there
+            self._second_due = now  # the node reports itself at once
             node.start(now)
             self._ask(now)
 
     def _follow_ids(self) -> None:
-        """Receive what is for the nodes as they are now; make the ids of the bus anew."""
+        """Compute the ids to receive from the node-IDs."""
         self._by_id = {node.node_id: node for node in self._nodes if node.node_id}
         requests = SERVICE | REQUEST
         mask = requests | NODE << 8

@@ -23,9 +23,15 @@ from kontronik_can_gw.signals.plan import classic_bits
 _USUAL_BITRATE = 1_000_000
 _MAX_SEED = (1 << 64) - 1
 _LOWEST_RATE_HZ = 10
-"""ArduPilot takes a motor for stopped if it hears nothing of it for 210 ms."""
-_STATUS, _BEC = (8, 8, 3), (8, 6)
-"""Data bytes of the frames of esc.Status, of CircuitStatus and Temperature."""
+"""Lower rates are reported. ArduPilot treats a motor as stopped after 210 ms without esc.Status."""
+_STATUS = (8, 8, 3)
+"""Data bytes of the frames of an esc.Status."""
+_EXTENDED = 8
+"""Data bytes of the frame of an esc.StatusExtended."""
+_BEC = (8, 6)
+"""Data bytes of the frames of CircuitStatus and Temperature."""
+_NODE_STATUS = 8
+"""Data bytes of the frame of a NodeStatus."""
 _RESOLUTION = (
     "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V, 0.063 V from 64 V; "
     "current 0.031 A from 32 A, 0.063 A from 64 A, 0.125 A from 128 A; temperature 0.25 K"
@@ -47,20 +53,27 @@ class DronecanSetup(OutputSetup):
     @cached_property
     def nodes(self) -> tuple[NodeSetup, ...]:
         """The gateway's node, or one for each ESC."""
-        table, numbers = self.given.table, tuple(range(len(self.escs)))
+        table = self.given.table
         first = table.node_id
         if not table.per_esc_nodes:
+            numbers = tuple(range(len(self.escs)))
             return (NodeSetup(first, table.name, self._unique_id(table.name), numbers),)
-        names = [f"{table.name}.{esc.name.lower()}" for esc in self.escs]
-        return tuple(
-            NodeSetup(first and first + n, name, self._unique_id(name), (n,))
-            for n, name in enumerate(names)
-        )
+        nodes = []
+        for number, esc in enumerate(self.escs):
+            name = f"{table.name}.{esc.name.lower()}"
+            node_id = first + number if first else 0
+            nodes.append(NodeSetup(node_id, name, self._unique_id(name), (number,)))
+        return tuple(nodes)
 
     def _unique_id(self, name: str) -> bytes:
-        """The same for this machine and name; others' are others from the first bytes on, for they are asked for by parts."""
-        machine, of_name = self.given.identity, name.encode()
-        checks = crc32(machine + of_name).to_bytes(4, "big") + crc32(of_name).to_bytes(4, "big")
+        """Return the unique id, which depends on the machine and the name of the node.
+
+        Ids of different nodes differ in their first bytes, because an allocator asks for them in
+        parts.
+        """
+        machine = self.given.identity
+        node = name.encode()
+        checks = crc32(machine + node).to_bytes(4, "big") + crc32(node).to_bytes(4, "big")
         return checks + machine[:8].ljust(8, b"\0")
 
     def make(self, host: OutputHost, now: int) -> Dronecan:
@@ -72,37 +85,47 @@ class DronecanSetup(OutputSetup):
         return given._asdict() | {"table": table, "identity": identity}
 
     def taken_ids(self) -> Mapping[int, str]:
-        """Whatever parses as a frame of one of our nodes; of a node-ID that is not known yet, everything."""
+        """Return the blocks of ids that are frames of our nodes.
+
+        If an allocator chooses the node-ID, that is every 29-bit id.
+        """
         if not self.given.table.node_id:
             return {id_block(0, 0): "DroneCAN, whose node-ID an allocator chooses"}
-        return {
-            id_block(node.node_id, NODE): f"DroneCAN node {node.node_id} (bits 0 to 6 of its ids)"
-            for node in self.nodes
-        }
+        found = {}
+        for node in self.nodes:
+            user = f"DroneCAN node {node.node_id} (bits 0 to 6 of its ids)"
+            found[id_block(node.node_id, NODE)] = user
+        return found
 
     def traffic(self, is_worst: bool = False) -> tuple[float, float]:
-        table, escs = self.given.table, len(self.escs)
-        rates = [*((size, table.rate_hz * escs) for size in _STATUS), (8, table.extended_hz * escs)]
-        rates += [*((size, escs) for size in _BEC), (8, len(self.nodes))]
-        bits = sum(rate * classic_bits(size, True) for size, rate in rates)
-        return sum(rate for _, rate in rates), bits
+        table = self.given.table
+        escs = len(self.escs)
+        rates = [(size, table.rate_hz * escs) for size in _STATUS]
+        rates.append((_EXTENDED, table.extended_hz * escs))
+        rates += [(size, escs) for size in _BEC]
+        rates.append((_NODE_STATUS, len(self.nodes)))
+        frames = sum(rate for _, rate in rates)
+        return frames, sum(rate * classic_bits(size, True) for size, rate in rates)
 
     def warnings(self, file: str, bitrate: int) -> list[str]:
         found = []
         if bitrate != _USUAL_BITRATE:
             found.append(
-                f"dronecan: can.bitrate is {bitrate // 1000} kbit/s; autopilots run DroneCAN at 1000 kbit/s"
+                f"dronecan: can.bitrate is {bitrate // 1000} kbit/s; "
+                "autopilots run DroneCAN at 1000 kbit/s"
             )
         table = self.given.table
         if table.rate_hz < _LOWEST_RATE_HZ:
             found.append(
-                f"dronecan.rate_hz is {table.rate_hz}: below {_LOWEST_RATE_HZ} ArduPilot may take a running motor for "
-                f"stopped. Set it to {_LOWEST_RATE_HZ} or more"
+                f"dronecan.rate_hz is {table.rate_hz}: below {_LOWEST_RATE_HZ} "
+                "ArduPilot may take a running motor for stopped. "
+                f"Set it to {_LOWEST_RATE_HZ} or more"
             )
         if table.extended_hz:
             found.append(
-                "dronecan.extended_hz: the motor temperature in esc.StatusExtended is not known and sent as -256 degC, which PX4 "
-                "takes for the temperature. Set extended_hz = 0 for PX4"
+                "dronecan.extended_hz: the motor temperature in esc.StatusExtended "
+                "is not known and sent as -256 degC, which PX4 takes for the temperature. "
+                "Set extended_hz = 0 for PX4"
             )
         if not self.given.identity:
             found.append(
@@ -112,39 +135,43 @@ class DronecanSetup(OutputSetup):
         plain = [esc.name for esc in self.escs if esc.pole_pairs == 1]
         if plain and table.rpm != "electrical":
             found.append(
-                f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: set pole_pairs in [[esc]], "
+                f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: "
+                "set pole_pairs in [[esc]], "
                 'or dronecan.rpm = "electrical" if it is one'
             )
         return [f"{file}: {text}" for text in found]
 
     def summary(self, escs: Sequence[EscSettings]) -> list[str]:
         first = self.given.table.first_index
-        return [
-            f"DroneCAN  {f'node {node.node_id}' if node.node_id else 'node-ID by an allocator'}, {node.name}: esc_index "
-            + " to ".join(dict.fromkeys(str(first + n) for n in (node.escs[0], node.escs[-1])))
-            for node in self.nodes
-        ]
+        found = []
+        for node in self.nodes:
+            node_id = f"node {node.node_id}" if node.node_id else "node-ID by an allocator"
+            indices = str(first + node.escs[0])
+            if len(node.escs) > 1:
+                indices += f" to {first + node.escs[-1]}"
+            found.append(f"DroneCAN  {node_id}, {node.name}: esc_index {indices}")
+        return found
 
     def lines(self) -> list[str]:
-        table, escs, found = self.given.table, self.escs, []
+        table = self.given.table
+        found = []
         for node in self.nodes:
-            who = ", ".join(
-                f"{escs[n].name} is esc_index {table.first_index + n}" for n in node.escs
-            )
+            escs = []
+            for number in node.escs:
+                index = table.first_index + number
+                escs.append(f"{self.escs[number].name} is esc_index {index}")
             node_id = node.node_id or "asks an allocator"
-            found.append(f"node {node_id}, {node.name}, unique id {node.unique_id.hex()}: {who}")
+            unique_id = node.unique_id.hex()
+            found.append(f"node {node_id}, {node.name}, unique id {unique_id}: {', '.join(escs)}")
+        sign = "negative while the motor turns backward" if table.negative_rpm else "never negative"
+        speed = SPEEDS[table.rpm]
         sent = f"esc.Status at {table.rate_hz} Hz while telemetry is fresh"
         if table.extended_hz:
             sent += f", esc.StatusExtended at {table.extended_hz} Hz"
         return [
             *found,
             f"{sent}; NodeStatus, CircuitStatus and Temperature of the BEC each second",
-            f"rpm is {SPEEDS[table.rpm]}, at most {MAX_RPM}: what is more is sent as that; "
-            + (
-                "negative while the motor turns backward"
-                if table.negative_rpm
-                else "never negative"
-            ),
+            f"rpm is {speed}, at most {MAX_RPM}: what is more is sent as that; {sign}",
             _RESOLUTION,
         ]
 
@@ -155,7 +182,8 @@ def configured(config: Config, machine: Machine) -> DronecanSetup:
     try:
         return _checked(given, config.escs)
     except UserError as error:
-        raise UserError(*[f"{config.file}: {problem}" for problem in error.problems]) from None
+        problems = [f"{config.file}: {problem}" for problem in error.problems]
+        raise UserError(*problems) from None
 
 
 def recorded(found: Mapping[str, Any], escs: Sequence[EscSettings]) -> DronecanSetup:
@@ -170,18 +198,21 @@ def recorded(found: Mapping[str, Any], escs: Sequence[EscSettings]) -> DronecanS
 
 
 def _checked(given: Given, escs: Sequence[EscSettings]) -> DronecanSetup:
+    """Return the setup. UserError if node-IDs or indices are too large."""
     setup = DronecanSetup(given, tuple(escs))
     problems = []
-    last = setup.nodes[-1].node_id
-    if last > MAX_NODE_ID:
+    last_id = setup.nodes[-1].node_id
+    if last_id > MAX_NODE_ID:
         highest = MAX_NODE_ID + 1 - len(setup.nodes)
         problems.append(
-            f"dronecan.node_id: that of the last node would be {last}. Choose one up to {highest}."
+            f"dronecan.node_id: that of the last node would be {last_id}. "
+            f"Choose one up to {highest}."
         )
-    last = given.table.first_index + len(escs) - 1
-    if last > MAX_ESC_INDEX:
+    last_index = given.table.first_index + len(escs) - 1
+    if last_index > MAX_ESC_INDEX:
         problems.append(
-            f"dronecan.first_index: esc_index of the last ESC would be {last}. There are 0 to {MAX_ESC_INDEX}."
+            f"dronecan.first_index: esc_index of the last ESC would be {last_index}. "
+            f"There are 0 to {MAX_ESC_INDEX}."
         )
     if problems:
         raise UserError(*problems)
