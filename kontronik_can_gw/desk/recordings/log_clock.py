@@ -54,7 +54,8 @@ class LogClock:
     def frames(self) -> Iterator[LogFrame]:
         """The frames in their order, at continuous times."""
         last = before = None
-        while (item := self._next()) is not None:
+        ahead, source = self._ahead, self._source
+        while (item := ahead.popleft() if ahead else next(source, None)) is not None:
             time_ns = item.time_ns + self._shift_ns
             if last is None or before is None:
                 if self._is_alone(item):
@@ -82,9 +83,6 @@ class LogClock:
                 item = item._replace(time_ns=time_ns)
             self._recent.append(item)
             yield item
-
-    def _next(self) -> LogFrame | None:
-        return self._ahead.popleft() if self._ahead else next(self._source, None)
 
     def _look_ahead(self, count: int) -> Sequence[LogFrame]:
         """The next frames, which stay to be read; fewer at the end of the log.

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
@@ -21,9 +21,10 @@ from kontronik_can_gw.desk.recordings.recording import (
     LogFrame,
     Sample,
 )
-from kontronik_can_gw.desk.recordings.samples import ColumnMaker, fields_of_log, rows_of_frames
+from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import EXTENDED
 
 _BATCH = 256
 """Frames."""
@@ -119,6 +120,10 @@ class CanLogInput(Input):
             yield some
 
     def frames(self) -> Iterator[TimedFrame]:
+        for time_ns, frame, received, _ in self._data_frames():
+            yield TimedFrame(time_ns, frame, received is True)
+
+    def _data_frames(self) -> Iterator[LogFrame]:
         """The data frames of one channel: the selected one, or the only one with messages of the DBC.
 
         UserError if several channels have such messages and none is selected. Frames of other
@@ -128,17 +133,18 @@ class CanLogInput(Input):
         self.others = 0
         logged = self._logged()
         for item in logged:
-            time_ns, frame, received, channel = item
-            if frame.remote or frame.can_id & ERROR:
-                self._without_data[channel, item.kind] += 1
+            frame = item.frame
+            can_id = frame.can_id
+            if frame.remote or can_id & ERROR:
+                self._without_data[item.channel, item.kind] += 1
                 continue
-            if frame.key not in ours:
+            if (can_id | EXTENDED if frame.extended else can_id) not in ours:
                 self.others += 1
-            elif chosen is None:
-                self._chosen = chosen = channel
-            elif channel != chosen:
-                raise self._ambiguous(logged)
-            yield TimedFrame(time_ns, frame, received is True)
+            elif item.channel != chosen:
+                if chosen is not None:
+                    raise self._ambiguous(logged)
+                self._chosen = chosen = item.channel
+            yield item
 
     def _logged(self) -> Iterator[LogFrame]:
         """All frames, or those of the selected channel. UserError if the log does not have it."""
@@ -190,12 +196,10 @@ class CanLogInput(Input):
         return fields_of_log(self.reader, self.bus.escs)
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
-        maker = ColumnMaker(self.reader, range(len(self.fields)) if chosen is None else chosen)
-        rows = rows_of_frames(self.frames(), self.reader)
-        while some := list(islice(rows, ROWS if self.stream is None else 1)):
-            for wall_ns, group in groupby(some, lambda row: self.wall_offset_ns(row[0])):
-                times, parts = zip(*group, strict=True)
-                yield Block(times, maker.columns(parts), wall_ns)
+        rows = RowsOfFrames(self.reader, range(len(self.fields)) if chosen is None else chosen)
+        count = ROWS if self.stream is None else 1
+        for times, columns in rows.blocks(self._data_frames(), count):
+            yield Block(times, columns, self.wall_offset_ns(times[0]))
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         return self.samples(chosen)

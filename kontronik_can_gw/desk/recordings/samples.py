@@ -6,16 +6,18 @@ message, within 5 ms goes into the same row.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import groupby
+from itertools import chain, pairwise, repeat
+from typing import NamedTuple
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output
-from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.dbc.view import Freshness
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Sample
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame, Sample
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.esc.values import Kind as How
+from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import MessagePlan, SendType
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
@@ -139,95 +141,139 @@ def _to_value(column: Column) -> tuple[str, float, float]:
     return (column.unit, 1, 0) if factors is None else (unit, float(factors[0]), float(factors[1]))
 
 
-PartsOfRow = tuple[Sequence[Value], ...]
-"""The values of a row in lists, one for each part of the SignalReader."""
+_Change = tuple[int, int | None]
+"""A row, and the bits of the frame with which it began. None: the values ceased to be fresh."""
 
 
-class ColumnMaker:
-    """Makes columns of the ``chosen`` signals from rows. Most lists of a row are those of the row before, which saves most of the work."""
+class _Wanted(NamedTuple):
+    """A signal that is a column: its place among the columns, and in its part."""
+
+    place: int
+    at: int
+    slope: float
+    shift: float
+
+
+class RowsOfFrames:
+    """Rows of the ``chosen`` signals as a listener on the bus has them, while they are fresh.
+
+    They are those of a View (tests/recordings/test_log_rows.py). But a View decodes each frame, and
+    this class decodes each signal once a block, in all frames that have it: a recorded hour has a
+    million frames.
+    """
 
     def __init__(self, reader: SignalReader, chosen: Sequence[int]) -> None:
-        self._width = len(chosen)
-        self._wanted: dict[int, list[tuple[int, int]]] = {}
-        """By part: places among the columns, and in the part's list."""
+        self._reader = reader
+        self._freshness = Freshness(reader.parts)
+        self._times: list[int] = []
+        """Times of the rows that are complete."""
+        self._changes: list[list[_Change]] = [[] for _ in reader.parts]
+        """For each part, what it had in these rows and in the next one."""
+        self._held: list[Value] = [None] * len(chosen)
+        """Value of each column in front of these rows."""
+        self._wanted: dict[int, list[_Wanted]] = {}
         for place, at in enumerate(chosen):
             index, part = next(
                 (index, part)
                 for index, part in enumerate(reader.parts)
                 if part.first <= at < part.first + part.count
             )
-            self._wanted.setdefault(index, []).append((place, at - part.first))
-        scales = [(place, *_to_value(reader.columns[at])[1:]) for place, at in enumerate(chosen)]
-        self._scales = [one for one in scales if one[1:] != (1, 0)]
+            _, slope, shift = _to_value(reader.columns[at])
+            wanted = _Wanted(place, at - part.first, slope, shift)
+            self._wanted.setdefault(index, []).append(wanted)
 
-    def columns(self, rows: Sequence[PartsOfRow]) -> list[Sequence[Value]]:
-        """The columns of some rows, in the units of the values."""
-        found: list[Sequence[Value]] = [()] * self._width
-        for index, wanted in self._wanted.items():
-            lists = [row[index] for row in rows]
-            if 2 * len(set(map(id, lists))) > len(lists):
-                every = [*zip(*lists, strict=True)]
-                for place, at in wanted:
-                    found[place] = every[at]
+    def blocks(
+        self, frames: Iterable[TimedFrame | LogFrame], count: int
+    ) -> Iterator[tuple[Sequence[int], Sequence[Sequence[Value]]]]:
+        """Yield times and columns of ``count`` rows at once, as soon as these are complete."""
+        messages, freshness = self._reader.messages, self._freshness
+        times, changes = self._times, self._changes
+        row_ns: int | None = None
+        in_row: set[int] = set()
+        now = -LATEST_NS
+        for item in frames:
+            if item.time_ns > now:  # a log of several interfaces may not be in order
+                now = item.time_ns
+            frame = item.frame
+            key = frame.can_id | EXTENDED if frame.extended else frame.can_id
+            if (message := messages.get(key)) is None:
                 continue
-            runs = [(next(run), 1 + sum(1 for _ in run)) for _, run in groupby(lists, id)]
-            for place, at in wanted:
-                column: list[Value] = []
-                for values, count in runs:
-                    column += [values[at]] * count
-                found[place] = column
-        for place, slope, shift in self._scales:
-            found[place] = [_converted(value, slope, shift) for value in found[place]]
-        return found
+            if row_ns is not None and (key in in_row or now - row_ns > SAME_ROW_NS):
+                times.append(row_ns)
+                if len(times) == count:
+                    yield self._take_block()
+                row_ns = None
+                in_row.clear()
+            while (due := freshness.next_expiry) is not None and due < now:
+                if expired := freshness.expire(due + 1):  # a loss is a row of its own
+                    for part in expired:
+                        changes[part].append((len(times), None))
+                    times.append(due + 1)
+                    if len(times) == count:
+                        yield self._take_block()
+                    row_ns = None
+                    in_row.clear()
+            length, parts, _, page_of = message
+            data = frame.data
+            if len(data) < length:
+                continue
+            bits = int.from_bytes(data[:length], "little")
+            if page_of is not None:
+                parts = message.in_frame(bits)
+            for part in parts:
+                changes[part].append((len(times), bits))
+            freshness.note(parts, now)
+            in_row.add(key)
+            if row_ns is None:
+                row_ns = now
+        if row_ns is not None:
+            times.append(row_ns)
+        if times:
+            yield self._take_block()
+
+    def _take_block(self) -> tuple[Sequence[int], Sequence[Sequence[Value]]]:
+        """Times and columns of the rows that are complete."""
+        times = [*self._times]
+        self._times.clear()
+        held = self._held
+        columns: list[Sequence[Value]] = [()] * len(held)
+        for part, wanted in self._wanted.items():
+            changes = self._changes[part]
+            if not changes:
+                for place, *_ in wanted:
+                    columns[place] = [held[place]] * len(times)
+                continue
+            frames = [bits for _, bits in changes]
+            begins = [row for row, _ in changes]
+            lengths = [end - begin for begin, end in pairwise((*begins, len(times)))]
+            changes.clear()
+            is_dense = 2 * len(frames) > len(times)
+            if is_dense:  # a value for each row is faster than many short runs
+                frames = [*chain.from_iterable(map(repeat, frames, lengths))]
+            fresh = [bits for bits in frames if bits is not None]
+            unpacker = self._reader.parts[part].unpacker
+            for place, at, slope, shift in wanted:
+                values = unpacker.column(at, fresh)
+                if (slope, shift) != (1, 0):
+                    values = [_converted(value, slope, shift) for value in values]
+                if len(fresh) < len(frames):
+                    each = iter(values)
+                    values = [None if bits is None else next(each) for bits in frames]
+                if not is_dense:
+                    values = _runs(values, lengths)
+                columns[place] = [held[place]] * begins[0] + values if begins[0] else values
+                held[place] = values[-1]
+        return times, columns
+
+
+def _runs(values: Sequence[Value], lengths: Sequence[int]) -> list[Value]:
+    """Each value as often as its length tells."""
+    found: list[Value] = []
+    for value, length in zip(values, lengths, strict=True):
+        found += [value] * length
+    return found
 
 
 def _converted(value: Value, slope: float, shift: float) -> Value:
     is_number = isinstance(value, (int, float))
     return round((value - shift) / slope, _DIGITS) if is_number else value  # type: ignore[operator]
-
-
-def samples_of_frames(
-    frames: Iterable[TimedFrame], reader: SignalReader, chosen: Sequence[int]
-) -> Iterator[Sample]:
-    """Rows of CAN frames, one by one."""
-    maker = ColumnMaker(reader, chosen)
-    for time_ns, parts in rows_of_frames(frames, reader):
-        yield Sample(time_ns, tuple(column[0] for column in maker.columns([parts])))
-
-
-def rows_of_frames(
-    frames: Iterable[TimedFrame], reader: SignalReader
-) -> Iterator[tuple[int, PartsOfRow]]:
-    """Time and values of each row, as a listener on the bus has them: values hold while they are fresh."""
-    view = View(reader)
-
-    def row(time_ns: int) -> tuple[int, PartsOfRow]:
-        return time_ns, tuple(view.of_parts)
-
-    row_ns: int | None = None
-    in_row: set[int] = set()
-    last = -LATEST_NS
-    keys = reader.keys
-    for frame_ns, frame, _ in frames:
-        if frame_ns > last:  # a log of several interfaces may not be in order
-            last = frame_ns
-        time_ns = last
-        key = frame.key
-        if key not in keys:
-            continue
-        if row_ns is not None and (key in in_row or time_ns - row_ns > SAME_ROW_NS):
-            yield row(row_ns)
-            row_ns = None
-            in_row.clear()
-        while (due := view.next_expiry) is not None and due < time_ns:  # a loss is a row of its own
-            if view.expire(due + 1):
-                row_ns = None
-                in_row.clear()
-                yield row(due + 1)
-        if view.take(key, frame.data, time_ns) is None:
-            continue
-        in_row.add(key)
-        if row_ns is None:
-            row_ns = time_ns
-    if row_ns is not None:
-        yield row(row_ns)
