@@ -6,7 +6,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC as UTC_ZONE
 from datetime import datetime
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
+from itertools import repeat
 from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.libraries import missing_library
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Lines
 
 _MAX_INT64 = 1 << 63
+_KEPT_TEXTS = 1024
+"""Texts that are kept for each column. More would need more memory than they save time."""
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
 
@@ -32,13 +35,35 @@ def seconds_text(time_ns: int) -> str:
 def utc_text(wall_ns: int) -> str:
     """ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``."""
     second, rest = divmod(wall_ns, SECOND)
-    moment = datetime.fromtimestamp(second, UTC_ZONE)
-    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1000:06d}Z"
+    return f"{_second_text(second)}.{rest // 1000:06d}Z"
+
+
+@lru_cache
+def _second_text(second: int) -> str:
+    return f"{datetime.fromtimestamp(second, UTC_ZONE):%Y-%m-%dT%H:%M:%S}"
 
 
 def csv_text(text: str) -> str:
     """Quoted where it has to be."""
     return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
+
+
+class _Texts(dict[Any, str]):
+    """Text of a cell by its value, of which all have one type. Texts that were used are kept."""
+
+    def __init__(self, prefix: str, text_of: Callable[[Any], str]) -> None:
+        super().__init__()
+        self._prefix, self._text_of = prefix, text_of
+
+    def __missing__(self, value: Any) -> str:
+        text = self._prefix + self._text_of(value)
+        # 0.0 is equal to -0.0, which has another text
+        is_float_zero = value == 0 and isinstance(value, float)
+        if not is_float_zero:
+            if len(self) >= _KEPT_TEXTS:
+                self.clear()
+            self[value] = text
+        return text
 
 
 class TextTable:
@@ -76,21 +101,31 @@ class TextTable:
                 self._file.write(made)
 
     def _write(self, block: Block) -> None:
-        lines = (self._line(row, block.wall_ns) for row in block.rows())
+        heads = map(self._head_of_line, block.times, repeat(block.wall_ns or 0))
+        cells = [
+            map(texts.__getitem__, column)
+            for texts, column in zip(self._texts, block.columns, strict=True)
+        ]
+        lines = map("".join, zip(heads, *cells, repeat(self._end)))
         self._file.write("".join(lines).encode())
 
-    def _line(self, row: Sample, wall_ns: int | None) -> str:
-        pieces = [self._start, seconds_text(row.time_ns - self._table.origin_ns)]
+    def _head_of_line(self, time_ns: int, wall_ns: int) -> str:
+        text = self._start + seconds_text(time_ns - self._table.origin_ns)
         if self._table.has_utc:
-            pieces += (self._utc, utc_text(row.time_ns + (wall_ns or 0)), self._utc_end)
-        for prefix, value in zip(self._prefixes, row.values, strict=True):
-            pieces.append(prefix)
-            if isinstance(value, str):
-                pieces.append(self._text(value))
-            else:  # a float signal may be infinite, which JSON does not know
-                missing = value is None or not math.isfinite(value)
-                pieces.append(self._nothing if missing else str(value))
-        return "".join((*pieces, self._end))
+            text += self._utc + utc_text(time_ns + wall_ns) + self._utc_end
+        return text
+
+    @cached_property
+    def _texts(self) -> "list[_Texts]":
+        """The text of each column's cells, with the prefix."""
+        return [_Texts(prefix, self._cell) for prefix in self._prefixes]
+
+    def _cell(self, value: Any) -> str:
+        if isinstance(value, str):
+            return self._text(value)
+        # a float signal may be infinite, which JSON does not know
+        is_missing = value is None or not math.isfinite(value)
+        return self._nothing if is_missing else str(value)
 
     @cached_property
     def _lines(self) -> "Lines":
