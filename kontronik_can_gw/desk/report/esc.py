@@ -5,8 +5,10 @@ A value holds until the next row; while telemetry is lost nothing is counted. Ti
 
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, repeat
+from functools import lru_cache
+from itertools import compress, pairwise, repeat
 from math import isfinite
+from operator import ne
 from typing import Any, Literal, NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
@@ -160,7 +162,7 @@ class EscFlight:
         """Take rows as columns; return those to draw."""
         columns = {source: chunk[at] for source, at in self._at.items()}
         for source in columns.keys() & self._floats:
-            columns[source] = [v if v is None or isfinite(v) else None for v in columns[source]]
+            columns[source] = _finite(columns[source])
         self._derive(columns)
         nothing = (None,) * len(times)
         present = nothing if self._live is None else columns[self._live]
@@ -202,9 +204,7 @@ class EscFlight:
             return
         if self._is_computed("mean_cell_voltage", columns):
             sent = columns.get("mean_cell_voltage", repeat(None))
-            columns["mean_cell_voltage"] = [
-                _mean_cell(*of_row) for of_row in zip(voltage, cells, sent, strict=False)
-            ]
+            columns["mean_cell_voltage"] = [*map(_mean_cell, voltage, cells, sent)]
         if current is not None and self._is_computed("battery_power", columns):
             columns["battery_power"] = [
                 None if v is None or i is None else round(v * i, 3)
@@ -281,8 +281,10 @@ class EscFlight:
         for source in COUNTERS:
             known = [value for value in columns.get(source, ()) if value is not None]
             if known:
-                steps = pairwise((self._counts.get(source, known[0]), *known))
-                more = sum(b - a if b >= a else b for a, b in steps)
+                before = self._counts.get(source, known[0])
+                # most values are equal to the one before
+                changed = [before, *compress(known, map(ne, known, (before, *known)))]
+                more = sum(b - a if b >= a else b for a, b in pairwise(changed))
                 self.counted[source] = self.counted.get(source, 0) + more
                 self._counts[source] = known[-1]
 
@@ -323,6 +325,14 @@ class EscFlight:
         self._held = since, was_there, held_power, turned
 
 
+def _finite(values: Sequence[Number]) -> Sequence[Number]:
+    """The values without infinite ones."""
+    if isfinite(sum(filter(None, values))):
+        return values
+    return [value if value is None or isfinite(value) else None for value in values]
+
+
+@lru_cache(4096)
 def _mean_cell(voltage: Number, cells: int | None, sent: Number) -> Number:
     if voltage is None:
         return None

@@ -5,7 +5,8 @@ time-out have a gap between them. Times are ns of the recording's clock.
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import compress, islice, pairwise
+from operator import ne
 from typing import NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
@@ -215,7 +216,7 @@ def _runs(columns: Sequence[Sequence[Number]], count: int) -> Iterator[tuple[int
     for values in columns:
         if None in values:
             missing = [value is None for value in values]
-            edges |= {at for at, (a, b) in enumerate(pairwise(missing), 1) if a is not b}
+            edges.update(compress(range(1, count), map(ne, missing, islice(missing, 1, None))))
     yield from pairwise(sorted(edges))
 
 
