@@ -12,7 +12,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
-from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock, Sample
+from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
 from kontronik_can_gw.native import load
 from kontronik_can_gw.times import SECOND
 
