@@ -100,7 +100,7 @@ def test_usual_lines_are_read_as_they_are_written() -> None:
         12_345_678_000,
     ]
     assert [item.channel for item in frames[:4]] == ["can0", "can1", "can0", "vcan0"]
-    assert [item.received for item in frames[:4]] == [True, False, False, False]
+    assert [item.received for item in frames[:4]] == [True, False, None, None]
     assert [item.frame.can_id for item in frames[:4]] == [0x681, 0x681, 0x1ABCDEF0, 0x7FF]
     assert [item.frame.extended for item in frames[:4]] == [False, False, True, False]
     assert frames[0].frame.data == bytes.fromhex("0011223344556677")
