@@ -41,12 +41,19 @@ def pytest_collection_finish() -> None:
 
 TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
-    *("gateway", "golden/test_golden.py::test_no_frame_has_changed"),
-    *("dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
-    *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
-    *("canopen/test_dialogues.py", "canopen/test_sync_at_once.py", "runtime/test_hold_ups.py"),
-    *("runtime/test_esc_input.py", "runtime/test_snapshot.py"),
-    *("recordings/test_plain_bytes.py", "recordings/test_tables.py"),
+    "gateway",
+    "golden/test_golden.py::test_no_frame_has_changed",
+    "dbc/test_schedule_and_messages.py",
+    "dbc/test_binding.py",
+    "capture/test_replay_is_identical.py",
+    "canopen/test_outages_and_order.py",
+    "canopen/test_dialogues.py",
+    "canopen/test_sync_at_once.py",
+    "runtime/test_hold_ups.py",
+    "runtime/test_esc_input.py",
+    "runtime/test_snapshot.py",
+    "recordings/test_plain_bytes.py",
+    "recordings/test_tables.py",
 )
 """Tests of what the core does, folders, files or single ones: they run on the core in C and on the one in Python."""
 
@@ -79,8 +86,14 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 
 OF_SYSTEMD = (
-    *("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "JOURNAL_STREAM", "INVOCATION_ID"),
-    *("RUNTIME_DIRECTORY", "STATE_DIRECTORY", "XDG_STATE_HOME"),
+    "NOTIFY_SOCKET",
+    "WATCHDOG_USEC",
+    "WATCHDOG_PID",
+    "JOURNAL_STREAM",
+    "INVOCATION_ID",
+    "RUNTIME_DIRECTORY",
+    "STATE_DIRECTORY",
+    "XDG_STATE_HOME",
 )
 """Set where the tests run in a service; the gateway would take them as its own."""
 OF_TERMINALS = ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE")

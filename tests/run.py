@@ -153,7 +153,8 @@ def run(step: str, limit_s: float, scratch: Path, arguments: Sequence[str], live
     """Run a step; its output comes at once if ``live``, else as a whole at its end."""
     result = Result(step)
     if lacking := missing(step):
-        result.note, result.enable = f"there is no {lacking}", NEEDS[step][1]
+        result.note = f"there is no {lacking}"
+        result.enable = NEEDS[step][1]
         return result
     report = scratch / f"{step}.xml"
     words = {"report": report, "scratch": scratch}
@@ -187,7 +188,8 @@ def run(step: str, limit_s: float, scratch: Path, arguments: Sequence[str], live
         with printing:
             print("" if live else printed, flush=True)
     if "{report}" not in STEPS[step]:
-        result.passed, result.failed = int(not code), int(bool(code))
+        result.passed = int(not code)
+        result.failed = int(bool(code))
     elif report.exists():
         read_report(report, result)
     nothing_chosen = code == 5 and arguments
@@ -242,7 +244,8 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
 
 
 def main() -> int:
-    own, arguments = sys.argv[1:], list[str]()
+    own = sys.argv[1:]
+    arguments = list[str]()
     if "--" in own:
         at = own.index("--")
         own, arguments = own[:at], own[at + 1 :]

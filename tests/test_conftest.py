@@ -13,7 +13,9 @@ from kontronik_can_gw.runtime.system.folders import runtime_folder
 TESTS = Path(__file__).parent
 IGNORING = ["sh", "-c", 'trap "" HUP INT QUIT; exec "$@"', "sh", sys.executable, "-c"]
 """Starts Python as nohup and a shell's background job do, with these signals ignored."""
-HUP, INT, QUIT = 1, 2, 3
+HUP = 1
+INT = 2
+QUIT = 3
 
 
 def run_ignoring(script: str) -> subprocess.CompletedProcess[str]:

@@ -65,7 +65,8 @@ atexit.register(write)
 
 def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
     """The modules of a gateway with these tables that has sent values of an ESC; ``extra`` is run in it at its start."""
-    bus, names = f"kontronik-test-{os.getpid()}-{time.monotonic_ns()}", folder / "names"
+    bus = f"kontronik-test-{os.getpid()}-{time.monotonic_ns()}"
+    names = folder / "names"
     (folder / "sitecustomize.py").write_text(
         AT_THE_END.format(standin=str(STANDIN), extra=extra, bus=bus, file=str(names))
     )

@@ -81,7 +81,8 @@ def test_what_is_missing_is_not_run_and_the_remedy_is_named(
 def test_the_last_line_has_the_totals(
     capsys: pytest.CaptureFixture[str], failed: int, skipped: int, code: int, strict_code: int
 ) -> None:
-    reasons, failures = [("a.b", "no such tool")] * skipped, ["a.crc: 3 is not 4"] * failed
+    reasons = [("a.b", "no such tool")] * skipped
+    failures = ["a.crc: 3 is not 4"] * failed
     results = [
         checks.Result("unit", 1.0, 3, failed, reasons, failures),
         checks.Result("lint", 1.0, 1),

@@ -38,7 +38,8 @@ OFF = 0xC0000000
 FLAGS = ("extended", "fd", "remote")
 
 Changes = Mapping[tuple[int, int], Mapping[str, Any]]
-_SAVE, _LOAD = b"save", b"load"
+_SAVE = b"save"
+_LOAD = b"load"
 
 
 @cache
@@ -174,7 +175,8 @@ class Bench(Talker):
 
     def take(self) -> list[CanFrame]:
         """What was sent since the last call."""
-        heard, self.heard = self.heard, []
+        heard = self.heard
+        self.heard = []
         return [frame for _, frame in heard]
 
     def answer_saves(self, error: str | None = None) -> list[tuple[int, Stored]]:
@@ -307,7 +309,9 @@ class Bench(Talker):
     def _say_sdo(self, verb: str, rest: str) -> str:
         match = re.fullmatch(r"(\d+) (\w{4}:\w\w)((?: [0-9A-F]{2})*)(?: [=!].*)?", rest)
         assert match is not None, f"what is {rest!r}?"
-        node, place, data = int(match[1]), _place(match[2]), bytes.fromhex(match[3])
+        node = int(match[1])
+        place = _place(match[2])
+        data = bytes.fromhex(match[3])
         said = f"{verb} {node} {match[2]} {hexadecimal(data)}".rstrip()
         found = self.read(*place, node) if verb == "read" else self.write(*place, data, node)
         if isinstance(found, int):

@@ -38,7 +38,8 @@ class Talker:
 
     def heard_lines(self) -> list[str]:
         """What was sent since the last call, "time -> ...": lines."""
-        lines, self._lines = self._lines, []
+        lines = self._lines
+        self._lines = []
         return lines
 
 
@@ -60,7 +61,9 @@ def read_dialogues(path: Path) -> list[Dialogue]:
             blocks.append((line[2:].strip(), []))
         elif line:
             blocks[-1][1].append((f"{path.name}:{number}", line))
-    head, texts, parts = [], {}, dict[str, list[Line]]()
+    head = []
+    texts = {}
+    parts = dict[str, list[Line]]()
     for place, line in blocks.pop(0)[1]:
         verb, _, rest = line.partition(" ")
         if verb == "with":
@@ -114,7 +117,8 @@ def play_lines(talker: Talker, lines: Sequence[Line]) -> None:
         match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)\s+)?(\S.*)", raw.partition(";")[0].strip())
         if match is None:
             continue
-        time, what = match[1] or time, " ".join(match[2].split())
+        time = match[1] or time
+        what = " ".join(match[2].split())
         now = round(float(time) * MS)
         if what == "hung":
             talker.jump(now)
@@ -168,7 +172,8 @@ def hexadecimal(data: bytes) -> str:
 
 def _with_wildcards(was: str, wanted: str) -> str:
     """``was`` with ".." where ``wanted`` has it, and without the answer that a line does not ask for."""
-    one, other = was.split(), wanted.split()
+    one = was.split()
+    other = wanted.split()
     if len(one) != len(other) or ".." not in other:
         return was
     return " ".join(".." if b == ".." else a for a, b in zip(one, other, strict=True))

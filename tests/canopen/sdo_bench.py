@@ -9,7 +9,12 @@ from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.times import NEVER
 
-_U8, _U16, _U32, _TEXT, _DOMAIN, _U64 = 0x05, 0x06, 0x07, 0x09, 0x0F, 0x1B
+_U8 = 0x05
+_U16 = 0x06
+_U32 = 0x07
+_TEXT = 0x09
+_DOMAIN = 0x0F
+_U64 = 0x1B
 _ENTRIES: list[tuple[int, int, int, str, int | bytes]] = [
     (0x1000, 0, _U32, "ro", 0x00020192),
     (0x1001, 0, _U8, "ro", 5),

@@ -39,7 +39,8 @@ def uploaded(ask: Ask, answer: bytes) -> bytes:
         return answer[4 : 8 - (answer[0] >> 2 & 3)]
     assert answer[0] == 0x41
     size = int.from_bytes(answer[4:], "little")
-    data, toggle = b"", 0
+    data = b""
+    toggle = 0
     while True:
         part = answer_to(ask, bytes((0x60 | toggle,)))
         assert part[0] & 0xF0 == toggle

@@ -266,10 +266,8 @@ def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
     escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
     text = described(dialogue.Bench(escs=escs))
     db = read(text)
-    messages, signals = (
-        [m.name for m in db.messages],
-        [s.name for m in db.messages for s in m.signals],
-    )
+    messages = [m.name for m in db.messages]
+    signals = [s.name for m in db.messages for s in m.signals]
     for names in (messages, signals):
         assert len({name.lower() for name in names}) == len(names)
     check_comments(db)

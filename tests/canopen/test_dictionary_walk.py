@@ -11,9 +11,16 @@ from kontronik_can_gw.esc.kontronik.codec import encode as uart
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.status import GatewayState
 
-NO_OBJECT, NO_SUB, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
-TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x06070012, 0x06070013, 0x06090031, 0x06090032
-DEVICE_STATE, NO_DATA = 0x08000022, 0x08000024
+NO_OBJECT = 0x06020000
+NO_SUB = 0x06090011
+READ_ONLY = 0x06010002
+WRITE_ONLY = 0x06010001
+TOO_LONG = 0x06070012
+TOO_SHORT = 0x06070013
+TOO_HIGH = 0x06090031
+TOO_LOW = 0x06090032
+DEVICE_STATE = 0x08000022
+NO_DATA = 0x08000024
 FORMATS = {0x01: "?", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I", 0x08: "f"}
 TEXTS = (0x09, 0x0F)
 
@@ -126,7 +133,8 @@ def values(data: LiveData | InfoData) -> list[bytes]:
 ALL_LIVE = [
     *((0x2000, sub) for sub in range(1, 17)),
     *((0x2001, sub) for sub in (1, 2, 3, 5)),
-    *((0x606C, 0), (0x6079, 0)),
+    (0x606C, 0),
+    (0x6079, 0),
 ]
 """Objects that come and go with live data."""
 INFORMATION = [*((0x2010, sub) for sub in range(1, 8)), *((0x2011, sub) for sub in range(1, 15))]
@@ -167,7 +175,8 @@ def lose(bench: Bench) -> None:
 def test_lost_values_abort_or_stay_or_are_codes_by_setting_and_the_others_keep_theirs(
     behaviour: int,
 ) -> None:
-    bench, known = fed(behaviour), entries()
+    bench = fed(behaviour)
+    known = entries()
     kept = [*INFORMATION, (0x2001, 4), (0x2001, 6)]
     fresh = {at: bench.read(*at) for at in [*ALL_LIVE, *kept]}
     assert not any(isinstance(data, int) for data in fresh.values())

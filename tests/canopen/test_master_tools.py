@@ -41,7 +41,8 @@ left:
 
 def concise(data: bytes) -> Iterator[tuple[int, int, bytes]]:
     """The objects of a concise DCF (CiA 302-3): count, then index, sub-index, size and data of each."""
-    (count,), at = struct.unpack_from("<L", data), 4
+    (count,) = struct.unpack_from("<L", data)
+    at = 4
     for _ in range(count):
         index, sub, size = struct.unpack_from("<HBL", data, at)
         yield index, sub, data[at + 7 : at + 7 + size]
@@ -83,7 +84,9 @@ def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
     bench = Bench(changes=NO_HEARTBEAT)
     node = wire_to(bench).add_node(1, str(EDS))
     pdo = node.tpdo[5]
-    pdo.cob_id, pdo.trans_type, pdo.event_timer = 0x1F1, 254, 100
+    pdo.cob_id = 0x1F1
+    pdo.trans_type = 254
+    pdo.event_timer = 100
     pdo.enabled = pdo.rtr_allowed = True
     pdo.add_variable(0x2000, 2)
     pdo.save()

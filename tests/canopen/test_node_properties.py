@@ -74,7 +74,8 @@ happenings = st.one_of(
 
 
 def happen(bench: Bench, what: tuple[Any, ...]) -> None:
-    gateway, now = bench.gateway, bench.now
+    gateway = bench.gateway
+    now = bench.now
     match what:
         case "frame", frame:
             gateway.receive_frame(frame, now, now)
@@ -106,7 +107,8 @@ def happen(bench: Bench, what: tuple[Any, ...]) -> None:
 def test_nothing_raises_equal_input_gives_equal_output_and_every_frame_is_one_that_the_bus_can_carry(
     story: list[tuple[Any, ...]],
 ) -> None:
-    one, other = Bench(NODES), Bench(NODES)
+    one = Bench(NODES)
+    other = Bench(NODES)
     for what in story:
         happen(one, what)
         happen(other, what)
@@ -171,7 +173,8 @@ def test_no_pdo_outside_operational_no_emergency_while_stopped(
         before = [node.state for node in bench.nodes]
         happen(bench, what)
         for frame in bench.take():
-            service, number = frame.can_id & 0x780, (frame.can_id & 0x7F) - 1
+            service = frame.can_id & 0x780
+            number = (frame.can_id & 0x7F) - 1
             if before[number] == bench.nodes[number].state:
                 assert service not in (0x180, 0x280, 0x380, 0x480) or before[number] == 5
                 is_nmt = what[0] == "frame" and what[1].can_id == 0

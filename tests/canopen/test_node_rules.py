@@ -17,7 +17,8 @@ from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.system.machine import machine_identity, serial_number
 from kontronik_can_gw.signals.plan import Layout
 
-VALUE, TAKEN = 0x06090030, 0x06040043
+VALUE = 0x06090030
+TAKEN = 0x06040043
 
 
 def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_it_has_ceased() -> (
@@ -41,7 +42,8 @@ def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_i
 
 
 def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
-    numbers, speed_only = range(1, 5), (254, 0, 0, 0x20000120)
+    numbers = range(1, 5)
+    speed_only = (254, 0, 0, 0x20000120)
     tpdos = {place: change for n in numbers for place, change in tpdo(n, *speed_only).items()}
     bench = Bench(changes={**QUIET, **tpdos}).start()
     bench.now = 10 * MS
@@ -145,7 +147,8 @@ def u32(value: int) -> bytes:
     return value.to_bytes(4, "little")
 
 
-SPARE_ON, MAPPED = {0x180501: u32(0x40000680)}, {0x1A0500: b"\1", 0x1A0501: u32(0x20000220)}
+SPARE_ON = {0x180501: u32(0x40000680)}
+MAPPED = {0x1A0500: b"\1", 0x1A0501: u32(0x20000220)}
 EVENT_TIMERS = {(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
 
 

@@ -36,7 +36,8 @@ def requests(draw: st.DrawFn) -> bytes:
 
 def is_answer_to(request: bytes, answer: bytes) -> bool:
     """By CiA 301, 7.2.4.3: the server command that fits the client command, or an abort; the multiplexer of an initiate."""
-    client, server = request[0] >> 5, answer[0] >> 5
+    client = request[0] >> 5
+    server = answer[0] >> 5
     if len(answer) != 8:
         return False
     initiate = (
@@ -107,12 +108,15 @@ class Client:
         size = len(data).to_bytes(4, "little") if tell_size else bytes(4)
         answer = self.ask(bytes((0xC0 | with_crc << 2 | tell_size << 1,)) + self.multiplexer + size)
         assert answer[:4] == b"\xa4" + self.multiplexer
-        block_size, done, rounds = answer[4], 0, 0
+        block_size = answer[4]
+        done = 0
+        rounds = 0
         parts = [data[at : at + 7] for at in range(0, len(data), 7)] or [b""]
         while done < len(parts):
             rounds += 1
             block = parts[done : done + block_size]
-            received, whole = 0, True
+            received = 0
+            whole = True
             for number, part in enumerate(block[:-1], 1):
                 if self.lose():
                     whole = False
@@ -141,7 +145,8 @@ class Client:
             return uploaded(self.answer, answer)
         assert answer[0] == 0xC6
         size = int.from_bytes(answer[4:], "little")
-        data, over = b"", False
+        data = b""
+        over = False
         request = b"\xa3"
         while not over:
             block_size = block_sizes[turn % len(block_sizes)]
@@ -273,7 +278,8 @@ def test_a_block_upload_that_is_begun_again_and_again_keeps_its_pace() -> None:
     """A master that has no patience gets no more of the bus."""
     bench = Bench(MS)
     bench.objects.find(0x2003, 0).value = bytes(6000)
-    segments, end = 0, 200 * MS
+    segments = 0
+    end = 200 * MS
     while bench.now < end:
         bench.request(bytes.fromhex("a4032000 7f000000"))
         segments += len(bench.request(bytes.fromhex("a300000000000000")))

@@ -20,7 +20,9 @@ from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, 
 
 SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
 DATA = SHIPPED.read_bytes()
-U8, U16, U32 = 0x05, 0x06, 0x07
+U8 = 0x05
+U16 = 0x06
+U32 = 0x07
 TYPE_OF_WIRE = {"I": U32, "H": U16, "B": U8, "h": 0x03, "b": 0x02}
 # CiA 303-2: prefix as a power of ten, numerator, denominator
 UNIT_CODES = {"V": 0x260000, "A": 0x040000, "°C": 0x2D0000, "1/min": 0xB44700}
@@ -106,7 +108,8 @@ def test_settings_have_the_ranges_and_defaults_of_the_configuration(
     entries: dict[tuple[int, int], Entry], sub: int, key: str
 ) -> None:
     definition: Any = next(each for each in fields(EscConfig) if each.name == key)
-    entry, allowed = entries[0x2100, sub], definition.metadata["kind"].schema
+    entry = entries[0x2100, sub]
+    allowed = definition.metadata["kind"].schema
     most = {U8: 0xFF, U16: 0xFFFF}[entry.data_type] if entry.high is None else entry.high
     assert (entry.low or 0, most) == (allowed["minimum"], allowed["maximum"])
     assert entry.default == definition.default

@@ -92,8 +92,8 @@ OTHER_CONTENT: list[Any] = [
     *(content(communication=value) for value in ({"1017": "00"}, {"1018:00": "00", "1017:00": "00"})),
     *(content(communication={key: "00"}) for key in ("1017:00\n", "1a00:00", "2000:00", "0FFF:00")),
     *(content(communication={"1017:00": value}) for value in (5, "f4", "F4 01")),
-    *(content(more=1), content(communication=[]), content(application=None), content(application={"1FFF:FF": "00"})),
-    *(content().replace("{}", '{"1017:00":"00","1017:00":"01"}', 1), content().replace(",", ", ")),
+    content(more=1), content(communication=[]), content(application=None), content(application={"1FFF:FF": "00"}),
+    content().replace("{}", '{"1017:00":"00","1017:00":"01"}', 1), content().replace(",", ", "),
     content().rstrip("\n"),
 ]  # fmt: skip
 

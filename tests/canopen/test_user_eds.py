@@ -110,7 +110,8 @@ def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject)
     lines = SHIPPED.split("\r\n")
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(lines) - 1))
-        line, value = lines[at], data.draw(VALUES | st.text())
+        line = lines[at]
+        value = data.draw(VALUES | st.text())
         more = [f"{line.split('=')[0]}={value}"], [value], [f"[{value}]"], [line, "CompactSubObj=2"]
         lines[at : at + 1] = data.draw(st.sampled_from([[], [line] * 2, *more]))
     for problem in problems("\r\n".join(lines).encode("utf-8", "replace")):

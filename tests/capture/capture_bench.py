@@ -59,14 +59,12 @@ class Bench:
     def __post_init__(self) -> None:
         canopen: CanopenSetup | None = self.setup.canopen
         self.gateway = RecordedGateway(
-            *(
-                self._put,
-                self.setup.escs,
-                self.layout,
-                START,
-                self.setup.dbc_settings.silent_on_loss,
-                canopen,
-            ),
+            self._put,
+            self.setup.escs,
+            self.layout,
+            START,
+            self.setup.dbc_settings.silent_on_loss,
+            canopen,
             further=[setup.make for setup in self.setup.outputs],
         )
         self._waiting = TransmitQueue()
@@ -97,7 +95,8 @@ class Bench:
     def running(self, seed: int, wild: bool = True) -> Callable[[float], int]:
         """The gateway has started; what lets it run for so many seconds, and returns the time."""
         rng = random.Random(seed)
-        gateway, now = self.gateway, START + rng.randrange(MS)
+        gateway = self.gateway
+        now = START + rng.randrange(MS)
         faults = Faults(flipped_bits=0.0005)
         escs = [
             SimulatedEsc(

@@ -88,7 +88,8 @@ def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> No
 def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
     listed: list[bytes], rubbish: list[bytes], data: st.DataObject
 ) -> None:
-    stream, places = b"", []
+    stream = b""
+    places = []
     for number, payload in enumerate(listed):
         stream += rubbish[number]
         places.append(len(stream))
@@ -151,8 +152,24 @@ def test_data_that_is_too_short_is_refused(read: Callable[[bytes], object]) -> N
 
 
 VALUES: tuple[Any, ...] = (
-    *(None, 0, -1, 10**30, 1.5, 1e308, float("inf"), float("nan"), True, [], [1], {}, {"a": 1}),
-    *("", "x", "1/0", "1e9999", "9" * 5000),
+    None,
+    0,
+    -1,
+    10**30,
+    1.5,
+    1e308,
+    float("inf"),
+    float("nan"),
+    True,
+    [],
+    [1],
+    {},
+    {"a": 1},
+    "",
+    "x",
+    "1/0",
+    "1e9999",
+    "9" * 5000,
 )
 GONE = object()
 

@@ -29,7 +29,8 @@ from kontronik_can_gw.times import MS, SECOND
 def plain_run(seconds: float, faults: Faults | None = None) -> Bench:
     """A gateway with an ESC whose frames are read each 5 ms."""
     bench = Bench(*made(1))
-    gateway, now = bench.gateway, START
+    gateway = bench.gateway
+    now = START
     esc = SimulatedEsc(EscOptions(faults=faults or Faults()), seed=1, start_ns=START)
     gateway.port(0, True, now)
     gateway.start(now)
@@ -63,7 +64,8 @@ def test_a_loss_is_a_row_without_values_until_the_next_frame(tmp_path: Path) -> 
 
 def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> None:
     bench = plain_run(6)
-    stop, resume = START + 2 * SECOND, START + 5 * SECOND
+    stop = START + 2 * SECOND
+    resume = START + 5 * SECOND
     sent = [(f.time_ns - START, f.frame) for f in bench.sent if not stop < f.time_ns < resume]
     log = write_log(tmp_path / "a.log", sent, start_s=1_700_000_000)
     with open_input(log) as found:

@@ -29,7 +29,8 @@ class Bed:
     def __init__(
         self, folder: Path, wait: bool = False, header: dict[str, Any] = HEADER, **settings: float
     ) -> None:
-        self.folder, self.now = folder, 10 * SECOND
+        self.folder = folder
+        self.now = 10 * SECOND
         config = RecordConfig(**{"min_free_mb": 0} | settings)  # type: ignore[arg-type]
         self.it = Recorder(folder, config, lambda: self.now)
         self.it.header = header
@@ -212,7 +213,8 @@ def test_what_somebody_else_is_writing_stays(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stands, go_on = threading.Event(), threading.Event()
+    stands = threading.Event()
+    go_on = threading.Event()
 
     def fdatasync(_fd: int) -> None:
         stands.set()

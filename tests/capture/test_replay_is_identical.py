@@ -70,7 +70,8 @@ def test_a_marked_replay_differs_in_the_state_and_nowhere_else() -> None:
             states.append(str(message.decode_simple(other.frame.data)["GatewayState"]))
         if one != other:
             assert one.time_ns == other.time_ns
-            a, b = message.decode_simple(one.frame.data), message.decode_simple(other.frame.data)
+            a = message.decode_simple(one.frame.data)
+            b = message.decode_simple(other.frame.data)
             differing |= {name for name in a if a[name] != b[name]}
     assert differing == {"GatewayState"}
     assert states[-1] == "Stopping"

@@ -165,9 +165,18 @@ def test_every_command_works_in_a_fresh_root(packages: dict[str, Path], root: Ro
     for command in commands:
         assert f"usage: kontronik-can-gw {command}" in root.gateway(command, "--help")
     for line in (
-        *("init gateway.toml", "schema", "describe", "completion bash", "dbc --esc 2", "eds"),
-        *("check -c gateway.toml", "export c firmware", "monitor flight.kcap --once"),
-        *("report flight.kcap -o t.html", "demo --seconds 1", "convert flight.kcap - --to candump"),
+        "init gateway.toml",
+        "schema",
+        "describe",
+        "completion bash",
+        "dbc --esc 2",
+        "eds",
+        "check -c gateway.toml",
+        "export c firmware",
+        "monitor flight.kcap --once",
+        "report flight.kcap -o t.html",
+        "demo --seconds 1",
+        "convert flight.kcap - --to candump",
         *(f"convert flight.kcap t.{form}" for form in ["csv", "jsonl", "log", "asc", "blf", "trc"]),
     ):
         root.gateway(*line.split())
@@ -234,7 +243,8 @@ def booted(root: Root, out: Path, script: str, *how: str) -> dict[str, Any]:
     command += [f"--timeout={BOOT_LIMIT_S}", f"--rw={root.path.parent}", "--"]
     command += ["sh", f"{HERE}/boot_root.sh", str(root.path), str(out), script, *how]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    facts, said = out / "facts.json", out / "said"
+    facts = out / "facts.json"
+    said = out / "said"
     assert facts.exists(), done.stdout + done.stderr + (said.read_text() if said.exists() else "")
     found: dict[str, Any] = json.loads(facts.read_text())
     return found
@@ -294,7 +304,8 @@ def test_a_running_gateway_goes_on_after_an_upgrade_and_ends_with_the_package(
     facts = booted(root, out, "on_upgrade.py")
     assert facts["fresh"], facts["install said"]
     assert facts["fresh after upgrade"], facts["upgrade said"]
-    before, after = facts["installed"], facts["upgraded"]
+    before = facts["installed"]
+    after = facts["upgraded"]
     assert before["FragmentPath"] == f"/etc/systemd/system/{UNIT}"
     assert after["FragmentPath"].endswith(f"/lib/systemd/system/{UNIT}")
     assert after["FragmentPath"] != before["FragmentPath"]

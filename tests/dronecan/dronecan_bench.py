@@ -101,7 +101,11 @@ class Bench:
         self.loaded = given or loaded(escs, **table)
         self.now = START
         self.gateway = Gateway(
-            *(self.loaded.escs, self.loaded.layout, START, False, self.loaded.canopen),
+            self.loaded.escs,
+            self.loaded.layout,
+            START,
+            False,
+            self.loaded.canopen,
             further=[setup.make for setup in self.loaded.outputs],
         )
         self.live: list[LiveData | None] = [LIVE] * escs

@@ -44,7 +44,8 @@ def test_without_an_allocator_it_asks_for_ever_and_says_nothing_else() -> None:
     assert bytes(first.unique_id.to_bytes()) == unique_ids(bench)[0][:6]
     line = f"DroneCAN kontronik_can_gw.e0: waits for a node-ID, {len(times)} requests"
     assert bench.output.facts()["lines"][0] == line
-    again, other = Bench(given=bench.loaded).run(9).frames, waiting(2).run(9).frames
+    again = Bench(given=bench.loaded).run(9).frames
+    other = waiting(2).run(9).frames
     assert again == bench.frames[: len(again)]  # the seed decides when it asks
     assert other != again
 
@@ -92,7 +93,8 @@ def test_nodes_get_theirs_in_turn_and_none_that_another_of_ours_has() -> None:
 
 def test_a_lying_allocator_never_gets_more_than_a_node_id() -> None:
     """Unique ids that are ours in parts, too long, of others; the requests go on."""
-    rng, bench = random.Random(4), waiting().run(1.1)
+    rng = random.Random(4)
+    bench = waiting().run(1.1)
     (own,) = unique_ids(bench)
     lies: list[Callable[[], bytes]] = [
         lambda: own[: rng.randrange(1, 16)],

@@ -14,9 +14,12 @@ from kontronik_can_gw.times import MS, SECOND
 
 TIMEOUT = 250 * MS
 """After which the gateway's value of an ESC is not available (telemetry_timeout_ms)."""
-RPM_LIFE, TELEMETRY_LIFE, RUNNING_LIFE = SECOND, 5 * SECOND, 210 * MS
+RPM_LIFE = SECOND
+TELEMETRY_LIFE = 5 * SECOND
+RUNNING_LIFE = 210 * MS
 """Of ArduPilot: of a speed, of a voltage, of a speed that says before a take-off that the motor turns."""
-PX4_ONLINE, BETAFLIGHT_LIFE = 1200 * MS, SECOND
+PX4_ONLINE = 1200 * MS
+BETAFLIGHT_LIFE = SECOND
 
 
 class Autopilot:
@@ -29,7 +32,8 @@ class Autopilot:
         """PX4 publishes what was gathered when an index comes again: index to time."""
 
     def take(self, transfer: Transfer) -> None:
-        got, at = transfer.payload, transfer.at
+        got = transfer.payload
+        at = transfer.at
         if transfer.name == "NodeStatus":
             self.nodes[transfer.source] = at, got.health, got.mode
         if transfer.name == "Status":
@@ -60,12 +64,14 @@ class World:
 
     def step(self) -> None:
         """Ten milliseconds: what the ESCs send now, and what the autopilot hears of it."""
-        bench, rng = self.bench, self.rng
+        bench = self.bench
+        rng = self.rng
         for esc, live in enumerate(bench.live):
             if rng.random() < (0.01 if live is not None else 0.02):
                 bench.live[esc] = LIVE if live is None else None
             if (live := bench.live[esc]) is not None:
-                speed, volts = 70 * rng.randrange(300), rng.randrange(1600, 6000)
+                speed = 70 * rng.randrange(300)
+                volts = rng.randrange(1600, 6000)
                 bench.live[esc] = live._replace(electrical_speed=speed, battery_voltage=volts)
                 self.history[esc].append((bench.now + 10 * MS, speed, volts / 100))
         bench.run(0.01)
@@ -83,7 +89,8 @@ class World:
 @pytest.mark.parametrize(("rpm", "ratio"), [("motor", 7), ("output", 70), ("electrical", 1)])
 def test_nothing_stale_is_taken_for_fresh_and_nothing_blocks_arming(rpm: str, ratio: int) -> None:
     """Betaflight takes ``rpm`` for electrical; its temperature is in whole degrees."""
-    world, seen = World(1, 4, rpm), 0
+    world = World(1, 4, rpm)
+    seen = 0
     pilot = world.pilot
     for _ in range(1500):
         world.step()

@@ -17,7 +17,8 @@ pytestmark = pytest.mark.extended
 
 def test_the_crate_reads_what_the_package_reads() -> None:
     need(READER.exists(), "dronecan-reader")
-    rng, bench = random.Random(3), Bench(4, extended_hz=10)
+    rng = random.Random(3)
+    bench = Bench(4, extended_hz=10)
     for turn in range(100):
         for esc in range(4):
             bench.live[esc] = LIVE._replace(

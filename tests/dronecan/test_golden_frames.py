@@ -45,20 +45,23 @@ class Measuring:
         speed: str = "electrical_speed",
         has_direction: bool = True,
     ) -> None:
-        escs, layout = [EscSettings()], Layout("", "", ())
+        escs = [EscSettings()]
+        layout = Layout("", "", ())
         self.core: Any = PythonCore(escs, layout, 0, False)
         if not is_pure:
             self.core, why = make_core(escs, layout, 0, False, slots=1)
             if why:
                 pytest.skip(why)
-        self.kind, self.now = kind, 0
+        self.kind = kind
+        self.now = 0
         self.plan = plans_of(PROTOCOLS[0], speed, has_direction)[kind]
         self.slot = self.core.slot(0)
         self.slot.start(0)
 
     def sent(self, live: LiveData, index: int, errors: int = 0, turns: int = 1) -> list[CanFrame]:
         """What goes out of node 42 with priority 16 for the last of so many frames of the ESC."""
-        can_id, bits = message_id(self.kind.number, 42, 16), fill(self.kind, index, errors)
+        can_id = message_id(self.kind.number, 42, 16)
+        bits = fill(self.kind, index, errors)
         self.slot.configure(SlotSettings(self.plan, can_id, True, 1, 3, bits, 64), self.now)
         for _ in range(turns):
             self.now += 10_000_000
@@ -132,9 +135,11 @@ def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
     for _ in range(500):
         live = random_live(rng)
         live = live._replace(throttle=max(-127, live.throttle))
-        index, errors = rng.randrange(32), rng.choice((0, 1, 300, (1 << 32) - 1))
+        index = rng.randrange(32)
+        errors = rng.choice((0, 1, 300, (1 << 32) - 1))
         got = status.read(live, index, errors)
-        volts, amperes = live.battery_voltage / 100, live.battery_current / 10
+        volts = live.battery_voltage / 100
+        amperes = live.battery_current / 10
         kelvin = live.power_stage_temperature + 273.15
         found = (got.error_count, got.voltage, got.current, got.temperature, got.esc_index)
         assert found == (errors, half(volts), half(amperes), half(kelvin), index)
@@ -142,7 +147,8 @@ def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
         rpm = -live.electrical_speed if is_backward else live.electrical_speed
         assert got.rpm == max(-131_072, min(rpm, 131_071))
         assert got.power_rating_pct == min(live.output_opening, 127)
-        got, word = extended.read(live, index), live.operating_errors
+        got = extended.read(live, index)
+        word = live.operating_errors
         assert got.input_pct == abs(live.throttle)
         assert got.output_pct == min(live.output_opening, 127)
         assert (got.motor_temperature_degC, got.motor_angle, got.esc_index) == (-256, 0, index)

@@ -32,9 +32,11 @@ def frame(rng: random.Random, node_ids: list[int]) -> CanFrame:
 
 def storm(count: int, seed: int, node_id: int) -> Bench:
     """So many frames, past the filters, while memory stays."""
-    rng, bench = random.Random(seed), Bench(2, per_esc_nodes=True, node_id=node_id)
+    rng = random.Random(seed)
+    bench = Bench(2, per_esc_nodes=True, node_id=node_id)
     bench.run(1)
-    output, sizes = bench.output, []
+    output = bench.output
+    sizes = []
     for at in range(count):
         sent = frame(rng, [42, 43])
         if at % 4:

@@ -157,7 +157,8 @@ def test_other_outputs_send_what_they_send_without_it(canopen: bool) -> None:
     found = []
     for enabled in (True, False):
         given = loaded(2, dbc=True, canopen=canopen, enabled=enabled, extended_hz=33)
-        bench, rng = Bench(2, given=given), random.Random(6)
+        bench = Bench(2, given=given)
+        rng = random.Random(6)
         for _ in range(80):
             for esc in range(2):
                 live = LIVE._replace(electrical_speed=rng.randrange(70_000))
@@ -226,7 +227,8 @@ def test_a_bus_that_is_too_slow_gets_whole_transfers(
 ) -> None:
     """Of two ESCs, of which the newer values win: what is begun ends as it began."""
     monkeypatch.setenv("KONTRONIK_PURE", is_pure)
-    world, setup = wire_world.World(2), loaded(2)
+    world = wire_world.World(2)
+    setup = loaded(2)
     (dronecan,) = setup.outputs
     layout = Layout("", "", ())
     loop = wire_world.loop_in(world, monkeypatch, setup.escs, layout, further=[dronecan.make])

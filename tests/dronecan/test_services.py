@@ -54,8 +54,10 @@ def test_parameters_are_listed_and_read_by_name_and_nobody_sets_one() -> None:
         expected += [(f"e{number}.esc_index", 4 + number), (f"e{number}.pole_pairs", 7)]
         expected += [(f"e{number}.gear", pytest.approx(10))]
     for given in (
-        *(("integer_value", 1), ("real_value", 2.5)),
-        *(("boolean_value", 1), ("string_value", b"electrical")),
+        ("integer_value", 1),
+        ("real_value", 2.5),
+        ("boolean_value", 1),
+        ("string_value", b"electrical"),
     ):
         for index, one in enumerate(expected):
             assert held(bench, index=index, given=given) == one

@@ -26,7 +26,8 @@ def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh_and_no_longer(
     assert bench.intervals("Status") == {0, 20 * MS}
     order = [(each.source, each.payload.esc_index) for each in bench.of("Status")]
     assert order == [(42, 0), (42 + per_esc_nodes, 1)] * 50
-    bench.live[0], lost = None, bench.now
+    bench.live[0] = None
+    lost = bench.now
     bench.clear()
     bench.run(2)
     of_first = [each for each in bench.of("Status") if each.payload.esc_index == 0]
@@ -76,7 +77,8 @@ def test_the_bec_once_a_second_and_what_a_device_does_not_supply_is_nan(
     bench.hear(InfoData(device_and_variant=device_and_variant(device, 1)))
     bench.live[0] = LIVE._replace(operating_errors=1 << OperatingError.BEC_UNDERVOLTAGE | 1 << 9)
     bench.run(3)
-    circuit, warm = bench.of("CircuitStatus")[-1].payload, bench.of("Temperature")[-1].payload
+    circuit = bench.of("CircuitStatus")[-1].payload
+    warm = bench.of("Temperature")[-1].payload
     assert (circuit.circuit_id, circuit.error_flags) == (2, 2)
     assert circuit.voltage == pytest.approx(5.981, abs=0.004)
     assert circuit.current == pytest.approx(amperes, abs=0.001, nan_ok=True)
@@ -92,8 +94,16 @@ def test_the_bec_once_a_second_and_what_a_device_does_not_supply_is_nan(
         # (errors, electrical speed) of each second, None: nothing is heard
         (
             [
-                *((0, 0), (1 << HOT, 0), (0, 0), (0, 700), (1 << HOT, 700), (1 << WARM, 700)),
-                *((1 << HOT | 1, 700), (1 << HOT | 1, 700), (0, 0), (0, 700)),
+                (0, 0),
+                (1 << HOT, 0),
+                (0, 0),
+                (0, 700),
+                (1 << HOT, 700),
+                (1 << WARM, 700),
+                (1 << HOT | 1, 700),
+                (1 << HOT | 1, 700),
+                (0, 0),
+                (0, 700),
             ],
             [0, 1, 1, 0, 1, 1, 3, 3, 3, 0],
         ),
@@ -107,7 +117,8 @@ def test_the_bec_once_a_second_and_what_a_device_does_not_supply_is_nan(
 def test_error_count_is_that_of_errors_since_the_motor_was_started(
     flight: list[tuple[int, int] | None], counts: list[int]
 ) -> None:
-    bench, found = Bench(), []
+    bench = Bench()
+    found = []
     for second in flight:
         bench.live[0] = None
         if second is not None:

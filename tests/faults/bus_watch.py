@@ -155,7 +155,9 @@ class Judge:
         (self._judge_info if message.kind == "info" else self._judge_live)(said)
 
     def _judge_live(self, said: Said) -> None:
-        fed, at_ns, can_id = self.escs[said.esc], said.at_ns, said.message.can_id
+        fed = self.escs[said.esc]
+        at_ns = said.at_ns
+        can_id = said.message.can_id
         limit_ns = TIMEOUT_NS + self.slack_ns
         n = newest = fed.newest(at_ns + MS)
         while n >= 0 and at_ns - fed.sent[n] <= limit_ns + self.more_ns:

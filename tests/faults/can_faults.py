@@ -18,7 +18,8 @@ from slcan_adapters import Adapter
 
 CONFLICT = 0x8150
 traffic = partial(fault, "Traffic", limit_s=None, escs=[], settle_s=1)
-ACTIVE, PASSIVE = 1, 3
+ACTIVE = 1
+PASSIVE = 3
 BUS_OFF_LEFT = 0x8140
 MAX_IN_CONTROLLER = 6
 """Frames that the kernel has taken and that nobody can take back: as many as the smallest send buffer that it grants holds."""
@@ -95,7 +96,8 @@ def slow_bus(injection: Injection, rate: str, held_ns: int) -> Iterator[None]:
 
     Values may be late by ``held_ns`` until then: the kernel had them, and nobody can take them back from it.
     """
-    interface, watch = injection.bench.interface, injection.bench.watch
+    interface = injection.bench.interface
+    watch = injection.bench.watch
     watch.more_ns = held_ns
     run(f"tc qdisc add dev {interface} root tbf rate {rate} burst 160 limit 160")
     yield

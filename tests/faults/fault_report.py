@@ -32,9 +32,11 @@ class Fault:
 FAULTS: list[Fault] = []
 """Every fault; filled by importing the modules that define them."""
 AREAS = ("Start", "Serial", "CAN", "Time", "Process", "Disk", "Traffic", "Many")
-GOOD, FAILED = "good", "failed"
+GOOD = "good"
+FAILED = "failed"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
-BEGIN, END = "<!-- faults begin -->\n", "<!-- faults end -->\n"
+BEGIN = "<!-- faults begin -->\n"
+END = "<!-- faults end -->\n"
 HEAD = f"""| machine, fault | injected | recovered | worst recovery | wrong values | values lost | state |
 {"|---" * 7}|
 """
@@ -116,5 +118,6 @@ def put(text: str, report: Report) -> str:
     """A page with the rows of a report in the place of older ones, in the order of the programme."""
     rows = shown(text) | {row.fault: str(row) for row in report.values()}
     listed = [f"{rows[str(each)]}\n" for each in in_order() if str(each) in rows]
-    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    before = text.partition(BEGIN)[0]
+    after = text.partition(END)[2]
     return "".join((before, BEGIN, HEAD, *listed, END, after))

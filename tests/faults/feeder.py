@@ -27,7 +27,8 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and
 from kontronik_can_gw.esc.kontronik.states import Device
 
 SECOND = 1_000_000_000
-SPEED, CURRENT = 1, 2
+SPEED = 1
+CURRENT = 2
 """Bits of ``seen``: the messages that follow each live frame."""
 _MASK = 0xFFFFFFFF
 POLE_PAIRS = 7
@@ -115,7 +116,8 @@ def live_values(identity: Identity, n: int) -> dict[str, float]:
     """Physical values of a live frame by the names that the DBC's signals have in snake case, and its error bits as "flags"."""
     data = live(identity, n)
     values = physical(data, sheet.LIVE_FIELDS)
-    speed, voltage = values["electrical_speed"], values["battery_voltage"]
+    speed = values["electrical_speed"]
+    voltage = values["battery_voltage"]
     return {
         **values,
         "flags": data.operating_errors & 0xFFFFFF,
@@ -206,7 +208,8 @@ class FedEsc:
         is_info = self._ticks % self.info_every == 3  # the first one soon
         identity = self.identity
         data = info(identity, len(self.info_sent)) if is_info else live(identity, len(self.sent))
-        wire, whole = encode(data, identity.layout), True
+        wire = encode(data, identity.layout)
+        whole = True
         if self.mangle is not None:
             wire, whole = self.mangle(wire)
         self.note(time.monotonic_ns(), is_info)

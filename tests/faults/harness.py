@@ -106,7 +106,8 @@ class Gateway(LoggedProcess):
 
     def growth(self, before: dict[str, int], rss_kib: int) -> list[str]:
         """What it has more of than before, memory above so much."""
-        limits, after = before | {"rss": before["rss"] + rss_kib}, self.figures()
+        limits = before | {"rss": before["rss"] + rss_kib}
+        after = self.figures()
         return [
             f"{each} {before[each]} -> {after[each]}"
             for each in before
@@ -243,7 +244,8 @@ class Bench:
 
     def kill(self) -> None:
         """End the gateway, however it fares."""
-        gateway, self._gateway = self._gateway, None
+        gateway = self._gateway
+        self._gateway = None
         if gateway is not None:
             gateway.kill()
 
@@ -264,7 +266,8 @@ class Bench:
 
     def wait_until(self, condition: Callable[[], object], seconds: float, what: str) -> None:
         """Wait until something holds. NotRecovered when it does not come."""
-        begin, last = time.monotonic(), False
+        begin = time.monotonic()
+        last = False
         while not condition():
             if last:
                 raise NotRecovered(f"{what}: not within {seconds:g} s; {self.last_words()}")
@@ -277,7 +280,8 @@ class Bench:
 
     def wait_log(self, text: str, since: int = 0, seconds: float = 10) -> None:
         """Wait for a line with this text in the gateway's log, from that line on."""
-        lines, texts = self.gateway.lines, [each for each in (text, self.said_instead) if each]
+        lines = self.gateway.lines
+        texts = [each for each in (text, self.said_instead) if each]
         self.wait_until(
             lambda: any(each in line for line in lines[since:] for each in texts),
             seconds,
@@ -355,7 +359,8 @@ class Bench:
         if not good:
             injection.leave_out_until(time.monotonic_ns())
         injection.note_values(self.account(row))
-        received, self._received = self._received, sum(esc.received() for esc in self.escs)
+        received = self._received
+        self._received = sum(esc.received() for esc in self.escs)
         row.transmitted += max(0, self._received - received)
         if fault.limit_s is not None and injection.recovery_s > fault.limit_s:
             row.notes.append(f"recovered only after {injection.recovery_s:.2f} s")
@@ -444,7 +449,8 @@ class Injection:
         def after(at_ns: int | None) -> str:
             return "no time" if at_ns is None else f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
 
-        watch, row = self.bench.watch, self.row
+        watch = self.bench.watch
+        row = self.row
         wrong = watch.wrong_count - self._wrong
         row.wrong += wrong
         for each in list(watch.wrong)[-min(wrong, 3) :] if wrong else ():

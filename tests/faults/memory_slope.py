@@ -35,7 +35,8 @@ def faults_in(samples: Sequence[Sample]) -> list[str]:
     """What is wrong with the memory of a run, in words; empty for a run that is shorter than ``MIN_HOURS``."""
     if not samples:
         return []
-    begin, end = samples[0].seconds, samples[-1].seconds
+    begin = samples[0].seconds
+    end = samples[-1].seconds
     if end - begin < MIN_HOURS * HOUR_S:
         return []
     settled = [each for each in samples if each.seconds >= begin + _WARM_UP * (end - begin)]

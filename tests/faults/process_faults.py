@@ -72,13 +72,15 @@ def ended(bench: Bench, injection: Injection, _n: int) -> None:
     start_and_wait(injection)
 
 
-SAME_PORT, SAME_NODES = "is in use by another program", "another gateway on this machine"
+SAME_PORT = "is in use by another program"
+SAME_NODES = "another gateway on this machine"
 
 
 @fault("Process", "a second instance", None, escs=[], rounds=(SAME_PORT, SAME_NODES))
 def second(bench: Bench, injection: Injection, reason: str) -> None:
     """On the same port, and with the same nodes on the same interface: refused with one line, the first goes on undisturbed."""
-    other, extra = bench.folder / "second.toml", bench.folder / "second"
+    other = bench.folder / "second.toml"
+    extra = bench.folder / "second"
     text = bench.config.read_text()
     if reason == SAME_PORT:
         text = text.replace("enabled = true", "enabled = false")
@@ -199,7 +201,8 @@ write to the disk at all, which the watch on its system calls would show as sile
 def disk(_: Path) -> Iterator[Bench]:
     """Two ESCs; the parameters on a small file system of their own; a slow one at will."""
     folder = Path(tempfile.mkdtemp(prefix="disk."))
-    store, site = folder / "store", folder / "site"
+    store = folder / "store"
+    site = folder / "site"
     store.mkdir()
     run(f"mount -t tmpfs -o size=64k,mode=0700 tmpfs {store}")
     site.mkdir()

@@ -47,14 +47,24 @@ def run_inside(args: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         timeout_s = TIMEOUT_S.get(args.part, 180 * args.minutes + 300)
         words = [
-            *(sys.executable, PROJECT / "tests/vm/vm_run.py", f"--timeout={timeout_s:g}"),
-            *(f"--backend={'qemu' if args.part == 'qemu' else 'uml'}", f"--rw={folder}", "--"),
-            *(sys.executable, "-B", __file__, args.part, f"--inside={folder}"),
-            *(f"--seed={args.seed}", f"--minutes={args.minutes:g}"),
+            sys.executable,
+            PROJECT / "tests/vm/vm_run.py",
+            f"--timeout={timeout_s:g}",
+            f"--backend={'qemu' if args.part == 'qemu' else 'uml'}",
+            f"--rw={folder}",
+            "--",
+            sys.executable,
+            "-B",
+            __file__,
+            args.part,
+            f"--inside={folder}",
+            f"--seed={args.seed}",
+            f"--minutes={args.minutes:g}",
             *(f"--only={text}" for text in args.only),
         ]
         subprocess.run(list(map(str, words)), stdin=subprocess.DEVNULL, check=False)
-        report, file = Report(), Path(folder, REPORT)
+        report = Report()
+        file = Path(folder, REPORT)
         if file.exists():
             report.read(file)
     return report
@@ -91,7 +101,8 @@ def run(faults: Sequence[Fault], report: Report, folder: Path) -> None:
 
 def run_one(bench: Bench, fault: Fault, rounds: Sequence[object], report: Report) -> bool:
     """True if the bench is still good."""
-    begin, row = time.monotonic(), report.of(fault)
+    begin = time.monotonic()
+    row = report.of(fault)
     good = all(bench.inject(fault, row, each) for each in rounds)
     print(f"{time.monotonic() - begin:6.1f} s  {row.told}", flush=True)
     return good

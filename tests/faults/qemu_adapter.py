@@ -19,11 +19,19 @@ FULL_SPEED = 2
 _HEADER = struct.Struct(">5I28s")
 _SUBMIT = struct.Struct(">4xi12x8s")
 _SETUP = struct.Struct("<BBHHH")
-_CMD_UNLINK, _RET_SUBMIT, _RET_UNLINK = 2, 3, 4
-_STALL, _UNLINKED = -32, -104
-_DEVICE_TO_HOST, _VENDOR_OR_CLASS = 0x80, 0x60
-_GET_STATUS, _GET_DESCRIPTOR, _GET_CONFIGURATION = 0, 6, 8
-_DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
+_CMD_UNLINK = 2
+_RET_SUBMIT = 3
+_RET_UNLINK = 4
+_STALL = -32
+_UNLINKED = -104
+_DEVICE_TO_HOST = 0x80
+_VENDOR_OR_CLASS = 0x60
+_GET_STATUS = 0
+_GET_DESCRIPTOR = 6
+_GET_CONFIGURATION = 8
+_DEVICE = 1
+_CONFIGURATION = 2
+_STRING = 3
 
 
 def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
@@ -44,8 +52,12 @@ class Line(NamedTuple):
 
 ESC_LINE = Line()
 FRESH_LINE = Line(9600, "N")
-STATUS_OVERRUN, STATUS_PARITY, STATUS_FRAMING, STATUS_BREAK = 0x02, 0x04, 0x08, 0x10
-MODEM_STATUS, LINE_STATUS = 0x01, 0x60
+STATUS_OVERRUN = 0x02
+STATUS_PARITY = 0x04
+STATUS_FRAMING = 0x08
+STATUS_BREAK = 0x10
+MODEM_STATUS = 0x01
+LINE_STATUS = 0x60
 FIFO_SIZE = 384
 """Received bytes, two of status with each packet among them, that the chip holds while nobody reads."""
 
@@ -104,7 +116,8 @@ class SerialAdapter:
         wait_until(attached, 5, "the USB port is free")
         theirs.close()  # the kernel holds it
         with self._lock:
-            self.line, self._is_set = FRESH_LINE, False
+            self.line = FRESH_LINE
+            self._is_set = False
             self._asked.clear()
             self._ready.clear()
             self._ours = ours
@@ -128,7 +141,8 @@ class SerialAdapter:
     def put(self, data: bytes, error: int = 0) -> None:
         """Bytes from the ESC, and what was wrong with them: packets to the host, as soon as it asks; nothing happens while unplugged."""
         if self.line != ESC_LINE:
-            data, error = bytes(len(data)), STATUS_FRAMING
+            data = bytes(len(data))
+            error = STATUS_FRAMING
         with self._lock:
             for at in range(0, len(data) if self.plugged else 0, 62):
                 packet = data[at : at + 62]

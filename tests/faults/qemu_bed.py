@@ -26,7 +26,8 @@ from qemu_adapter import SerialAdapter, wait_until
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
 
-WIRE, UART = 0, 1
+WIRE = 0
+UART = 1
 SLACK_NS = 400 * MS
 RATE_HZ = 10
 INFO_EVERY = 20
@@ -112,7 +113,8 @@ class FarPort(FedEsc):
 
     def put(self, data: bytes, seconds: float = 1.0) -> bool:
         """Bytes to the port; whether it took all of them within the time."""
-        done, deadline = 0, time.monotonic() + seconds
+        done = 0
+        deadline = time.monotonic() + seconds
         while done < len(data) and time.monotonic() < deadline:
             try:
                 done += os.write(self._fd, data[done:])
@@ -152,7 +154,8 @@ class WirePort(FedEsc):
 
     def unplug(self) -> None:
         """Returns when its device file is gone."""
-        before, self.device = self.device, ""
+        before = self.device
+        self.device = ""
         self.adapter.unplug()
         wait_until(lambda: before not in serial_ports(), 5, f"{before} gone")
 

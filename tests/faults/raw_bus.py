@@ -8,7 +8,9 @@ import time
 from typing import Self
 
 FRAME = struct.Struct("=IB3x8s")
-ERROR_FLAG, EXTENDED, REMOTE = 0x20000000, 0x80000000, 0x40000000
+ERROR_FLAG = 0x20000000
+EXTENDED = 0x80000000
+REMOTE = 0x40000000
 INVERTED = 0x20000000
 """In a filter: all but this id."""
 SO_RCVBUFFORCE = 33

@@ -16,7 +16,8 @@ from harness import Bench, Injection, PtyPort
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.states import Device
 
-LOST, PORT_ERROR = 4, 5
+LOST = 4
+PORT_ERROR = 5
 on_first = partial(fault, "Serial", limit_s=2.0, escs=[0])
 """A fault of the first ESC."""
 
@@ -123,7 +124,8 @@ def bit_errors(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
 
     Not hit is what the CRC of the legacy layout leaves out: nobody can see that.
     """
-    at, crc = generator.randrange(len(wire)), len(wire) - 4
+    at = generator.randrange(len(wire))
+    crc = len(wire) - 4
     if generator.random() > 0.3 or crc // 4 * 4 <= at < crc:
         return wire, True
     rest = wire[at + 1 :]
@@ -229,7 +231,8 @@ def stutter(bench: Bench, injection: Injection, _n: int) -> None:
 def never_silent(bench: Bench, injection: Injection, _n: int) -> None:
     """Frame behind frame, as many as 115200 baud carry: of one ESC newer values take the place of older ones, of the other none is lost."""
     fed = bench.escs[0]
-    before, fed.rate_hz = fed.rate_hz, 260
+    before = fed.rate_hz
+    fed.rate_hz = 260
     time.sleep(1.5)
     fed.rate_hz = before
     injection.cleared()

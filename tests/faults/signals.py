@@ -58,9 +58,12 @@ def _snake(name: str) -> str:
 def _message(message: Any, count: int) -> Message:
     whose = re.match(r"Esc(\d*)(?=[A-Z])", message.name)
     if whose is None or (count > 1) != bool(whose[1]):
-        stem, esc, prefix = message.name, None, ""
+        stem = message.name
+        esc = None
+        prefix = ""
     else:
-        stem, esc = message.name[whose.end() :], int(whose[1] or 1) - 1
+        stem = message.name[whose.end() :]
+        esc = int(whose[1] or 1) - 1
         prefix = whose[0] if count > 1 else ""
     places: list[Place] = []
     flags: list[Place] = []

@@ -15,7 +15,8 @@ import time
 import tty
 
 _N_SLCAN = 17
-_TIOCSETD, _SIOCGIFNAME = 0x5423, 0x8910
+_TIOCSETD = 0x5423
+_SIOCGIFNAME = 0x8910
 _RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 
 
@@ -89,7 +90,8 @@ class Adapter:
         if kind == b"S":
             self.rate = _RATES[int(command[1:])]
         elif kind == b"O":
-            self.is_open, self.silent = True, False
+            self.is_open = True
+            self.silent = False
         elif kind == b"C":
             self.is_open = False
 

@@ -11,7 +11,9 @@ from kontronik_can_gw.esc.kontronik.codec import Layout
 
 START = 100 * SECOND
 PERIOD = 20 * MS
-SPEED_ID, CURRENT_ID, LINK_ID = 0x688, 0x690, 0x6B0
+SPEED_ID = 0x688
+CURRENT_ID = 0x690
+LINK_ID = 0x6B0
 
 
 @pytest.fixture
@@ -27,7 +29,8 @@ def judge() -> Judge:
 
 def frame(judge: Judge, can_id: int, n: int, esc: int = 0) -> bytes:
     """A frame as the gateway sends it, made from the DBC alone."""
-    values, message = judge.escs[esc].values(n), judge.table[can_id]
+    values = judge.escs[esc].values(n)
+    message = judge.table[can_id]
     bits = (int(values["flags"]) & message.flags[1]) << message.flags[0]
     for place in message.places:
         bits |= (round(values[place.name] / place.scale) & place.mask) << place.start
@@ -80,7 +83,8 @@ def test_what_is_wrong_is_named(
     for each in given:
         if isinstance(each, tuple):
             one, other = (frame(judge, SPEED_ID, n) for n in each)
-            n, data = each[1], one[:3] + other[3:]
+            n = each[1]
+            data = one[:3] + other[3:]
         else:
             n = abs(each)
             data = frame(judge, SPEED_ID, n, int(each < 0))

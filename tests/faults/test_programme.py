@@ -43,7 +43,8 @@ def test_states_stand_in_both_reports(tmp_path: Path, capsys: pytest.CaptureFixt
     report["wrong"] = row("wrong", wrong=1)
     assert conclude(report) == 1
     assert capsys.readouterr().out.endswith("2 faults: 1 failed, 1 good\n")
-    out, again = tmp_path / "out", Report()
+    out = tmp_path / "out"
+    again = Report()
     report.write(out)
     again.read(out)
     assert [each.state for each in again.values()] == [GOOD, FAILED]
@@ -94,7 +95,8 @@ def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gate
 
 
 def test_a_gateway_that_ended_is_said_to_have_ended() -> None:
-    bench, row = Bench.__new__(Bench), Row("x", None)
+    bench = Bench.__new__(Bench)
+    row = Row("x", None)
     with subprocess.Popen(["false"]) as process:
         pass
     bench._gateway = cast(Any, SimpleNamespace(process=process, lines=["the last word"]))
@@ -112,7 +114,8 @@ def test_the_page_shows_each_fault_healed_without_a_wrong_or_lost_value() -> Non
 
 
 def test_rows_that_were_run_take_the_place_of_older_ones_whatever_they_show() -> None:
-    before, fault = PAGE.read_text(), str(in_order()[3])
+    before = PAGE.read_text()
+    fault = str(in_order()[3])
     run = Row(fault, 2.0, injected=3, recovered=3, worst_s=0.1, wrong=1)
     after = put(before, Report({fault: run}))
     line = f"| {fault} | 3 | 3 | 0.10 s (limit 2 s) | 1 | 0 | failed |"

@@ -20,7 +20,8 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import SECOND
 
-FIRST_ID, COMMAND_ID = 0x1234500, 0x12
+FIRST_ID = 0x1234500
+COMMAND_ID = 0x12
 ESCS = [EscSettings("left"), EscSettings("right")]
 
 
@@ -30,8 +31,10 @@ class Voltages(Output):
     def __init__(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> None:
         super().__init__()
         self.receive_ids = frozenset({COMMAND_ID})
-        self._escs, self._gateway = escs, gateway
-        self._due, self._period = now + SECOND, SECOND
+        self._escs = escs
+        self._gateway = gateway
+        self._due = now + SECOND
+        self._period = SECOND
 
     def own_ids(self) -> dict[int, Owner]:
         return {FIRST_ID + n | EXTENDED: Owner(n, "voltage") for n in range(len(self._escs))}
@@ -62,7 +65,8 @@ class Voltages(Output):
 def test_other_receive_ids_are_noticed_whatever_their_content_and_address() -> None:
     output = Output()
     for number in range(100):
-        before, again = output.marks, output.marks
+        before = output.marks
+        again = output.marks
         assert before == again
         output.receive_ids = NO_IDS  # the memory of the old ones may be used again
         output.receive_ids = frozenset((number // 2,))

@@ -53,7 +53,8 @@ class Bench:
         return sent + self.take()
 
     def wait(self, ns: int) -> list[bytes]:
-        end, sent = self.now + ns, []
+        end = self.now + ns
+        sent = []
         while (due := self.gateway.next_deadline()) <= end:
             self.now = max(self.now, due)
             self.gateway.advance(self.now)

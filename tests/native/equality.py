@@ -132,18 +132,27 @@ def _difference(*sides: Sequence[CanFrame]) -> str:
 
 _STATE_EACH = 10
 STATE = (
-    *("live", "info", "last_live", "last_info", "link", "layout", "cells", "last_cells"),
-    *(
-        "counters",
-        "frame_rate",
-        "losses",
-        "late_frames",
-        "suspect_frames",
-        "live_ns",
-        "last_info_ns",
-    ),
-    *("info_bound_ns", "pole_pairs", "output_divisor", "gear_denominator"),
-    *("energy_mw_ns", "run_time_ns"),
+    "live",
+    "info",
+    "last_live",
+    "last_info",
+    "link",
+    "layout",
+    "cells",
+    "last_cells",
+    "counters",
+    "frame_rate",
+    "losses",
+    "late_frames",
+    "suspect_frames",
+    "live_ns",
+    "last_info_ns",
+    "info_bound_ns",
+    "pole_pairs",
+    "output_divisor",
+    "gear_denominator",
+    "energy_mw_ns",
+    "run_time_ns",
 )
 
 
@@ -160,7 +169,8 @@ class BothSlots:
 
     def act(self, now: int) -> None:
         """Something is done with it: as a rule it is started."""
-        chance, what = self.chance, self.chance.random()
+        chance = self.chance
+        what = self.chance.random()
         if what < 0.3:
             other = None if chance.random() < 0.3 else self._random()
             if self.started and self.settings is not None and other is not None:
@@ -188,7 +198,8 @@ class BothSlots:
                 mapped.append(variable)
         times = (chance.choice((0, 0, 5, 20, 25)) * MS, chance.choice((0, 0, 7, 500)) * MS)
         if self.is_transfer:
-            fill, page = chance.getrandbits(8 * FILL), 64 + 3 * chance.randrange(40)
+            fill = chance.getrandbits(8 * FILL)
+            page = 64 + 3 * chance.randrange(40)
             of_id = chance.choice((0x18040A2A, 0x18040A2A, 0x18040A2B)), chance.random() < 0.9
             return SlotSettings(transfer_plan(chance), *of_id, *times, fill, page)
         plan = compile_pdo(mapped)
@@ -204,7 +215,8 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
 
     One that the core in C can express: slots of one id are all there, and count together.
     """
-    at, signals = 8 * FILL, []
+    at = 8 * FILL
+    signals = []
     sources = [v for v in VALUES.values() if v.supplied and v.kind is not Kind.OBJECT]
     for source in chance.sample(sources, chance.randint(1, 7)):
         is_float = chance.random() < 0.4
@@ -217,8 +229,16 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
         pieces = [Piece(cut, length - cut, at)] + [Piece(0, cut, at + length - cut)] * (cut > 0)
         codes = (0x7E00, 0x7BFF) if is_float else (0, high)
         signal = SignalPlan(
-            *(source.name, "", Role.SOURCE, length, signed, is_float, tuple(pieces)),
-            *(-high - 1 if signed else 0, high, *codes),
+            source.name,
+            "",
+            Role.SOURCE,
+            length,
+            signed,
+            is_float,
+            tuple(pieces),
+            -high - 1 if signed else 0,
+            high,
+            *codes,
             slope=Fraction(chance.choice((1, 1, 1, 1000)), source.per_unit),
             intercept=Fraction(chance.choice(("0", "0", "273.15"))),
             source=source,
@@ -228,10 +248,20 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
         signals.append(signal)
         at += length
     plan = MessagePlan(
-        *("transfer", 0, True, False, (at + 7) // 8, SendType.EVENT, 0, 0, tuple(signals)),
-        *(frozenset({0}), frozenset({Group.LIVE})),
+        "transfer",
+        0,
+        True,
+        False,
+        (at + 7) // 8,
+        SendType.EVENT,
+        0,
+        0,
+        tuple(signals),
+        frozenset({0}),
+        frozenset({Group.LIVE}),
     )
-    seed, paced = chance.randrange(1 << 16), chance.random() < 0.7
+    seed = chance.randrange(1 << 16)
+    paced = chance.random() < 0.7
     found = SlotPlan(plan, compile_pack(plan), Event.LIVE, 0, None, False, "", seed, paced)
     try:
         _rows(found, EscSettings().protocol)
@@ -261,7 +291,9 @@ class Both:
         escs: Sequence[EscSettings],
         layout: Layout,
     ) -> None:
-        self.chance, self.escs, self.layout = chance, escs, layout
+        self.chance = chance
+        self.escs = escs
+        self.layout = layout
         self.silent = chance.random() < 0.3
         self.now = START
         self.events: tuple[list[Any], list[Any]] = ([], [])
@@ -294,7 +326,8 @@ class Both:
         """What came out, each time; the state of the ESCs, which keeps what is wrong, now and then."""
         for slot in self.slots:
             assert slot.both[0].is_pending == slot.both[1].is_pending
-        frames, others = self.python.take(self.now), self.native.take(self.now)
+        frames = self.python.take(self.now)
+        others = self.native.take(self.now)
         assert frames == others, _difference(frames, others)
         self.count += len(frames)
         assert self.events[0] == self.events[1], self.events
@@ -330,7 +363,8 @@ class Both:
         self.now += (
             chance.choice(_STEPS) if chance.random() < 0.99 else chance.randrange(30 * SECOND)
         )
-        esc, what = chance.randrange(len(self.escs)), chance.random()
+        esc = chance.randrange(len(self.escs))
+        what = chance.random()
         if what < 0.1:
             pass
         elif what < 0.12:
@@ -349,7 +383,8 @@ class Both:
         self.call("advance", self.now)
 
     def _receive(self, esc: int) -> None:
-        chance, data = self.chance, self.chance.choice(_streams())
+        chance = self.chance
+        data = self.chance.choice(_streams())
         count = chance.randrange(6) if chance.random() < 0.2 else 0
         cuts = sorted(chance.choices(range(len(data) + 1), k=count))
         for begin, end in zip([0, *cuts], [*cuts, len(data)], strict=True):

@@ -77,9 +77,11 @@ class Case:
     def expected(self) -> str:
         """The frames of the core in Python, by the same clock, as candump logs them."""
         core = PythonCore(self.escs, self.layout, 0, self.silent)
-        core.status.state, core.status.can_state = GatewayState.RUNNING, CanState.ERROR_ACTIVE
+        core.status.state = GatewayState.RUNNING
+        core.status.can_state = CanState.ERROR_ACTIVE
         core.repeat(0)
-        taken, empty = [0] * len(self.lines), [0] * len(self.lines)
+        taken = [0] * len(self.lines)
+        empty = [0] * len(self.lines)
         last = max(-(-len(line) * BYTE_NS // MS) * MS for line in self.lines)
         text = []
         for now in range(0, last + SILENCE + 1, MS):

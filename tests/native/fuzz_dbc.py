@@ -24,10 +24,44 @@ from kontronik_can_gw.native.rows import NotInCore
 
 STEPS = 40
 NUMBERS = (
-    *("0", "1", "-1", "2", "7", "8", "9", "15", "16", "31", "32", "33", "62", "63", "64", "65"),
-    *("255", "256", "511", "512", "65535", "65536", "2147483647", "2147483648", "4294967295"),
-    *("9223372036854775807", "-9223372036854775808", "18446744073709551615"),
-    *("0.1", "-0.5", "1e-9", "1e9", "1e18", "1e300", "0.00592884289493769", "1e-320", "nan", "inf"),
+    "0",
+    "1",
+    "-1",
+    "2",
+    "7",
+    "8",
+    "9",
+    "15",
+    "16",
+    "31",
+    "32",
+    "33",
+    "62",
+    "63",
+    "64",
+    "65",
+    "255",
+    "256",
+    "511",
+    "512",
+    "65535",
+    "65536",
+    "2147483647",
+    "2147483648",
+    "4294967295",
+    "9223372036854775807",
+    "-9223372036854775808",
+    "18446744073709551615",
+    "0.1",
+    "-0.5",
+    "1e-9",
+    "1e9",
+    "1e18",
+    "1e300",
+    "0.00592884289493769",
+    "1e-320",
+    "nan",
+    "inf",
 )
 HERE = Path(__file__).parents[1]
 PATHS = shipped("dbc/kontronik_esc.dbc"), HERE / "dbc/rich.dbc", HERE / "benchmarks/five.dbc"
@@ -44,7 +78,8 @@ def changed(chance: random.Random, text: str) -> str:
             text = text[: one.start()] + chance.choice(NUMBERS) + text[one.end() :]
         elif what < 0.85:
             lines = text.split("\n")
-            at, to = chance.randrange(len(lines)), chance.randrange(len(lines))
+            at = chance.randrange(len(lines))
+            to = chance.randrange(len(lines))
             line = lines[at] if chance.random() < 0.5 else lines.pop(at)
             lines.insert(to, line)
             text = "\n".join(lines)

@@ -24,7 +24,8 @@ TEXTS = ("csv", "jsonl", "candump")
 @contextmanager
 def core(library: Any) -> Iterator[None]:
     """The shared object that is there; None: there is none."""
-    before, load.library = load.library, lambda: (library, "")  # type: ignore[assignment]
+    before = load.library
+    load.library = lambda: (library, "")  # type: ignore[assignment]
     try:
         yield
     finally:
@@ -33,7 +34,8 @@ def core(library: Any) -> Iterator[None]:
 
 def esc(chance: random.Random, number: int) -> dict[str, object]:
     gear = f"{chance.randint(1, 300)}/{chance.randint(1, 300)}"
-    timeout, poles = chance.choice((20, 250, 1000)), chance.choice((1, 7, 14, 64, 100))
+    timeout = chance.choice((20, 250, 1000))
+    poles = chance.choice((1, 7, 14, 64, 100))
     cells = chance.choice((0, 0, 6, 14))
     more = {"gear": gear, "cell_count": cells, "telemetry_timeout_ms": timeout}
     return {"name": f"e{number}", "pole_pairs": poles} | more
@@ -78,7 +80,8 @@ def write_capture(chance: random.Random, path: Path, version: int = 2) -> Path:
     blocks = [block(b"H", 0, json_payload(header))]
     while entries:
         count = chance.choice((1, 2, 40, 400))
-        some, entries = entries[:count], entries[count:]
+        some = entries[:count]
+        entries = entries[count:]
         payload = data_payload(some)
         if version == 1:
             payload = data_payload([e._replace(came_ns=e.time_ns) for e in some])

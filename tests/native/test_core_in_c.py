@@ -48,7 +48,8 @@ def test_both_cores_are_equal_over_a_million_frames(native_library: Any, group: 
 
 def _scaled(chance: random.Random) -> str:
     """A message whose signal has a factor that takes many digits and cannot hold all values of its source."""
-    length, is_signed = chance.randint(2, 24), chance.random() < 0.5
+    length = chance.randint(2, 24)
+    is_signed = chance.random() < 0.5
     factor = f"{chance.choice((1, 1, 1, -1)) / chance.choice((3, 7, 255, 1023, 4095)):.8g}"
     offset = chance.choice(("0", "0", "-40"))
     sign = "-" if is_signed else "+"
@@ -153,7 +154,8 @@ def test_sorting_of_pending_messages_is_not_quadratic(tmp_path: Path) -> None:
     counter.write_text(_COUNTED, encoding="utf-8")
     options = ("-O0", "-finstrument-functions", "-Wl,-Bsymbolic", *OPTIONS, str(counter))
     library = load(built(tmp_path / "counted.so", *options))
-    few, many = _sort_calls(library, 60), _sort_calls(library, 240)
+    few = _sort_calls(library, 60)
+    many = _sort_calls(library, 240)
     print(few, many)
     assert few < many < 6 * few, (few, many)
 

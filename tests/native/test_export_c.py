@@ -44,7 +44,8 @@ def test_macros_build_without_a_warning(tmp_path: Path, program: str, options: s
 def test_the_command_writes_what_a_configuration_sends(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config, folder = tmp_path / "gateway.toml", tmp_path / "firmware"
+    config = tmp_path / "gateway.toml"
+    folder = tmp_path / "firmware"
     config.write_text(
         '[can]\nchannel = "vcan0"\n[canopen]\nenabled = true\n'
         '[[esc]]\nname = "left"\nport = "/dev/null"\npole_pairs = 7\n'
@@ -141,7 +142,8 @@ def test_it_links_with_a_program_in_cpp(shipped_case: Case) -> None:
 @pytest.mark.parametrize("option", ["-DKCG_DATA=64", "-DKCG_FOUND=3"])
 def test_files_that_differ_in_a_structure_do_not_link(shipped_case: Case, option: str) -> None:
     """The program would write beyond memory that the other file has reserved."""
-    case, gcc = shipped_case, there("gcc")
+    case = shipped_case
+    gcc = there("gcc")
     case.output(gcc, "-std=c99", option, "-c", "core.c")
     words = [gcc, "-std=c99", "-o", "differs", "core.o", "tables.c", "example_main.c"]
     done = subprocess.run(words, cwd=case.folder, capture_output=True, text=True, check=False)
@@ -156,7 +158,8 @@ def test_files_that_differ_in_a_structure_do_not_link(shipped_case: Case, option
 @pytest.mark.parametrize(("option", "count"), [("-DKCG_SLOTS=0", 0), ("-DKCG_SLOTS=1", 8)])
 def test_what_is_declared_is_defined(shipped_case: Case, option: str, count: int) -> None:
     """Every function of core.h that the preprocessor leaves is defined in core.c, and the slots only with KCG_SLOTS."""
-    case, gcc = shipped_case, there("gcc")
+    case = shipped_case
+    gcc = there("gcc")
     header = case.output(gcc, "-std=c99", option, "-E", "-P", "core.h")
     declared = set(re.findall(r"(kcg_\w+)\([^;{}]*\);", header))
     case.output(gcc, "-std=c99", option, "-c", "core.c")
@@ -203,21 +206,27 @@ int main(void)
     return 0;
 }
 """
-OK, LOST, PORT_ERROR = LinkState.OK, LinkState.LOST, LinkState.PORT_ERROR
+OK = LinkState.OK
+LOST = LinkState.LOST
+PORT_ERROR = LinkState.PORT_ERROR
 
 
 def test_the_example_survives_a_failed_uart_and_bus_off(shipped_case: Case) -> None:
-    case, live = shipped_case, encode(LiveData(battery_voltage=2400), WireLayout.V4)
+    case = shipped_case
+    live = encode(LiveData(battery_voltage=2400), WireLayout.V4)
     text = _FAULTS.replace("LIVE", ", ".join(map(str, live)))
     (case.folder / "faults.c").write_text(text)
     case.output(there("gcc"), "-std=c99", *STRICT, "-o", "faults", "core.c", "tables.c", "faults.c")
-    blocks, states, frames = {}, {}, []
+    blocks = {}
+    states = {}
+    frames = []
     for line in case.output("./faults").splitlines():
         if line.startswith("("):
             frames.append(line.split()[2].partition("#")[0])
         else:
             name, link, count = line.split()
-            blocks[name], states[name] = frames, (int(link), int(count))
+            blocks[name] = frames
+            states[name] = (int(link), int(count))
             frames = []
     assert states == {
         "ok": (OK, 0),

@@ -36,7 +36,8 @@ def sources(tmp_path: Path) -> Path:
 
 def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str, str]:
     """The program in a fresh environment, the name of its wheel, and what pip printed."""
-    folder, wheels = sources.parent / "fresh", sources.parent / "wheels"
+    folder = sources.parent / "fresh"
+    wheels = sources.parent / "wheels"
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     build = ["wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(wheels), str(sources)]
     command = [*pip, *build]
@@ -64,7 +65,8 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
 def test_the_gateway_works_and_says_which_core_runs_and_why(
     sources: Path, compiles: str | None, why: str
 ) -> None:
-    programs, environment = sources.parent / "programs", dict(os.environ)
+    programs = sources.parent / "programs"
+    environment = dict(os.environ)
     programs.mkdir()
     if compiles is None and compiler() is None:
         pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev")

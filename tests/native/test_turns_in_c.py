@@ -65,7 +65,8 @@ class InC:
     ) -> None:
         self.world = world = wire_world.World(len(escs))
         self.loop = wire_world.loop_in(world, patch, escs, layout, **more)
-        self.bus, self.begun = world.bus, world.now
+        self.bus = world.bus
+        self.begun = world.now
         self.turns: list[int] = []
         _count(patch, self.loop, "_serve", lambda: self.turns.append(world.now))
         self.loop.open()
@@ -157,7 +158,8 @@ def test_what_is_sent_is_what_a_replay_in_python_sends(
 ) -> None:
     """The order included: outputs' frames, then slots, then messages. With nodes nearly each frame has other error bits."""
     it = Recorded(seed, monkeypatch, has_nodes)
-    sent, replayed = it.sent(), it.replayed(monkeypatch)
+    sent = it.sent()
+    replayed = it.replayed(monkeypatch)
     assert it.loop._poller.count > 100 > len(it.turns)  # type: ignore[attr-defined]
     assert len(sent) == len(replayed) > 0
     assert sent == replayed
@@ -179,10 +181,11 @@ def test_syncs_read_at_once_are_all_answered_in_the_run_and_in_its_replay(
         (150, 0x601, "23 00 18 01 81 01 00 40"),
         *[(1000, 0x80, "")] * 8,
         *[(1500, 0x80, "")] * 3,
-        *[(1800, 0x80, "")],
+        (1800, 0x80, ""),
     ):
         it.bus.came(can_id, bytes.fromhex(data), it.begun + at * MS)
-    sent, replayed = it.sent(), it.replayed(monkeypatch)
+    sent = it.sent()
+    replayed = it.replayed(monkeypatch)
     pdos = [(number, data) for number, data in sent if number == 0x181 and len(data) == 1]
     assert len(pdos) == 6
     assert pdos == [
@@ -266,7 +269,8 @@ def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_
     it.run(5.295)  # between two heartbeats
     it.fill_bus(30 * MS)
     it.run(6)
-    status, transmitter = it.loop.gateway.status, it.loop.can.transmitter
+    status = it.loop.gateway.status
+    transmitter = it.loop.can.transmitter
     assert (transmitter.is_stalled, status.dropped_frames) == (False, 0)
     sent = [at - it.begun for at, f in it.bus.sent if f.can_id == EMERGENCY + 1]
     (at,) = [at for at in sent if at > 4 * SECOND]
@@ -335,7 +339,8 @@ def test_a_slow_bus_has_the_newest_of_each_page_of_a_multiplexed_message(
             wire = encode(LiveData(electrical_speed=len(made)), WireLayout.V4)
             it.world.wires[0].put(wire, [at] * len(wire))
     it.run(4)
-    status, transmitter = it.loop.gateway.status, it.loop.can.transmitter
+    status = it.loop.gateway.status
+    transmitter = it.loop.can.transmitter
     it.loop.close()
     pages: dict[int, list[int]] = {}
     after: Counter[int] = Counter()

@@ -92,7 +92,8 @@ def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_p
     made_of: Callable[[bytes], bytes | None],
     said: str,
 ) -> None:
-    path, not_built = tmp_path / "core-other.so", tmp_path / "not_built.txt"
+    path = tmp_path / "core-other.so"
+    not_built = tmp_path / "not_built.txt"
     if (content := made_of(objects.shared_object().read_bytes())) is not None:
         path.write_bytes(content)
     monkeypatch.setattr(load, "shared_object", lambda: path)
@@ -107,8 +108,10 @@ def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_p
 @pytest.mark.parametrize(
     ("machine", "bits", "its"),
     [
-        *(("aarch64", 64, "aarch64"), ("aarch64", 32, "armv7l")),
-        *(("armv6l", 32, "armv6l"), ("x86_64", 32, "i686")),
+        ("aarch64", 64, "aarch64"),
+        ("aarch64", 32, "armv7l"),
+        ("armv6l", 32, "armv6l"),
+        ("x86_64", 32, "i686"),
     ],
 )
 def test_a_process_of_32_bits_has_an_object_of_its_own(
@@ -183,7 +186,8 @@ def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str, said: 
 def test_a_compiler_that_fails_is_said_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program, target = tmp_path / "cc", tmp_path / "core.so"
+    program = tmp_path / "cc"
+    target = tmp_path / "core.so"
     program.write_text("#!/bin/sh\nprintf 'In file:\\nfatal error: \\377' >&2\nexit 1\n")
     program.chmod(0o755)
     said = f"at the installation {program} failed: fatal error: \ufffd"

@@ -97,7 +97,8 @@ class FakeNativePoller(NativePoller):
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
-        self.before, self.now = self._world.before, self._world.looked
+        self.before = self._world.before
+        self.now = self._world.looked
         self.late = self._world.late
         return ready
 

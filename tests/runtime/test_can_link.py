@@ -66,7 +66,9 @@ class Kernel:
             self._waiting.append(self.facts)
 
     def take(self) -> list[LinkFacts]:
-        told, self._waiting, self.news = [*self.news, *self._waiting], [], []
+        told = [*self.news, *self._waiting]
+        self._waiting = []
+        self.news = []
         return told
 
     def close(self) -> None:
@@ -78,7 +80,9 @@ class Bench:
         canopen = {"enabled": has_node, "self_start": self_start, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
-        self.kernel, self.now, self.clock = kernel, 0, 0
+        self.kernel = kernel
+        self.now = 0
+        self.clock = 0
         self.world = World()
         self.can = CanLink(
             loaded.config.can,
@@ -130,7 +134,9 @@ class Bench:
 
     def changes(self, facts: LinkFacts, there: bool = True) -> None:
         """The interface, which rtnetlink tells."""
-        self.kernel.facts, self.kernel.news, Port.there = facts, [facts], there
+        self.kernel.facts = facts
+        self.kernel.news = [facts]
+        Port.there = there
 
     def take(self) -> list[tuple[int, bytes]]:
         return self.port.take()
@@ -291,7 +297,8 @@ def test_a_saturated_bus_is_no_dead_adapter(bench: Bench, monkeypatch: pytest.Mo
     """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
     monkeypatch.setattr(Port, "is_socket", False)
     bench.start()
-    port, before = bench.port, bench.can.port
+    port = bench.port
+    before = bench.can.port
     for n in range(3000):
         port.answer = Sent.OK if n % 3 else Sent.BUSY
         for can_id in range(10):
@@ -306,7 +313,8 @@ def test_a_saturated_bus_is_no_dead_adapter(bench: Bench, monkeypatch: pytest.Mo
 
 def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
     bench.begin()
-    bench.port.bus_off_count, bench.port.overruns = 2, 1
+    bench.port.bus_off_count = 2
+    bench.port.overruns = 1
     for _ in range(2):
         bench.can.serve(bench.now)
     bench.turn(200)
@@ -351,9 +359,11 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
     made.gateway = Gateway(
         loaded.escs, loaded.layout, 0, further=[setup.make for setup in loaded.outputs]
     )
-    made.kernel, made.now, made.clock = kernel, 0, 0
+    made.kernel = kernel
+    made.now = 0
+    made.clock = 0
     made.can = CanLink(
-        *(loaded.config.can, made.gateway, World().poller, FaultLog()), clock=lambda: made.clock
+        loaded.config.can, made.gateway, World().poller, FaultLog(), clock=lambda: made.clock
     )
     return made
 

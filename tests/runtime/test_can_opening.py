@@ -38,7 +38,8 @@ class Driver:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.begun = threading.Event()
-        self.may_open, self.may_close = threading.Event(), threading.Event()
+        self.may_open = threading.Event()
+        self.may_close = threading.Event()
         self.opened = 0
         self.closed_by: list[str] = []
         """Names of the threads that closed it."""

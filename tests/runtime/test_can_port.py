@@ -32,7 +32,9 @@ from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
 SOL = socket.SOL_SOCKET
-EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
+EXTENDED = 0x80000000
+REMOTE = 0x40000000
+ERROR = 0x20000000
 _numbers = itertools.count()
 
 
@@ -296,7 +298,8 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
     )
     monkeypatch.setattr(socketcan_port, "time", clock)
     port.set_receive_ids({1})
-    fake.inbox, fake.ancillary = [packet(1)], ancillary
+    fake.inbox = [packet(1)]
+    fake.ancillary = ancillary
     assert fake.options[64] == 1, "the kernel is asked for them"
     assert port.receive() == [(CanFrame(1, b""), came)]
 
@@ -477,7 +480,8 @@ class ReturningBus:
 def test_frames_that_the_interface_returns_are_not_received() -> None:
     bus = ReturningBus()
     port = DriverPort(bus, OwnFrames())  # type: ignore[arg-type]
-    own, other = CanFrame(0x680, b"own", page=2), CanFrame(0x680, b"other")
+    own = CanFrame(0x680, b"own", page=2)
+    other = CanFrame(0x680, b"other")
     try:
         port.set_receive_ids({0x680})
         for _ in range(3):
@@ -494,7 +498,8 @@ def test_frames_that_the_interface_returns_are_not_received() -> None:
 
 
 def test_an_identical_frame_of_another_device_is_received() -> None:
-    own_frames, frame = OwnFrames(), CanFrame(0x680, b"same")
+    own_frames = OwnFrames()
+    frame = CanFrame(0x680, b"same")
     own_frames.add(frame, 0)
     assert [own_frames.is_own(frame) for _ in range(2)] == [True, False]
     own_frames.add(frame, 0)

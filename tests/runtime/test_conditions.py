@@ -35,7 +35,8 @@ def test_a_condition_is_one_line_at_each_end(
 
 
 def test_what_comes_and_goes_is_said_again_when_it_does_not(told: pytest.LogCaptureFixture) -> None:
-    conditions, now = FaultLog(), 0
+    conditions = FaultLog()
+    now = 0
     for _ in range(300):  # ten minutes, each second lost and found
         conditions.begin(NAME, "lost", now)
         conditions.end(NAME, "ok", now + SECOND)
@@ -51,7 +52,9 @@ def test_what_comes_and_goes_is_said_again_when_it_does_not(told: pytest.LogCapt
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
 def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, int]]) -> None:
-    conditions, now, lines = FaultLog(), 0, 0
+    conditions = FaultLog()
+    now = 0
+    lines = 0
     conditions.hold()
     for name, begins, seconds in happenings:
         now += seconds * SECOND

@@ -29,7 +29,8 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 
-LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
+LEFT = Identity(0x403, 0x6001, "A1", "1.0")
+RIGHT = Identity(0x403, 0x6001, "B2", "1.0")
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)
 
 
@@ -108,8 +109,10 @@ def bench(there: dict[str, Identity | None]) -> Bench:
 
 
 USB0, USB1, USB2, USB3 = (f"/dev/ttyUSB{n}" for n in range(4))
-BY_ID, BY_PATH = "/dev/serial/by-id/usb-FTDI", "/dev/serial/by-path/usb-0:1"
-BOTH, TURNED = {USB0: LEFT, USB1: RIGHT}, {USB0: RIGHT, USB1: LEFT}
+BY_ID = "/dev/serial/by-id/usb-FTDI"
+BY_PATH = "/dev/serial/by-path/usb-0:1"
+BOTH = {USB0: LEFT, USB1: RIGHT}
+TURNED = {USB0: RIGHT, USB1: LEFT}
 REPLUGGED: dict[str, tuple[dict[str, Identity], dict[str, Identity], list[str | None]]] = {
     "an adapter under another number is found": ({USB0: LEFT}, {USB3: LEFT}, [USB3]),
     "two in the other order stay with their ESCs": (BOTH, TURNED, [USB1, USB0]),
@@ -359,7 +362,8 @@ def test_settings_are_checked_every_100_ms_while_the_esc_sends(
 ) -> None:
     """While another program has echo on, an ESC receives what it sends. Both cores check equally often."""
     world = World()
-    wire, limit = world.wires[0], 125 * MS if speaks else 170 * MS
+    wire = world.wires[0]
+    limit = 125 * MS if speaks else 170 * MS
     loop = loop_in(world, monkeypatch)
     loop.open()
     loop.begin()
@@ -367,7 +371,8 @@ def test_settings_are_checked_every_100_ms_while_the_esc_sends(
     if speaks:
         wire.stream(begin, begin + 3 * SECOND, 20 * MS)
     run(loop, world, begin + 1300 * MS)
-    changed, wire.now_set = world.now, bytes(64)
+    changed = world.now
+    wire.now_set = bytes(64)
     run(loop, world, begin + 3 * SECOND)
     loop.close()
     assert wire.now_set == wire.settings
@@ -421,7 +426,8 @@ def test_pauses_between_attempts_grow_until_a_port_has_given_bytes(
     loop = loop_in(world, monkeypatch)
     loop.open()
     loop.begin()
-    opened, open_port = list[int](), loop.escs[0].open
+    opened = list[int]()
+    open_port = loop.escs[0].open
 
     def note_and_open(*arguments: Any) -> None:
         opened.append(world.now)
@@ -447,7 +453,8 @@ def test_pauses_between_attempts_grow_until_a_port_has_given_bytes(
 
 def test_echo_is_off_before_anything_else_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
     """A terminal that was just made echoes; what comes before that is off goes back to the ESC."""
-    real, echoes = serial_port._open, []
+    real = serial_port._open
+    echoes = []
     with PtyEsc() as esc:
 
         def switch(on: bool) -> None:

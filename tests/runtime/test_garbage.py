@@ -49,7 +49,9 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
     bench = Bench(*EVERYTHING)
     running = bench.running(7)
     running(2)  # the nodes boot, and what is made once is made
-    before, written, begun = None, 0, len(bench.sent)
+    before = None
+    written = 0
+    begun = len(bench.sent)
     with collector_off():
         for _ in range(40):
             entries = len(bench.entries)
@@ -73,7 +75,8 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
 def test_the_loop_leaves_no_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     """With its ports, conditions and the CAN side; lines that fall silent and speak again, a process that is held up."""
     setup, layout = EVERYTHING
-    world, further = World(2), [each.make for each in setup.outputs]
+    world = World(2)
+    further = [each.make for each in setup.outputs]
     loop = loop_in(world, monkeypatch, setup.escs, layout, setup.canopen, further=further)
     loop.open()
     loop.begin()

@@ -85,8 +85,10 @@ def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
 ) -> None:
     rng = random.Random(seed)
     world = World(1 + neighbour)
-    wire, start = world.wires[0], world.now
-    timeout, period = timeout_ms * MS, period_ms * MS
+    wire = world.wires[0]
+    start = world.now
+    timeout = timeout_ms * MS
+    period = period_ms * MS
     escs = (EscSettings("esc1", timeout_ns=timeout), TWO[1])[: 1 + neighbour]
     at = start + rng.randrange(period)
     while at < start + 4 * SECOND:
@@ -180,7 +182,8 @@ def test_a_port_that_always_has_bytes_keeps_no_other_one_waiting(
     """A megabyte waits at one, of which 4 KiB take the process a millisecond; each frame of the other is shown two reads later at most."""
     world = World(2)
     flooded, usual = world.wires
-    start, read = world.now, flooded.read
+    start = world.now
+    read = flooded.read
 
     def slow_read(most: int = 4096) -> bytes:
         data = read(most)
@@ -247,7 +250,8 @@ def test_bytes_that_come_faster_than_the_wire_allows_are_not_of_the_future(
     loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=timeout))
     wire.stream(world.now, world.now + 400 * MS, 20 * MS)
     run(loop, world, world.now + SECOND)
-    came, number = world.now + MS, len(wire.frames) + 1
+    came = world.now + MS
+    number = len(wire.frames) + 1
     flood = bytes(10_000) + live(number)
     wire.put(flood, [came] * len(flood))
     wire.frames.append(came)
@@ -268,7 +272,8 @@ def test_bytes_left_in_a_lost_port_do_not_age_the_first_ones_of_the_next(
     wire.send(world.now)
     run(loop, world, world.now + 100 * MS)
     wire.put(bytes(5000), [world.now] * 5000)
-    lost, read = world.now, wire.read
+    lost = world.now
+    read = wire.read
 
     def read_once(most: int = 4096) -> bytes:
         data = read(most)
@@ -317,14 +322,17 @@ def test_frames_that_become_old_while_they_are_handed_over_are_made_anew(
     """The process is held up behind the read, or when the kernel has taken 64 of 100 frames."""
     world = World()
     (wire,) = world.wires
-    start, hold_up, read = world.now, 300 * MS, wire.read
+    start = world.now
+    hold_up = 300 * MS
+    read = wire.read
     escs = (EscSettings("esc1", timeout_ns=SECOND),)
     loop = loop_in(world, monkeypatch, escs, compiled(dbc_text(MANY, TIMES)))
     loop.open()
     loop.begin()
     wire.stream(start, start + SECOND, 100 * MS)
     run(loop, world, start + SECOND)
-    held, sent = len(wire.frames) + 1, 0
+    held = len(wire.frames) + 1
+    sent = 0
 
     def slow_read(most: int = 4096) -> bytes:
         data = read(most)
@@ -363,7 +371,8 @@ def test_a_bus_that_takes_a_part_of_what_is_handed_over_gets_the_rest(
     """The kernel takes six of 25 frames at once. The others follow before the next values."""
     world = World()
     (wire,) = world.wires
-    start, period = world.now, 50 * MS
+    start = world.now
+    period = 50 * MS
     messages = MANY[:25]
     world.bus.frame_ns = 200_000
     layout = compiled(dbc_text(messages, TIMES.replace("20", "1000")))
@@ -396,14 +405,16 @@ def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     world = World()
     fed: list[int] = []
     signs = SimpleNamespace(present=True, watchdog_ns=500 * MS, ready=lambda _: None)
-    signs.status, signs.watchdog = signs.ready, lambda: fed.append(world.now)
+    signs.status = signs.ready
+    signs.watchdog = lambda: fed.append(world.now)
     escs = (EscSettings("esc1", timeout_ns=60 * SECOND),)
     loop = loop_in(world, monkeypatch, escs, notifier=signs)  # type: ignore[arg-type]
     loop.open()
     loop.begin()
     begin = world.now
     run(loop, world, begin + 5 * SECOND)  # on a silent line, for which the loop need not wake
-    middle, end = world.now, world.now + 10 * SECOND
+    middle = world.now
+    end = world.now + 10 * SECOND
     world.wires[0].stream(middle, end, 20 * MS)
     for at in range(middle, end, 50 * MS):
         world.bus.came(0x100, b"", at)
@@ -422,11 +433,13 @@ def test_bytes_that_came_while_the_interface_was_tried_are_old(
     world = World()
     (wire,) = world.wires
     start = world.now
-    world.there, world.opening_ns = False, 400 * MS
+    world.there = False
+    world.opening_ns = 400 * MS
     loop = begin(monkeypatch, world, EscSettings("esc1"))
     wire.stream(start + 410 * MS, start + 2 * SECOND, 100 * MS)
     run(loop, world, start + 2 * SECOND)
-    world.there, world.opening_ns = True, 100 * MS
+    world.there = True
+    world.opening_ns = 100 * MS
     run(loop, world, start + 4 * SECOND)
     wire.send(world.now)
     run(loop, world, world.now + 50 * MS)
@@ -439,7 +452,8 @@ def test_a_bus_that_is_slower_than_what_comes_has_the_newest_values_in_order(
 ) -> None:
     """Four ESCs whose frames come together; the kernel takes six frames in advance. In C hardly a turn comes back for it."""
     world = World(4)
-    start, end = world.now, world.now + 3 * SECOND
+    start = world.now
+    end = world.now + 3 * SECOND
     world.bus.frame_ns = 1_900_000
     for number, wire in enumerate(world.wires):
         wire.stream(start + number * 100_000, end, 10 * MS)
@@ -467,7 +481,8 @@ def test_a_frame_that_came_in_a_hold_up_is_as_old_as_it_is(
     monkeypatch: pytest.MonkeyPatch, clock_error_s: int
 ) -> None:
     """However the wall clock was set meanwhile: it came between the two looks at the bus."""
-    world, shown_at = World(), list[int]()
+    world = World()
+    shown_at = list[int]()
     loop = begin(monkeypatch, world, EscSettings("esc1"))
     monkeypatch.setattr(loop.gateway, "receive_frame", lambda _frame, _now, at: shown_at.append(at))
     world.bus.clock_error = clock_error_s * SECOND
@@ -489,7 +504,11 @@ def test_a_frame_that_came_in_a_hold_up_is_as_old_as_it_is(
 
 
 HELD_UP_NS = 400 * MS
-REQUEST, ANSWER, EMCY, HEARTBEAT, TPDO = 0x601, 0x581, 0x081, 0x701, 0x181
+REQUEST = 0x601
+ANSWER = 0x581
+EMCY = 0x081
+HEARTBEAT = 0x701
+TPDO = 0x181
 SPEED = 0x688
 ZEROS = "00 00 00 00"
 WATCH = ("23 16 10 01 2c 01 05 00", "2f 29 10 01 01 00 00 00", "2b 00 21 04 60 ea 00 00")
@@ -571,7 +590,8 @@ def of(frames: list[tuple[int, bytes]], *ids: int) -> list[tuple[int, str]]:
 def test_a_command_that_waited_is_obeyed_and_answered_once(
     bench: Bench, can_id: int, request_hex: str, answer_id: int, answer: str, state: NmtState
 ) -> None:
-    bus, now = bench.world.bus, bench.world.now
+    bus = bench.world.bus
+    now = bench.world.now
     bus.came(can_id, bytes.fromhex(request_hex), now + MS)
     if can_id == 0x7E5:
         bus.came(can_id, bytes.fromhex(f"5e 00 00 00 {ZEROS}"), now + 2 * MS)
@@ -697,7 +717,10 @@ def test_within_a_turn_the_rest_is_late_but_answers_are_not_lost(
     assert any(can_id == SPEED for can_id, _ in late), "and told that there is nothing"
 
 
-LOST, UNDERVOLTAGE, SYNC_LENGTH, HEARTBEAT_LOST = "1075", "2032", "4082", "3081"
+LOST = "1075"
+UNDERVOLTAGE = "2032"
+SYNC_LENGTH = "4082"
+HEARTBEAT_LOST = "3081"
 
 
 def emergencies(bench: Bench) -> list[str]:

@@ -61,7 +61,8 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
         listening.settimeout(LIMIT_S)
         process = subprocess.Popen(command, stderr=log, env=environment)
         try:
-            said, end = "", time.monotonic() + LIMIT_S
+            said = ""
+            end = time.monotonic() + LIMIT_S
 
             def heard(condition: Callable[[], bool]) -> None:
                 nonlocal said

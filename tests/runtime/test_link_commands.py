@@ -55,7 +55,8 @@ def test_without_rtnetlink_the_name_decides(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_can_fd_is_switched_on_by_the_mtu_of_a_virtual_interface() -> None:
-    virtual, adapter = CanConfig(channel="vcan0", fd=True), CanConfig(fd=True)
+    virtual = CanConfig(channel="vcan0", fd=True)
+    adapter = CanConfig(fd=True)
     command = "sudo ip link set vcan0 down; sudo ip link set vcan0 mtu 72 up"
     assert link_commands.enable_fd(virtual, "vcan") == command
     assert link_commands.add_virtual(virtual).endswith("&& sudo ip link set vcan0 mtu 72 up")

@@ -61,7 +61,8 @@ class FakeSocket:
 
 
 def monitor_of(*datagrams: bytes | int) -> tuple[LinkMonitor, FakeSocket]:
-    monitor, fake = LinkMonitor("can0"), FakeSocket(*datagrams)
+    monitor = LinkMonitor("can0")
+    fake = FakeSocket(*datagrams)
     monitor.close()
     monitor._socket = fake  # type: ignore[assignment]
     return monitor, fake

@@ -37,7 +37,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.rights
 def test_what_one_has_another_cannot_have_until_it_is_given_back(folder: Path) -> None:
-    first, second = Locks(), Locks()
+    first = Locks()
+    second = Locks()
     assert first.hold(NODES[:2]) == []
     assert first.hold(NODES[:2]) == []
     mode = {0: 0o660}.get(os.geteuid(), 0o600)
@@ -55,7 +56,8 @@ def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The holder removes its file between our opening and our locking: what we have locked is nothing."""
-    path, real = tmp_path / "x", fcntl.flock
+    path = tmp_path / "x"
+    real = fcntl.flock
 
     def flock(fd: int, operation: int) -> None:
         monkeypatch.undo()
@@ -157,7 +159,8 @@ def assign_node_id(link: CanLink, node_id: int) -> None:
 def test_a_node_id_that_lss_assigns_while_running_is_locked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    link, other = waiting_gateway(monkeypatch), Locks()
+    link = waiting_gateway(monkeypatch)
+    other = Locks()
     assert other.hold(NODES[:1]) == []
     other.close()
     assign_node_id(link, 5)
@@ -170,7 +173,8 @@ def test_a_node_id_that_lss_assigns_while_running_is_locked(
 def test_a_node_id_of_lss_that_another_gateway_has_is_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    link, other = waiting_gateway(monkeypatch), Locks()
+    link = waiting_gateway(monkeypatch)
+    other = Locks()
     assert other.hold(NODES[:1]) == []
     assign_node_id(link, 5)
     assert "can0: CANopen node 5: another gateway on this machine sends this." in caplog.text

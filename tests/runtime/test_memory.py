@@ -45,7 +45,8 @@ class Everything:
 
     def pass_second(self) -> None:
         """Values, and an error bit, change. What the world itself keeps is dropped."""
-        world, begin = self.world, self.world.now
+        world = self.world
+        begin = self.world.now
         for wire in world.wires:
             del wire.arrivals[: wire._read], wire._bytes[: wire._read]
             wire._read = 0

@@ -29,7 +29,8 @@ def number_of(stored: Stored) -> int:
     return int.from_bytes(stored.application.get(0x210001, b""), "little")
 
 
-OLD, NEW = numbered(1), numbered(2)
+OLD = numbered(1)
+NEW = numbered(2)
 
 
 @pytest.fixture
@@ -153,7 +154,9 @@ class Recorder:
         error: OSError | None = None,
     ) -> None:
         self.steps: list[Step] = []
-        self._folder, self._failing, self._error = folder, failing, error
+        self._folder = folder
+        self._failing = failing
+        self._error = error
         self._names: dict[int, str] = {}
         self._real: dict[str, Callable[..., Any]] = {}
         names = "open write fsync close unlink replace rename mkdir truncate ftruncate"
@@ -234,7 +237,8 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
         elif step[0] == "fsync" and step[1] in entries:
             secured[entries[step[1]]] = contents[entries[step[1]]]
         elif step[0] == "fsync":  # a folder: entries are named with theirs
-            durable, pending = dict(entries), []
+            durable = dict(entries)
+            pending = []
         elif step[0] == "unlink":
             del entries[step[1]]
             pending.append({step[1]: None})
@@ -254,7 +258,8 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
         for damage in range(4 if torn else 1):
             state = {}
             for name, inode in names.items():
-                whole, safe = contents[inode], secured[inode]
+                whole = contents[inode]
+                safe = secured[inode]
                 if inode in torn:
                     half = whole[: (len(safe) + len(whole)) // 2]
                     whole = (safe, half, "\0" * len(whole), whole)[damage]
@@ -280,7 +285,8 @@ def recorded(
 
 
 FILE = "params/esc1.params"
-TEMPORARY, DAMAGED = f"{FILE}.tmp", f"{FILE}.damaged"
+TEMPORARY = f"{FILE}.tmp"
+DAMAGED = f"{FILE}.damaged"
 
 
 def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
@@ -358,7 +364,8 @@ def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
 
 
 def test_a_node_belongs_to_one_gateway_until_that_closes(tmp_path: Path) -> None:
-    first, second = ParameterStore(tmp_path / "store"), ParameterStore(tmp_path / "store")
+    first = ParameterStore(tmp_path / "store")
+    second = ParameterStore(tmp_path / "store")
     first.lock("esc1")
     with pytest.raises(RunError, match=r"esc1\.params: is in use by another gateway"):
         second.lock("esc1")

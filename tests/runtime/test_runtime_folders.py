@@ -73,7 +73,8 @@ def test_without_a_session_the_folder_in_tmp_is_closed_and_locks_hold(
     root: Path, ordinary_user: int
 ) -> None:
     said: list[str] = []
-    first, second = Locks(said.append), Locks(said.append)
+    first = Locks(said.append)
+    second = Locks(said.append)
     assert first.hold(["can0: CANopen node 5"]) == []
     assert second.hold(["can0: CANopen node 5"]) == ["can0: CANopen node 5"]
     assert said == []

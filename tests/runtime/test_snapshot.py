@@ -49,7 +49,8 @@ def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
                     continue
                 assert esc["values"][name] == raw / row.per_unit, name
                 assert document["units"][name] == row.unit
-        live, info = bench.newest(number, LiveData), bench.newest(number, InfoData)
+        live = bench.newest(number, LiveData)
+        info = bench.newest(number, InfoData)
         assert esc["operating_state"] == OperatingState(live.operating_state).name
         assert (esc["device"], esc["firmware"]) == ("KOSMIK", KONTRONIK.firmware_text(info))
         assert esc["values"]["motor_speed"] == pytest.approx(live.electrical_speed / 7, abs=1e-6)

@@ -29,7 +29,8 @@ PATIENCE = 60.0
 def numbered(number: int) -> Moment:
     """A moment of a gateway that has sent so many frames."""
     gateway = Gateway([EscSettings("esc1")], Layout("", "", ()), 0)
-    gateway.status.sent_frames, gateway.status.received_frames = number, 3 * number
+    gateway.status.sent_frames = number
+    gateway.status.received_frames = 3 * number
     return moment_of(gateway, number * SECOND)
 
 
@@ -82,7 +83,8 @@ def test_the_file_is_whole_readable_for_all_one_gateways_and_gone_at_the_end(
         statistics.close()
         statistics.publish(numbered(4))  # too late, and nothing happens
     assert os.listdir(file.parent) == []
-    before, threads = os.listdir("/proc/self/fd"), threading.active_count()
+    before = os.listdir("/proc/self/fd")
+    threads = threading.active_count()
     Statistics(file).close()
     assert (os.listdir("/proc/self/fd"), threading.active_count()) == (before, threads)
 
@@ -90,7 +92,9 @@ def test_the_file_is_whole_readable_for_all_one_gateways_and_gone_at_the_end(
 def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free, stuck, real = threading.Event(), threading.Event(), os.write
+    free = threading.Event()
+    stuck = threading.Event()
+    real = os.write
 
     def write(fd: int, data: bytes) -> int:
         stuck.set()
@@ -120,7 +124,8 @@ def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
 def test_a_file_that_cannot_be_written_is_told_once_and_comes_as_soon_as_it_can(
     trouble: str, said: str, file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    moved, real = file.parent.with_name("moved"), os.write
+    moved = file.parent.with_name("moved")
+    real = os.write
 
     def full(fd: int, data: bytes) -> int:
         if len(data) > 10:

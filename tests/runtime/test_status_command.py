@@ -105,7 +105,8 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     assert seen.troubles[0].startswith("esc2: no bytes: ESC off")
 
 
-ACTIVE, UNKNOWN = CanState.ERROR_ACTIVE, CanState.UNKNOWN
+ACTIVE = CanState.ERROR_ACTIVE
+UNKNOWN = CanState.UNKNOWN
 OPEN = CanFacts("socketcan", "can0", None, True)
 SLCAN = CanFacts("slcan", "x", None, True)
 CLOSED = CanFacts("socketcan", "can0", None, False, "can0: gone")

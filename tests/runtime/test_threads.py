@@ -77,7 +77,8 @@ def test_a_job_that_fails_is_reported_and_the_next_one_is_done(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(worker_module, "FAILURE_PAUSE_S", 0)
-    done, failures = [], []
+    done = []
+    failures = []
     reached = threading.Event()
 
     def work(items: list[int]) -> None:

@@ -31,7 +31,8 @@ def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
 
 
 def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
         queue.put_all([queued(n)])
     assert (len(queue), queue.dropped) == (QUEUE_LENGTH, 10)
@@ -45,7 +46,8 @@ def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
 
 
 def test_frames_of_a_step_keep_their_order_and_leftovers_alternate() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     step = [queued(1, 0x81), slot(0x18040A2A), queued(2, 0x82), slot(0x181), slot(0x182)]
     queue.put_all(step)
     assert queue.in_order() == step
@@ -64,8 +66,10 @@ def test_frames_of_a_step_keep_their_order_and_leftovers_alternate() -> None:
 @given(st.lists(st.one_of(st.none(), st.integers(1, 7)), max_size=60))
 def test_what_is_sent_of_transfers_is_whole_and_the_newest(steps: list[int | None]) -> None:
     """``steps``: put a newer transfer of two frames or three, or let the interface take so many frames."""
-    queue, sent = TransmitQueue(), list[CanFrame]()
-    pages, wanted = {0x18040A2A: (64, 65, 66), 0x18040C2A: (67, 68)}, 0
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
+    pages = {0x18040A2A: (64, 65, 66), 0x18040C2A: (67, 68)}
+    wanted = 0
     for number, step in enumerate(steps):
         if step is None:
             for can_id, parts in pages.items():
@@ -92,7 +96,8 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
     steps: list[tuple[bool, int] | int], one_by_one: bool
 ) -> None:
     """``steps``: put a (queued?, id) frame, or let the interface take so many frames, at once or with turns broken off after each."""
-    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     put: list[CanFrame] = []
     newest: dict[int, CanFrame] = {}  # slots that wait
     has_leftovers = False
@@ -104,7 +109,8 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
                 newest[frame.can_id] = frame
             queue.put_all([frame])
             continue
-        before, both = len(sent), has_leftovers and 0 < len(newest) < len(queue)
+        before = len(sent)
+        both = has_leftovers and 0 < len(newest) < len(queue)
         for _ in range(step if one_by_one else 1):
             send(queue, sent, 1 if one_by_one else step)
         now_sent = sent[before:]
@@ -120,7 +126,8 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
             )
     send(queue, sent, 1000)
     assert [f for f in sent if f.queued] == [f for f in put if f.queued]
-    slots_put, slots_sent = sum(not f.queued for f in put), sum(not f.queued for f in sent)
+    slots_put = sum(not f.queued for f in put)
+    slots_sent = sum(not f.queued for f in sent)
     assert slots_sent + queue.replaced == slots_put
     assert (len(queue), queue.dropped) == (0, 0)
 
@@ -133,7 +140,8 @@ def test_pages_of_a_message_are_no_parts_of_a_transfer_however_many() -> None:
     bind: dict[str, str | float] = {f"S{n}": n for n in numbers}
     (plan,) = compiled(text, bind=bind).messages
     make = compile_frame(plan)
-    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     queue.put_all([make((), GatewayStatus(), 0, 0, FIRST_PART + 1)])
     queue.put_all([make((), GatewayStatus(), 0, 0, at) for at in numbers])
     send(queue, sent, 100)

@@ -40,7 +40,8 @@ from kontronik_can_gw.times import MS, SECOND
 NS_PER_BYTE = KONTRONIK.byte_ns
 
 NOT_AVAILABLE = 0xFFFFFFFF
-_FIRST_PORT, CAN_FD = 1000, 2000
+_FIRST_PORT = 1000
+CAN_FD = 2000
 _MAX_READ = 4096
 TIMES = """BA_DEF_DEF_ "GenMsgCycleTime" 20;
 BA_DEF_DEF_ "GenMsgSendType" "CyclicAndEvent";
@@ -154,7 +155,8 @@ class Wire:
 
     def settings_hold(self) -> bool:
         self.looks.append(self._world.now)
-        held, self.now_set = self.now_set == self.settings, self.settings
+        held = self.now_set == self.settings
+        self.now_set = self.settings
         return held
 
     def close(self) -> None:
@@ -189,7 +191,8 @@ class Bus(CanPort):
 
     def take(self) -> list[tuple[int, bytes]]:
         """What was sent since the last call."""
-        sent, self.sent = self.sent, []
+        sent = self.sent
+        self.sent = []
         return [(frame.can_id, frame.data) for _, frame in sent]
 
     # as a CanPort
@@ -272,7 +275,8 @@ class World:
         return self.now
 
     def register(self, fd: int, handler: Handler, events: int) -> None:
-        self.handlers[fd], self._events[fd] = handler, events
+        self.handlers[fd] = handler
+        self._events[fd] = events
 
     def unregister(self, fd: int) -> None:
         del self.handlers[fd]
@@ -300,7 +304,8 @@ class World:
 
     def look(self) -> None:
         """It is asked what is ready."""
-        self.before, self.looked = self.looked, self.now
+        self.before = self.looked
+        self.looked = self.now
         self.looks.append(self.now)
 
     def ready(self, fd: int) -> int:
@@ -331,7 +336,9 @@ class FakePoller(Poller):
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
-        self.before, self.now, self.late = self._world.before, self._world.looked, self._world.late
+        self.before = self._world.before
+        self.now = self._world.looked
+        self.late = self._world.late
         return ready
 
 

@@ -61,7 +61,8 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
     command += [f"--timeout={TIMEOUT_S}", f"--rw={folder}", "--", "sh", f"{HERE}/boot_systemd.sh"]
     command += [sys.executable, f"{HERE}/inside_systemd.py", str(folder), *hidden_folders()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S + 60)
-    file, said = folder / "facts.json", folder / "said"
+    file = folder / "facts.json"
+    said = folder / "said"
     talk = done.stdout + done.stderr + (said.read_text() if said.exists() else "")
     assert file.exists(), talk
     found: Facts = json.loads(file.read_text())

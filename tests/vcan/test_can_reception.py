@@ -83,7 +83,8 @@ def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vca
 
 
 def test_long_frames_leave_and_come_as_can_fd(vcan: str) -> None:
-    long, short = CanFrame(0x123456, bytes(range(64)), True, fd=True), CanFrame(0x10, b"short")
+    long = CanFrame(0x123456, bytes(range(64)), True, fd=True)
+    short = CanFrame(0x10, b"short")
     with port_on(vcan, [], fd=True) as port, port_on(vcan, [long.key, 0x10], fd=True) as other:
         assert [port.send(frame) for frame in (long, short)] == [Sent.OK, Sent.OK]
         assert all_of(other, vcan) == [long, short]

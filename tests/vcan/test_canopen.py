@@ -37,14 +37,16 @@ def test_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
         master_on(vcan) as master,
         run.running() as gateway,
     ):
-        watch, node = run.watch, master[1]
+        watch = run.watch
+        node = master[1]
         wait_for(lambda: len(watch.boot_ups) == 2, "boot-ups")
 
         def states(number: int = 1) -> list[int]:
             return [frame.data[0] for frame in watch.of(0x700 + number)]
 
         def go(state: str) -> None:
-            begin, node.nmt.state = len(states()), state
+            begin = len(states())
+            node.nmt.state = state
             wait_for(lambda: states()[begin:][-1:] == [STATES[state]], state)
 
         for each in (1, 2):
@@ -69,7 +71,8 @@ def test_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
         for command, kept in (("RESET COMMUNICATION", 50_000), ("RESET", 60_000)):
             node.sdo[0x2100][4].raw = 50_000
             node.sdo[0x1017].raw = 50
-            begin, node.nmt.state = len(states()), command
+            begin = len(states())
+            node.nmt.state = command
             wait_for(lambda begin=begin: BOOT_UP in states()[begin:], command)  # type: ignore[misc]
             assert (node.sdo[0x1017].raw, node.sdo[0x2100][4].raw) == (1000, kept), command
         assert states(2).count(BOOT_UP) == 1, "the other node has not noticed"

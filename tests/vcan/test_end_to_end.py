@@ -10,7 +10,9 @@ from vcan_tools import chain, wait_for
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
 
-LINK_THERE, LINK_LOST, STOPPING = (2, 3), 4, 2
+LINK_THERE = (2, 3)
+LINK_LOST = 4
+STOPPING = 2
 """A link is Degraded rather than Ok when its ESC waits for the bus to show each frame."""
 EIGHT = [
     Identity(i + 1, (Layout.V4, Layout.LEGACY)[i % 2], cells=6 + i, alarms=i > 5) for i in range(8)

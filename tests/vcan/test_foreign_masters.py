@@ -29,15 +29,23 @@ pytestmark = pytest.mark.extended
 
 Start = Callable[..., GatewayProcess]
 
-PRODUCT, REVISION = 0x4B4F4E01, 0x00010000
+PRODUCT = 0x4B4F4E01
+REVISION = 0x00010000
 LOSES = "telemetry_timeout_ms = 10000"
 """Where telemetry is to be lost: no machine stands still for so long."""
-BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
+BOOT_UP = 0
+STOPPED = 4
+OPERATIONAL = 5
+PRE_OPERATIONAL = 127
 BOOTED = [BOOT_UP, PRE_OPERATIONAL]
 # CiA 301 data types: bytes of a number; strings and domains have any length
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
-WRITE_ONLY, NO_OBJECT, NO_SUB = 0x06010001, 0x06020000, 0x06090011
-TOO_HIGH, TOO_LOW, TOO_LONG = 0x06090031, 0x06090032, 0x06070012
+WRITE_ONLY = 0x06010001
+NO_OBJECT = 0x06020000
+NO_SUB = 0x06090011
+TOO_HIGH = 0x06090031
+TOO_LOW = 0x06090032
+TOO_LONG = 0x06070012
 NO_DATA = 0x08000024
 
 

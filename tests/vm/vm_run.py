@@ -125,7 +125,8 @@ def uml_command(job: str, out: int, err: int) -> list[str]:
 
 def uml_host_environment(job: str) -> dict[str, str]:
     """Its own, outside of the guest; uml_xstate.so is there where it does not start without."""
-    own_time, help_to_start = os.path.join(job, "time.so"), os.path.join(cache(), "uml_xstate.so")
+    own_time = os.path.join(job, "time.so")
+    help_to_start = os.path.join(cache(), "uml_xstate.so")
     source = os.path.join(HERE, "uml_time.c")
     subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", own_time, source, "-ldl"], check=True)
     preload = filter(os.path.exists, (own_time, help_to_start))
@@ -262,9 +263,11 @@ def start_vm(
     backend: str, job: str, out: int, err: int, log: BinaryIO
 ) -> "subprocess.Popen[bytes]":
     if backend == "uml":
-        command, environment = uml_command(job, out, err), uml_host_environment(job)
+        command = uml_command(job, out, err)
+        environment = uml_host_environment(job)
     else:
-        command, environment = qemu_command(job, out, err), {"TMPDIR": job}
+        command = qemu_command(job, out, err)
+        environment = {"TMPDIR": job}
     return subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -282,7 +285,8 @@ def run_in_vm(
     """Returns the exit code, and whether the command was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
     undertaker = None
-    result, started = Path(job, "rc"), Path(job, "started")
+    result = Path(job, "rc")
+    started = Path(job, "started")
     try:
         write_job(job, backend, command, writable)
         pipes = [os.pipe() for _ in range(2)]
