@@ -1,4 +1,7 @@
-"""The recipe for another output: one class, one line in the gateway's tuple. It sends one invented frame a second for each ESC."""
+"""The recipe for another output: one class, and one line in the gateway's tuple.
+
+The output of this test sends an invented frame for each ESC once a second.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +29,10 @@ ESCS = [EscSettings("left"), EscSettings("right")]
 
 
 class Voltages(Output):
-    """Each ESC's battery voltage in 10 mV, FFFFh: not available; a command by CAN changes the period."""
+    """An output that sends each ESC's battery voltage in 10 mV, or FFFFh if not available.
+
+    A CAN command changes the period.
+    """
 
     def __init__(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> None:
         super().__init__()
@@ -62,18 +68,18 @@ class Voltages(Output):
         self.frames.append(CanFrame(FIRST_ID + esc, data, extended=True))
 
 
-def test_other_receive_ids_are_noticed_whatever_their_content_and_address() -> None:
+def test_changed_receive_ids_are_noticed_even_at_the_same_address() -> None:
     output = Output()
     for number in range(100):
         before = output.marks
         again = output.marks
         assert before == again
-        output.receive_ids = NO_IDS  # the memory of the old ones may be used again
+        output.receive_ids = NO_IDS  # the memory of the old set may be used again
         output.receive_ids = frozenset((number // 2,))
         assert output.marks != before
 
 
-def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
+def test_a_further_output_sends_values_and_receives_commands() -> None:
     gateway = Gateway(ESCS, Layout("", "", ()), 0, further=(Voltages,))
     gateway.start(0)
     found = []
@@ -84,23 +90,27 @@ def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
             wire = encode(LiveData(battery_voltage=2400), codec.Layout.V4)
             gateway.receive_bytes(1, wire, now, now)
         gateway.advance(now)
-        found += [(now, f.can_id - FIRST_ID, f.data.hex()) for f in gateway.take_frames(now)]
+        for frame in gateway.take_frames(now):
+            found.append((now, frame.can_id - FIRST_ID, frame.data.hex()))
         if now == 2 * SECOND:
             gateway.receive_frame(CanFrame(COMMAND_ID, b"\x09"), now, now)
-    assert [each for each in found if each[1] == 1] == [
+    sent_for_left = [each for each in found if each[1] == 0]
+    sent_for_right = [each for each in found if each[1] == 1]
+    assert sent_for_right == [
         (SECOND, 1, "6009"),
         (2 * SECOND, 1, "6009"),
-        (2 * SECOND + 2 * SECOND // 10, 1, "ffff"),  # lost: 250 ms after the last
+        (2 * SECOND + 2 * SECOND // 10, 1, "ffff"),  # lost 250 ms after the last frame
         (3 * SECOND, 1, "ffff"),
     ]
-    assert [each for each in found if each[1] == 0] == [(s * SECOND, 0, "ffff") for s in (1, 2, 3)]
+    assert sent_for_left == [(second * SECOND, 0, "ffff") for second in (1, 2, 3)]
 
 
-def test_another_device_with_its_ids_is_noticed() -> None:
+def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
     gateway = Gateway(ESCS, Layout("", "", ()), 0, further=(Voltages,))
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
-    assert [(each.whose, each.node) for each in gateway.conflicts.take()] == [("voltage", 1)]
+    (conflict,) = gateway.conflicts.take()
+    assert (conflict.whose, conflict.node) == ("voltage", 1)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +121,7 @@ def test_another_device_with_its_ids_is_noticed() -> None:
         (0x581, "SDO answers of CANopen node 1"),
     ],
 )
-def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused_by_name(
+def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused(
     tmp_path: Path, number: int, said: str
 ) -> None:
     text = f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Logger\nBO_ {number} Volts: 8 Gw\n'

@@ -398,7 +398,7 @@ for seed, frame_ns, has_nodes in ((0, 0, True), (2, 20_000_000, False), (5, 0, T
         it = test_turns_in_c.Recorded(seed, each, has_nodes)
         it.bus.frame_ns = frame_ns
         print(len(it.sent()))
-hold_ups = test_hold_ups.test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true
+hold_ups = test_hold_ups.test_after_any_hold_up_values_end_in_time_and_ages_are_true
 for seed in range(3):
     hold_ups.hypothesis.inner_test(seed, 60, 10, 0.05, seed % 2, seed % 3)
 """

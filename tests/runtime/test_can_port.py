@@ -1,4 +1,4 @@
-"""The CAN port: on a socket that is none, and with python-can's in-process bus, whose reader is a thread."""
+"""The CAN port on a fake socket, and on python-can's in-process bus, which a thread reads."""
 
 import errno
 import itertools
@@ -45,17 +45,21 @@ def wait_for(condition: Callable[[], bool], what: str, seconds: float = 120) -> 
         time.sleep(0.002)
 
 
-# --- a socket that is none
+# --- a fake socket
 
 
 class FakeSocket:
-    """A raw CAN socket: ``inbox`` is what comes (numbers are errors), ``drops`` what the kernel had no room for."""
+    """A raw CAN socket.
+
+    ``inbox`` has the packets to receive and, as numbers, errors. ``drops`` counts the frames for
+    which the kernel had no room.
+    """
 
     def __init__(self) -> None:
         self.inbox: list[bytes | int] = []
         self.sent: list[bytes] = []
         self.full: int | None = None
-        """After so many frames the queue takes no more."""
+        """The queue is full after this number of frames."""
         self.options: dict[int, bytes | int] = {}
         self.ancillary: list[tuple[int, int, bytes]] = []
         self.drops = 0
@@ -111,7 +115,7 @@ class FakeSocket:
 
 
 def frames_of(port: CanPort) -> list[CanFrame]:
-    """What comes, without its times."""
+    """Receive frames and return them without their times."""
     return [frame for frame, _ in port.receive()]
 
 
@@ -135,10 +139,10 @@ def filters_of(fake: FakeSocket) -> list[tuple[int, int]]:
     return list(struct.iter_unpack("=II", packed))
 
 
-def test_a_new_socket_receives_no_data_frame_and_none_of_its_own(
+def test_a_new_socket_receives_neither_data_frames_nor_its_own_frames(
     port: CanPort, fake: FakeSocket
 ) -> None:
-    """Its own frames would look as if another device sent with its ids."""
+    """Its own frames would look as if another device used its ids."""
     assert fake.options[socket.CAN_RAW_FILTER] == b""
     assert fake.options[socket.CAN_RAW_RECV_OWN_MSGS] == 0
     assert fake.options[socket.SO_RCVBUF] == 1 << 20, (
@@ -171,7 +175,7 @@ def test_any_ids_fit_into_the_kernels_filters(short_ids: set[int], long_ids: set
         assert not any(passes(each) for each in twins)
 
 
-def test_only_data_frames_with_wanted_ids_come(port: CanPort, fake: FakeSocket) -> None:
+def test_only_data_frames_with_wanted_ids_are_received(port: CanPort, fake: FakeSocket) -> None:
     port.set_receive_ids({0x601, 0, 0x602 | EXTENDED, id_block(0x80AA, 0xFFFF)})
     assert (EXTENDED | 0x80AA, EXTENDED | REMOTE | 0xFFFF) in filters_of(fake), "one for a block"
     fake.inbox = [
@@ -220,7 +224,7 @@ def test_an_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number
     assert port.gone, "an interface may go while filters are set, too"
 
 
-def test_frames_go_out_as_the_kernel_wants_them(port: CanPort, fake: FakeSocket) -> None:
+def test_frames_are_sent_in_the_format_of_the_kernel(port: CanPort, fake: FakeSocket) -> None:
     assert port.send(CanFrame(0x6D8, b"abc")) is Sent.OK
     assert port.send(CanFrame(0x6D8, b"abcdefgh", extended=True)) is Sent.OK
     assert port.send(CanFrame(0x1, bytes(64), fd=True)) is Sent.OK
@@ -245,13 +249,14 @@ def test_frames_go_out_as_the_kernel_wants_them(port: CanPort, fake: FakeSocket)
         ([errno.EBADF], Sent.GONE, CanState.DOWN),
     ],
 )
-def test_a_refusal_of_the_kernel_shows_what_is_wrong(
+def test_an_error_of_the_kernel_shows_the_state_of_the_interface(
     port: CanPort, fake: FakeSocket, faults: list[int], answer: Sent, state: CanState
 ) -> None:
     fake.refusals = list(faults)
     frame = CanFrame(1, b"\1")
     assert (port.send(frame), port.state) == (answer, state)
-    assert answer is Sent.GONE or port.send(frame) is Sent.OK, "it is tried again"
+    if answer is not Sent.GONE:
+        assert port.send(frame) is Sent.OK, "it is tried again"
 
 
 @pytest.mark.parametrize(
@@ -264,10 +269,10 @@ def test_a_refusal_of_the_kernel_shows_what_is_wrong(
         (0x04, 0x30, CanState.ERROR_PASSIVE),
         (0x04, 0x40, CanState.ERROR_ACTIVE),
         (0x04, 0x00, CanState.UNKNOWN),
-        (0x20, 0x40, CanState.UNKNOWN),  # no acknowledge: says nothing of the state
+        (0x20, 0x40, CanState.UNKNOWN),  # a missing acknowledge does not show the state
     ],
 )
-def test_error_frames_show_the_controllers_state_and_do_not_hold_the_loop(
+def test_error_frames_show_the_controllers_state_and_never_block_the_loop(
     port: CanPort, fake: FakeSocket, kind: int, detail: int, state: CanState
 ) -> None:
     fake.inbox = [packet(ERROR | kind, bytes((0, detail)) + bytes(6)), b"short"] * 500
@@ -286,7 +291,7 @@ def test_error_frames_show_the_controllers_state_and_do_not_hold_the_loop(
         ([], None),
     ],
 )
-def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
+def test_the_kernels_time_of_a_frame_is_converted_to_the_monotonic_clock(
     port: CanPort,
     fake: FakeSocket,
     monkeypatch: pytest.MonkeyPatch,
@@ -304,7 +309,7 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
     assert port.receive() == [(CanFrame(1, b""), came)]
 
 
-def test_frames_that_the_controller_or_the_kernel_lost_are_noted_once(
+def test_frames_lost_by_controller_or_kernel_are_counted_once(
     port: CanPort, fake: FakeSocket
 ) -> None:
     port.set_receive_ids({1})
@@ -312,7 +317,8 @@ def test_frames_that_the_controller_or_the_kernel_lost_are_noted_once(
     port.receive()
     assert port.overruns == 1
     fake.drops = 5
-    for expected in (2, 2):  # more than one call takes: only then the kernel may have lost some
+    for expected in (2, 2):
+        # Only if more frames wait than one call reads may the kernel have lost some.
         fake.inbox = [packet(1)] * (RECEIVE_LIMIT + 1)
         port.receive()
         assert port.overruns == expected
@@ -320,7 +326,7 @@ def test_frames_that_the_controller_or_the_kernel_lost_are_noted_once(
 
 @pytest.fixture
 def opened(fake: FakeSocket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSocket:
-    """The socket that ``open_socketcan`` gets. In tmp_path is /sys/class/net."""
+    """Return the socket that ``open_socketcan`` gets. tmp_path replaces /sys/class/net."""
     real = socket.socket
 
     def make(family: int, *rest: int) -> Any:
@@ -372,26 +378,33 @@ FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
 
 
 @pytest.mark.parametrize("stopped_before", range(7))
-def test_what_became_late_in_the_middle_of_a_turn_stays(
+def test_frames_that_became_late_in_a_turn_are_not_sent(
     port: CanPort, fake: FakeSocket, stopped_before: int
 ) -> None:
-    """The process is stopped in front of one of the frames: those before have gone, and nothing after."""
+    """The process is stopped before one of the frames. Only the earlier frames are sent."""
     steps = itertools.count()
-    answer = port.send_all(FRAMES, lambda: 1000 if next(steps) < stopped_before else 1001, 1000)
-    assert answer == ((6, Sent.OK) if stopped_before == 6 else (stopped_before, Sent.LATE))
+
+    def clock() -> int:
+        return 1000 if next(steps) < stopped_before else 1001
+
+    answer = port.send_all(FRAMES, clock, 1000)
+    if stopped_before == 6:
+        assert answer == (6, Sent.OK)
+    else:
+        assert answer == (stopped_before, Sent.LATE)
     assert [data[8] for data in fake.sent] == list(range(stopped_before))[:6]
 
 
 class DatagramSocket(socket.socket):
-    """As a CAN socket: the kernel counts what waits in it in the same way."""
+    """A socket whose waiting data the kernel counts in the same way as a CAN socket's."""
 
     def setsockopt(self, level: int, *rest: Any) -> None:
         if level != socket.SOL_CAN_RAW:
             super().setsockopt(level, *rest)
 
 
-def test_the_kernel_holds_six_frames_at_most() -> None:
-    """What waits there cannot be overtaken by newer values."""
+def test_the_kernel_holds_at_most_six_frames() -> None:
+    """Newer values cannot overtake frames that wait in the kernel."""
     ours, others = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with others, DatagramSocket(fileno=ours.detach()) as mine:
         port = SocketCanPort(mine)
@@ -410,7 +423,7 @@ def readers() -> list[threading.Thread]:
 
 @contextmanager
 def virtual() -> Iterator[tuple[DriverPort, can.BusABC]]:
-    """A port on a bus of its own, and another participant."""
+    """Yield a port on a separate bus, and another participant of that bus."""
     channel = f"reception-{os.getpid()}-{next(_numbers)}"
     port = open_can(CanConfig("virtual", channel))
     assert isinstance(port, DriverPort)
@@ -429,7 +442,7 @@ def readable(port: CanPort, seconds: float = 120) -> bool:
 
 
 def receive(port: CanPort, count: int) -> list[CanFrame]:
-    """Wait for so many frames as a loop does: by the descriptor."""
+    """Wait for this number of frames at the descriptor, as a loop does."""
     frames: list[CanFrame] = []
     while len(frames) < count:
         assert readable(port), f"{len(frames)} of {count} frames"
@@ -438,12 +451,11 @@ def receive(port: CanPort, count: int) -> list[CanFrame]:
 
 
 def message(can_id: int, data: bytes = b"", **flags: Any) -> can.Message:
-    return can.Message(
-        arbitration_id=can_id, data=data, is_extended_id=flags.pop("is_extended_id", False), **flags
-    )
+    flags.setdefault("is_extended_id", False)
+    return can.Message(arbitration_id=can_id, data=data, **flags)
 
 
-def test_another_interfaces_refusal_is_busy() -> None:
+def test_a_python_can_interface_that_refuses_a_frame_is_busy() -> None:
     class Refusing:
         def send(self, _message: can.Message, timeout: float) -> None:
             assert timeout == 0
@@ -511,7 +523,7 @@ def test_an_identical_frame_of_another_device_is_received() -> None:
 def test_udp_multicast_is_known_to_return_own_frames(
     interface: str, returns: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is sent: the bus is one in this process."""
+    """No packet leaves this process: the bus is simulated."""
     monkeypatch.setattr(can, "Bus", lambda **_: ReturningBus())
     port = open_can(CanConfig(interface, "x"))
     try:
@@ -520,19 +532,21 @@ def test_udp_multicast_is_known_to_return_own_frames(
         assert port.send(CanFrame(0x680, b"last")) is Sent.OK
         port._bus.inbox.put(message(0x680, b"other"))  # type: ignore[attr-defined]
         expected = [CanFrame(0x680, data) for data in (b"own", b"last", b"other")]
-        assert receive(port, 1 if returns else 3) == expected[2 if returns else 0 :]
+        if returns:
+            expected = expected[2:]
+        assert receive(port, len(expected)) == expected
     finally:
         port.close()
 
 
-def test_one_thread_brings_the_wanted_frames_in_order() -> None:
+def test_one_thread_delivers_the_wanted_frames_in_order() -> None:
     with virtual() as (port, other):
         port.set_receive_ids(frozenset())
         assert (port.fileno(), port.receive(), readers()) == (None, [], [])
         port.set_receive_ids({0x601})
         port.set_receive_ids({0x601, 0x602, id_block(0x80AA, 0xFFFF)})
         assert len(readers()) == 1
-        assert not port.is_socket, "a descriptor to wait on says nothing of sending"
+        assert not port.is_socket, "a descriptor to wait on does not mean that it can send"
         for n in range(100):
             other.send(message(0x123, b"foreign"))
             other.send(message(0x601, is_extended_id=True))
@@ -550,7 +564,7 @@ def test_one_thread_brings_the_wanted_frames_in_order() -> None:
         assert receive(port, 1) == [CanFrame(0x603, b"")]
 
 
-def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> None:
+def test_the_threads_queue_is_bounded_and_keeps_the_oldest_frames() -> None:
     with virtual() as (port, other):
         port.set_receive_ids({1})
         for n in range(QUEUE_LENGTH + 20):
@@ -563,16 +577,17 @@ def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> N
             assert 0 < len(part) <= RECEIVE_LIMIT
             frames += part
         assert not readable(port, 0)
-        assert [int.from_bytes(frame.data, "little") for frame in frames] == list(
-            range(QUEUE_LENGTH)
-        )
+        numbers = [int.from_bytes(frame.data, "little") for frame in frames]
+        assert numbers == list(range(QUEUE_LENGTH))
         assert port.overruns == 1
 
 
 @pytest.mark.parametrize(
     "error", [can.CanOperationError("unplugged"), OSError(errno.EIO, "I/O"), TypeError("closed")]
 )
-def test_an_adapter_that_fails_is_gone(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+def test_an_adapter_that_fails_is_reported_as_gone(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     with virtual() as (port, other):
         port.set_receive_ids({1})
         other.send(message(1, b"before"))
@@ -589,7 +604,7 @@ def test_an_adapter_that_fails_is_gone(monkeypatch: pytest.MonkeyPatch, error: E
         assert port.send(CanFrame(2, b"")) is Sent.GONE
 
 
-def test_a_driver_that_cannot_filter_or_fails(
+def test_frames_are_filtered_here_if_the_driver_cannot_filter(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[object] = []
