@@ -1,4 +1,4 @@
-"""The parameter files: order, results, damage, kill -9, full and read-only disks, and loss of power at every instant."""
+"""The parameter files: order, results, damage, failing disks, and loss of power at every instant."""
 
 import errno
 import itertools
@@ -21,8 +21,12 @@ PATIENCE = 30.0
 
 
 def numbered(number: int, size: int = 16) -> bytes:
-    """A file that carries a number, and ``size`` bytes more."""
-    return encode(Stored(None, {}, {0x210001: number.to_bytes(4, "little"), 0x210002: bytes(size)}))
+    """Return the content of a file that has a number and ``size`` further bytes."""
+    application = {
+        0x210001: number.to_bytes(4, "little"),
+        0x210002: bytes(size),
+    }
+    return encode(Stored(None, {}, application))
 
 
 def number_of(stored: Stored) -> int:
@@ -41,7 +45,7 @@ def store(tmp_path: Path) -> Iterator[ParameterStore]:
 
 
 def put(store: ParameterStore, name: str, data: bytes) -> str | None:
-    """Save one content and return its result, taken as the loop does: when the descriptor is readable."""
+    """Save one content. Return its result, read when the descriptor is readable as in the loop."""
     assert store.save(name, data)
     assert select.select([store.fileno()], [], [], PATIENCE)[0], "no result came"
     ((about, problem),) = store.results()
@@ -50,7 +54,9 @@ def put(store: ParameterStore, name: str, data: bytes) -> str | None:
     return problem
 
 
-def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterStore) -> None:
+def test_saved_parameters_are_loaded_by_the_next_store(
+    tmp_path: Path, store: ParameterStore
+) -> None:
     assert store.load("a") == (Stored(), None)
     assert list(tmp_path.iterdir()) == [], "nothing is made by reading"
     assert put(store, "a", OLD) is None
@@ -65,7 +71,7 @@ def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterSt
     assert again.close(0)
 
 
-def test_files_are_the_owners_alone_and_a_folder_that_is_made_too(
+def test_files_and_a_new_folder_are_accessible_only_to_their_owner(
     tmp_path: Path, store: ParameterStore
 ) -> None:
     before = os.umask(0)
@@ -77,7 +83,7 @@ def test_files_are_the_owners_alone_and_a_folder_that_is_made_too(
     assert found == {"params": 0o700, "esc1.params": 0o600}
 
 
-def test_a_system_without_a_thread_to_give_refuses_the_saving(
+def test_saving_is_refused_if_no_thread_can_be_started(
     store: ParameterStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def start(thread: threading.Thread) -> None:
@@ -103,7 +109,7 @@ OTHER_VERSION = OLD.replace(b'"version":1', b'"version":9')
 
 
 @pytest.mark.parametrize("data", [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OTHER_VERSION])
-def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
+def test_a_damaged_file_is_reported_and_the_newest_one_is_kept(
     tmp_path: Path, store: ParameterStore, data: bytes
 ) -> None:
     folder = place(tmp_path, b"older rubbish")
@@ -119,10 +125,10 @@ def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
-def test_a_file_that_cannot_be_read_now_is_left_alone_and_half_a_new_one_is_never_read(
+def test_an_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
     tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An error of the disk that passes must not cost the settings."""
+    """A temporary error of the disk must not lose the settings."""
     folder = place(tmp_path, OLD)
     (folder / "esc1.params.tmp").write_bytes(NEW)
 
@@ -144,7 +150,10 @@ Step = tuple[str, ...]
 
 
 class Recorder:
-    """Writes down, in their order, the calls that change or secure what is on disk. The one that is ``failing`` raises ``error``."""
+    """Records the calls that change or sync the disk, in their order.
+
+    The call given as ``failing`` raises ``error``.
+    """
 
     def __init__(
         self,
@@ -186,9 +195,9 @@ class Recorder:
         return fd
 
     def _write(self, fd: int, data: bytes) -> int:
-        if any(step[0] == "write" for step in self.steps):  # some of it goes first
+        if any(step[0] == "write" for step in self.steps):  # the first part is always written
             self._fail_at("write", self._names[fd])
-        count: int = self._real["write"](fd, data[:50])  # a system may take only a part
+        count: int = self._real["write"](fd, data[:50])  # a system may write only a part
         self.steps.append(("write", self._names[fd], bytes(data[:count]).decode("latin-1")))
         return count
 
@@ -216,10 +225,15 @@ class Recorder:
 
 
 def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str, str]]:
-    """Every state in which the disk may be found: what no fsync has secured may be there, or not, or in part.
+    """Return every state that the disk may have after a loss of power.
 
-    ``files`` is what was on disk before. Changes of a folder not yet synced may each be lost or not, whatever their order (a renaming as a
-    whole); of a file not yet synced any beginning may be there, or zeros. A disk that keeps more order finds one of these states too.
+    ``files`` has the contents of the disk before the steps. Changes without fsync may be on disk
+    or not:
+
+    - Each change of a folder may be lost or kept, in any order. A renaming is one change.
+    - A file may have any first part of its new content, or zeros.
+
+    A disk that keeps more order has one of these states too.
     """
     contents: dict[int, str] = dict(enumerate(files.values()))
     secured: dict[int, str] = dict(contents)
@@ -236,7 +250,7 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
             contents[entries[step[1]]] += step[2]
         elif step[0] == "fsync" and step[1] in entries:
             secured[entries[step[1]]] = contents[entries[step[1]]]
-        elif step[0] == "fsync":  # a folder: entries are named with theirs
+        elif step[0] == "fsync":  # the step is about a folder, and entries include its name
             durable = dict(entries)
             pending = []
         elif step[0] == "unlink":
@@ -271,7 +285,10 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
 def recorded(
     monkeypatch: pytest.MonkeyPatch, folder: Path, *contents: bytes, load: bool = False
 ) -> list[Step]:
-    """What the store does on disk for one load, or for savings one after the other; each confirmation is a step too."""
+    """Return the steps of the store on disk for one load, or for several savings in succession.
+
+    Each confirmation is a step too.
+    """
     store = ParameterStore(folder)
     with monkeypatch.context() as patched:
         recorder = Recorder(patched, folder)
@@ -290,24 +307,25 @@ DAMAGED = f"{FILE}.damaged"
 
 
 def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
-    """What may be found after a loss of power that is neither the content confirmed last nor a later one asked for."""
-    asked = [files.get(FILE, "")] + [step[1] for step in steps if step[0] == "confirmed"]
+    """Return the wrong contents that may be found after a loss of power.
+
+    The content confirmed last is right, and so is the one being saved.
+    """
+    asked = [files.get(FILE, "")]
+    asked += [step[1] for step in steps if step[0] == "confirmed"]
     wrong = []
     for length in range(len(steps) + 1):
         done = steps[:length]
         confirmed = sum(step[0] == "confirmed" for step in done)
         allowed = asked[confirmed : confirmed + 2]
-        wrong += [
-            state.get(FILE, "")
-            for state in after_power_loss(files, done)
-            if state.get(FILE, "") not in allowed
-        ]
+        found = [state.get(FILE, "") for state in after_power_loss(files, done)]
+        wrong += [content for content in found if content not in allowed]
     return wrong
 
 
 @pytest.mark.parametrize("left_over", [False, True])
 @pytest.mark.parametrize("first", [False, True])
-def test_at_every_instant_a_loss_of_power_finds_the_old_or_the_new_content(
+def test_a_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_over: bool, first: bool
 ) -> None:
     folder = tmp_path / "params"
@@ -324,7 +342,7 @@ def test_at_every_instant_a_loss_of_power_finds_the_old_or_the_new_content(
     assert faults(files, steps) == []
 
 
-def test_a_damaged_file_is_somewhere_at_every_instant(
+def test_a_damaged_file_exists_at_every_instant(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = place(tmp_path, b"rubbish")
@@ -347,7 +365,7 @@ OF_THE_FILE = [(step, TEMPORARY) for step in ("create", "write", "fsync", "close
 
 
 @pytest.mark.parametrize("failing", [*OF_THE_FILE, ("fsync", "params")])
-def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
+def test_a_failure_at_any_step_is_reported_and_leaves_a_complete_file(
     tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, failing: Step
 ) -> None:
     folder = place(tmp_path, OLD)
@@ -355,7 +373,8 @@ def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
         Recorder(patched, folder, failing, OSError(errno.ENOSPC, "full"))
         assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: full"
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
-    assert (folder / "esc1.params").read_bytes() == (NEW if failing == ("fsync", "params") else OLD)
+    expected = NEW if failing == ("fsync", "params") else OLD
+    assert (folder / "esc1.params").read_bytes() == expected
     assert put(store, "esc1", NEW) is None
     assert store.load("esc1") == (decode(NEW), None)
 
@@ -363,7 +382,7 @@ def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
 # --- two gateways
 
 
-def test_a_node_belongs_to_one_gateway_until_that_closes(tmp_path: Path) -> None:
+def test_a_node_is_locked_by_one_gateway_until_it_closes(tmp_path: Path) -> None:
     first = ParameterStore(tmp_path / "store")
     second = ParameterStore(tmp_path / "store")
     first.lock("esc1")

@@ -1,4 +1,8 @@
-"""The thread that writes the file: never in the loop's way, always a whole document, faults told once, gone when closed."""
+"""The thread that writes the status file.
+
+It never delays the loop, always writes a complete document, and reports a fault once. The file
+is removed when it is closed.
+"""
 
 import errno
 import json
@@ -27,7 +31,7 @@ PATIENCE = 60.0
 
 
 def numbered(number: int) -> Moment:
-    """A moment of a gateway that has sent so many frames."""
+    """Return the Moment of a gateway that has sent this number of frames."""
     gateway = Gateway([EscSettings("esc1")], Layout("", "", ()), 0)
     gateway.status.sent_frames = number
     gateway.status.received_frames = 3 * number
@@ -42,12 +46,15 @@ def until(condition: Callable[[], object]) -> None:
 
 
 def number_in(file: Path) -> int:
-    """The number of the document in a file, 0 without one."""
-    return int(json.loads(file.read_bytes())["monotonic_ns"]) // SECOND if file.exists() else 0
+    """Return the number of the document in a file, or 0 without a file."""
+    if not file.exists():
+        return 0
+    document = json.loads(file.read_bytes())
+    return int(document["monotonic_ns"]) // SECOND
 
 
 def put(statistics: Statistics, number: int) -> list[Report]:
-    """Publish a document, and wait until the thread has done what it can; what it reports then."""
+    """Publish a document and wait until the thread has tried to write it. Return its reports."""
     statistics.publish(numbered(number))
     until(lambda: statistics._written is statistics._newest and not statistics._worker.busy_since)
     return statistics.reports(0)
@@ -66,10 +73,10 @@ def statistics(file: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Statisti
     made.close()
 
 
-def test_the_file_is_whole_readable_for_all_one_gateways_and_gone_at_the_end(
+def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
     file: Path, statistics: Statistics
 ) -> None:
-    (file.parent / ".status.json.tmp").write_text('{"half')  # of a process that was killed
+    (file.parent / ".status.json.tmp").write_text('{"half')  # left by a process that was killed
     for number in (1, 3):
         assert put(statistics, number) == []
         assert number_in(file) == number
@@ -81,7 +88,7 @@ def test_the_file_is_whole_readable_for_all_one_gateways_and_gone_at_the_end(
         Statistics(file)
     for _ in range(2):
         statistics.close()
-        statistics.publish(numbered(4))  # too late, and nothing happens
+        statistics.publish(numbered(4))  # too late, so it has no effect
     assert os.listdir(file.parent) == []
     before = os.listdir("/proc/self/fd")
     threads = threading.active_count()
@@ -89,7 +96,7 @@ def test_the_file_is_whole_readable_for_all_one_gateways_and_gone_at_the_end(
     assert (os.listdir("/proc/self/fd"), threading.active_count()) == (before, threads)
 
 
-def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
+def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
     file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free = threading.Event()
@@ -107,13 +114,13 @@ def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     since = statistics._worker.busy_since
     assert since is not None
     for number in range(2, 502):
-        statistics.publish(numbered(number))  # which never waits
+        statistics.publish(numbered(number))  # never waits
     assert statistics.reports(since + STALE_NS) == []
     (report,) = statistics.reports(since + STALE_NS + 1)
     assert report.begins and str(file) in report.text and "disk does not answer" in report.text
     assert statistics.reports(since + 2 * STALE_NS) == []
     free.set()
-    until(lambda: number_in(file) == 501)  # the newest, and none of those between
+    until(lambda: number_in(file) == 501)  # only the newest is written
     until(lambda: [each.begins for each in statistics.reports(0)] == [False])
 
 
@@ -121,7 +128,7 @@ def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     ("trouble", "said"),
     [("no folder", "No such file"), ("no file", "no plain file"), ("full", "No space left")],
 )
-def test_a_file_that_cannot_be_written_is_told_once_and_comes_as_soon_as_it_can(
+def test_a_file_that_cannot_be_written_is_reported_once_until_it_can(
     trouble: str, said: str, file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     moved = file.parent.with_name("moved")

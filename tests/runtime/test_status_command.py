@@ -1,4 +1,4 @@
-"""``status``: which file it reads, what it says of the gateway, its exit codes, and that no content of a file harms it."""
+"""The command ``status``: its files, its judgement and its exit codes. No file can harm it."""
 
 import contextlib
 import json
@@ -39,7 +39,7 @@ Document = dict[str, Any]
 def heard(
     escs: int = 2, seconds: float = 2, change: Callable[[Bench], None] | None = None
 ) -> Bench:
-    """A healthy gateway that runs."""
+    """Return a healthy gateway that runs."""
     bench = Bench(escs)
     bench.run(seconds)
     bench.gateway.set_can_state(CanState.ERROR_ACTIVE, bench.now)
@@ -57,7 +57,7 @@ def words(seen: Seen) -> str:
 
 
 def shell(*arguments: object) -> tuple[object, str, str]:
-    """Exit code, standard output and standard error of the command."""
+    """Run the command. Return its exit code, standard output and standard error."""
     done = run("status", *arguments)
     return done.code, done.out, done.err
 
@@ -67,14 +67,14 @@ NOW = 10**15
 
 @pytest.fixture(autouse=True)
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command's time stands still."""
+    """Stop the command's clock."""
     monkeypatch.setattr("kontronik_can_gw.cli.status.time.monotonic_ns", lambda: NOW)
 
 
 def written(
     file: Path, bench: Bench, program: ProgramFacts | None = None, **changes: Any
 ) -> Document:
-    """A file of this process and this instant."""
+    """Write a status file of this process and this instant."""
     document = bench.document(program=program or program_facts("gateway.toml"))
     document |= {"monotonic_ns": NOW} | changes
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -98,7 +98,7 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     bench = heard()
     bench.silent.add(1)
     bench.run(2)
-    why = "no bytes: ESC off"  # which is shown only of the one that is not heard
+    why = "no bytes: ESC off"  # shown only for the ESC that is not heard
     ports = [PortFacts(name, "/dev/a", True, diagnosis=why) for name in ("esc1", "esc2")]
     seen = judged(bench.document(ports=ports))
     assert (seen.code, seen.sentence) == (TROUBLE, "running, 1 fault")
@@ -127,7 +127,9 @@ LOST = PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (hung up).", lost_
         (ACTIVE, {"ports": [LOST]}, ["esc1: port not open for 70.0 s: /dev/a: lost (hung up)."]),
     ],
 )
-def test_each_fault_is_a_sentence(state: CanState, facts: dict[str, Any], said: list[str]) -> None:
+def test_each_fault_is_reported_as_a_sentence(
+    state: CanState, facts: dict[str, Any], said: list[str]
+) -> None:
     bench = heard(1)
     bench.gateway.set_can_state(state, bench.now)
     if "ports" in facts:
@@ -137,7 +139,7 @@ def test_each_fault_is_a_sentence(state: CanState, facts: dict[str, Any], said: 
     assert (seen.code, list(seen.troubles)) == (TROUBLE if said else HEALTHY, said)
 
 
-def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> None:
+def test_a_document_older_than_three_seconds_shows_no_value() -> None:
     document = heard().document()
     assert judged(document, STALE_NS).code == HEALTHY
     seen = judged(document, 12 * SECOND)
@@ -157,7 +159,7 @@ def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> Non
 CONTENTS = (b"", b"{", b"7", b"{}", b"\xff\xfe", b'{"format": 2}', b"[" * 100_000, b"1" * 5000)
 
 
-def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_no_statistics_file_is_refused_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "status.json"
     for content in CONTENTS:
         file.write_bytes(content)
@@ -167,7 +169,7 @@ def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path) -> None:
         assert said in refused(NOT_RUNNING, "status", "--file", tmp_path / name)
 
 
-def test_a_configuration_names_its_file_or_the_service_of_its_name(
+def test_a_configuration_selects_its_file_or_the_service_of_its_name(
     tmp_path: Path, run_folder: Path
 ) -> None:
     esc = '[[esc]]\nport = "x"\n'
@@ -209,10 +211,8 @@ def test_a_broken_configuration_in_this_folder_is_only_a_warning(
     assert shell("-c", "gateway.toml")[0] == 2
 
 
-def test_only_the_end_of_a_service_is_explained_by_the_journal(
-    run_folder: Path, tmp_path: Path
-) -> None:
-    """A killed gateway leaves its file behind. One that was started by hand has no journal."""
+def test_only_for_an_ended_service_is_the_journal_advised(run_folder: Path, tmp_path: Path) -> None:
+    """A killed gateway leaves its file behind. A gateway started by hand has no journal."""
     stopped_ns = NOW - 60 * SECOND
     by_hand = run_folder / "kontronik-can-gw" / "status" / "1.json"
     written(by_hand, heard(), monotonic_ns=stopped_ns)
@@ -229,7 +229,7 @@ def test_only_the_end_of_a_service_is_explained_by_the_journal(
         assert "Why? journalctl -e -u 'kontronik-can-gw*'" in shell(*arguments)[1]
 
 
-def test_without_options_all_gateways_are_shown_and_3_means_that_none_runs(
+def test_without_options_all_gateways_are_shown_and_3_means_none_runs(
     run_folder: Path,
 ) -> None:
     code, out, talk = shell()
@@ -249,7 +249,7 @@ def test_without_options_all_gateways_are_shown_and_3_means_that_none_runs(
     assert (code, out.count("kontronik-can-gw ")) == (TROUBLE, 2), "one runs, one has stopped"
 
 
-def test_without_options_gateways_of_this_user_are_found_in_every_runtime_folder(
+def test_gateways_of_this_user_are_found_in_every_runtime_folder(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "session"))
@@ -270,7 +270,7 @@ def test_without_options_gateways_of_this_user_are_found_in_every_runtime_folder
     assert shell()[1].count("kontronik-can-gw ") == 3, "a link is no second gateway"
 
 
-def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path: Path) -> None:
+def test_json_is_one_document_with_the_judgement_and_the_file_content(tmp_path: Path) -> None:
     file = tmp_path / "status.json"
     document = written(file, heard())
     for name, code, held in ((file, HEALTHY, document), (tmp_path / "none", NOT_RUNNING, None)):
@@ -287,11 +287,13 @@ WHOLE = with_nodes(heard(3).document(log_lines=["14:03:01 esc1: telemetry lost"]
 
 
 def places(value: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The paths of everything in a document."""
+    """Return the paths of all values in a document."""
     children = dict(enumerate(value)) if isinstance(value, list) else value
-    if not isinstance(children, dict):
-        return [path]
-    return [path, *(at for key, child in children.items() for at in places(child, (*path, key)))]
+    found = [path]
+    if isinstance(children, dict):
+        for key, child in children.items():
+            found += places(child, (*path, key))
+    return found
 
 
 PLACES = [place for place in places(WHOLE) if place]
@@ -307,7 +309,7 @@ _ODD = st.one_of(
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(PLACES), _ODD), min_size=1, max_size=5), st.booleans())
-def test_any_document_makes_lines_that_no_terminal_obeys(
+def test_lines_of_any_document_contain_no_terminal_controls(
     changes: list[tuple[tuple[Any, ...], Any]], alive: bool
 ) -> None:
     document: Any = json.loads(json.dumps(WHOLE))
