@@ -1,4 +1,4 @@
-"""An SDO server over a small object dictionary, whose time is turned by hand, for the tests of the server."""
+"""An SDO server with a small object dictionary, for the tests of the server. The test sets time."""
 
 from collections.abc import Sequence
 
@@ -38,7 +38,10 @@ class _TenBytes(Variable):
 
 
 class Objects(Dictionary):
-    """Remembers what was written. 2004h holds 10 bytes, 2005h is confirmed later, 2006h is at most 100."""
+    """An object dictionary that records downloads.
+
+    2004h has at most 10 bytes, 2005h is confirmed later, and 2006h is at most 100.
+    """
 
     def __init__(self) -> None:
         entries = [
@@ -57,14 +60,14 @@ class Objects(Dictionary):
 
 
 class Bench(Talker):
-    """A server whose time is turned by hand; a talker of dialogues (see script.py)."""
+    """A server that is the talker of dialogues (see script.py). The test sets the time."""
 
     def __init__(self, segment_ns: int = 0) -> None:
         super().__init__()
         self.objects = Objects()
         self.server = SdoServer(self.objects, self._sent, segment_ns)
         self.answers: list[bytes] = []
-        """Those of the last request, and what followed it."""
+        """Answers to the last request, and the frames after them."""
         self._tickets: list[int] = []
 
     def _sent(self, data: bytes) -> None:
@@ -73,9 +76,9 @@ class Bench(Talker):
         self.hear(self.now, hexadecimal(data))
 
     def pass_time(self, until: int) -> None:
-        """Let time pass as the runtime does: from deadline to deadline."""
-        while (due := self.server.due) <= until:
-            self.now = max(self.now, due)
+        """Let time pass from deadline to deadline, as the runtime does."""
+        while self.server.due <= until:
+            self.now = max(self.now, self.server.due)
             self.server.advance(self.now)
             assert self.server.due > self.now, "a deadline that advance does not settle"
         self.now = until
@@ -85,7 +88,7 @@ class Bench(Talker):
         self.server.advance(now)
 
     def request(self, data: bytes) -> list[bytes]:
-        """One request now, and what is answered at once."""
+        """Send a request now. Return the immediate answers."""
         self.answers = []
         self.server.receive(data, self.now)
         if self.server.waiting is not None:
@@ -124,5 +127,6 @@ class Bench(Talker):
 
 
 def sdo_bench_of(options: Sequence[str]) -> Bench:
-    """``segment N``: pauses of a block upload, ms a segment."""
-    return Bench(sum(int(option.removeprefix("segment ")) for option in options) * MS)
+    """Return a bench. The option ``segment N`` sets the pause of a block upload in ms a segment."""
+    pause_ms = sum(int(option.removeprefix("segment ")) for option in options)
+    return Bench(pause_ms * MS)

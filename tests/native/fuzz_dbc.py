@@ -1,7 +1,8 @@
-"""Changed DBC text -> layout -> tables -> both cores, which must agree:  fuzz_dbc.py SECONDS SEED CORE
+"""Feeds changed DBC text to both cores, which must agree:  fuzz_dbc.py SECONDS SEED CORE
 
-Random changes without guidance by coverage (libFuzzer cannot see into Python). A DBC is refused by a UserError, or by NotInCore of
-the core in C; anything else is a fault of the seed that was printed last.
+Coverage does not guide the random changes, because libFuzzer cannot measure it in Python. A DBC is
+refused by a UserError, or by NotInCore of the C core. Any other exception is a fault for the seed
+that was printed last.
 """
 
 import logging
@@ -69,7 +70,7 @@ FILES = [path.read_text(encoding="latin-1") for path in PATHS]
 
 
 def changed(chance: random.Random, text: str) -> str:
-    """With a number, a line, a sign, a byte order or a character that is another."""
+    """Change a number, a line, a sign, a byte order or a character of the text."""
     for _ in range(chance.choice((1, 1, 2, 3, 8))):
         what = chance.random()
         if what < 0.6:
@@ -96,7 +97,7 @@ def changed(chance: random.Random, text: str) -> str:
 
 
 def one(library: Any, seed: int) -> int:
-    """Frames compared; 0 where the DBC is refused, or for the core in Python alone."""
+    """Return the number of compared frames, or 0 if a core refuses the DBC."""
     chance = random.Random(seed)
     escs = equality.some_escs(chance)
     chosen = DbcConfig()

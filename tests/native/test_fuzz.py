@@ -12,16 +12,19 @@ from firmware import Case
 
 SECONDS = int(os.environ.get("KCG_FUZZ_SECONDS", "30"))
 SEED = random.Random().randrange(1 << 30) if SECONDS > 30 else 1
-"""Always the same in CI."""
+"""Seed of the fuzzers. It is always the same in CI."""
 HERE = Path(__file__).parent
 FUZZED = (1, 2, 5)
-"""Seeds of layouts."""
+"""Seeds of the layouts."""
 pytestmark = pytest.mark.extended
 
 
 @pytest.mark.parametrize("layout", FUZZED)
-def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
-    """Any calls, by libFuzzer: nothing outside its memory, nothing undefined, no deadline that does not move on."""
+def test_any_bytes_and_times_do_no_harm(tmp_path: Path, layout: int) -> None:
+    """libFuzzer makes any calls.
+
+    The core stays in its memory, has no undefined behaviour, and its deadlines advance.
+    """
     case = Case(tmp_path / "export", layout)
     corpus = tmp_path / "corpus"
     corpus.mkdir()
@@ -45,7 +48,7 @@ def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
     print(done.stderr[-600:])
 
 
-def test_dbc_text(tmp_path: Path) -> None:
-    """Changed DBC text: refused in words, or both cores agree."""
+def test_any_dbc_text_is_refused_or_read_equally(tmp_path: Path) -> None:
+    """Changed DBC text is refused with a message, or both cores agree."""
     printed = run_sanitized(tmp_path, str(HERE / "fuzz_dbc.py"), str(SECONDS), str(SEED))
     print(printed.splitlines()[-1])

@@ -399,7 +399,7 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
         pytest.param(None, id="no rtnetlink"),
     ],
 )
-def test_nothing_is_handed_to_the_kernel_in_bus_off(
+def test_no_frame_is_sent_in_bus_off(
     kernel: Kernel, facts: LinkFacts | None, is_drone: bool
 ) -> None:
     made = drone(kernel) if is_drone else Bench(kernel)
