@@ -73,7 +73,7 @@ make_venv() {
 
 install_project() { # $1: demo or test, $2: what pip installs
     stamp=.venv/.installed-$1
-    key="$(cat pyproject.toml hatch_build.py kontronik_can_gw/native/*.[ch] | cksum) $(command -v cc || command -v gcc || :) $PWD"
+    key="$(cat pyproject.toml hatch_build.py kontronik_can_gw/native/*.[ch] kontronik_can_gw/esc/kontronik/*.py | cksum) $(command -v cc || command -v gcc || :) $PWD"
     for done in "$stamp" .venv/.installed-test; do
         [ -e "$done" ] && [ "$(cat "$done")" = "$key" ] && return
     done

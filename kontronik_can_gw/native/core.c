@@ -6,11 +6,10 @@
 #define INFO_TIMEOUT (10 * SECOND)
 #define MIN_DISTANCE INT64_C(1000000)
 #define LONG_AGO (-(INT64_C(1) << 61))
-enum { LONGER_COVERED = 34 };                /* all bytes before the CRC of a legacy live frame; twin: deframer.has_longer_crc */
 enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
 enum { KNOWN = 1, TO_SEND = 2 };             /* of a page: its last frame is known; it follows without an event */
 enum { STARTED = 1, NEWS = 2, SEEN = 4 };    /* of a slot: it has changed since its last frame; its watched bits are known */
-enum { VOLTAGE_AT = 4, CURRENT_AT = 6, ERRORS_AT = 24, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
+enum { WORDS = (KCG_DATA + 7) / 8 };
 #define PAGES_OF(m) (KCG_PAGED ? (m)->pages : 1)
 #define WORDS_OF(m) (WORDS == 1 ? 1u : (m)->words) /* of 64 bits, that a frame has */
 
@@ -63,7 +62,7 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *p, size_t n)
 
 /* --- bytes to UART frames (twin: deframer.py) ------------------------------------------------------------------------ */
 
-static const struct { uint8_t length, covered; } forms[2][2] = {{{38, 32}, {40, 36}}, {{41, 36}, {44, 40}}}; /* [is info][V4] */
+static const struct { uint8_t length, covered; } forms[2][2] = KCG_FRAME_FORMS; /* [is info][V4] */
 
 static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reason)
 {
@@ -107,7 +106,7 @@ static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, 
     }
     kcg_found *f = &g->found[g->found_count++];
     f->end = end, f->is_info = (uint8_t)is_info, f->layout = v4 ? 1 : 2;
-    memcpy(f->body, body, is_info ? KCG_BODY : 30);
+    memcpy(f->body, body, is_info ? KCG_INFO_SIZE : KCG_LIVE_SIZE);
 }
 
 /* The next K that may begin a header: KO, KOD as far as there are bytes; `size` where there is none. */
@@ -123,6 +122,13 @@ static size_t header_at(const uint8_t *b, size_t from, size_t size)
         from = at + 1;
     }
     return size;
+}
+
+/* True if the CRC of a legacy live frame covers all bytes before it (twin: deframer.has_longer_crc). */
+static int has_longer_crc(const uint8_t *f)
+{
+    size_t covered = forms[0][0].length - 4u;
+    return kcg_crc32(0, f, covered) == u32(f + covered);
 }
 
 /* Frames in b[0..size); e->base is the stream position of b[0]. Returns how many bytes are decided; e->need: how many are missing. */
@@ -165,8 +171,7 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
         }
         if (v4 == 2) {
             e->count[KCG_N_HEADERS]++, e->count[KCG_N_CRC_ERRORS]++;
-            if (!is_info && kcg_crc32(0, f, LONGER_COVERED) == u32(f + LONGER_COVERED))
-                e->count[KCG_N_LONGER_CRCS]++;
+            e->count[KCG_N_LONGER_CRCS] += !is_info && has_longer_crc(f);
             reject(e, b, at, forms[is_info][1].length, KCG_N_DROPPED_CRC);
             at += 4;
         } else if (!missing) {
@@ -201,7 +206,7 @@ static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
     if (!size)
         return;
     if (e->held_count) {
-        size_t old = e->held_count, more = size < KCG_LONGEST ? size : KCG_LONGEST; /* so many decide whatever is held */
+        size_t old = e->held_count, more = size < KCG_LONGEST_FRAME ? size : KCG_LONGEST_FRAME; /* so many decide whatever is held */
         memcpy(e->held + old, data, more);
         if (size < e->need) {
             e->held_count = (uint8_t)(old + size), e->need = (uint8_t)(e->need - size);
@@ -231,13 +236,16 @@ static void flush(kcg *g, kcg_esc *e)
 
 /* --- the state of an ESC (twin: telemetry.py) ------------------------------------------------------------------------ */
 
-static int64_t wire(const uint8_t *p, int type)
+/* A field of live data or info; the macros of wire.h call this. */
+static int64_t kcg_field(const uint8_t *body, int offset, int type)
 {
+    const uint8_t *p = body + offset;
     switch (type) {
     case KCG_U8: return p[0];
     case KCG_I8: return (int8_t)p[0];
     case KCG_U16: return (uint16_t)(p[0] | p[1] << 8);
     case KCG_I16: return (int16_t)(p[0] | p[1] << 8);
+    case KCG_I32: return (int32_t)u32(p);
     default: return u32(p);
     }
 }
@@ -342,14 +350,15 @@ static int close_window(kcg_esc *e, int64_t now)
 
 static int accept_info(kcg_esc *e, const uint8_t *body, int64_t when, int64_t bound)
 {
-    int another = memcmp(body, e->info, 2), events = KCG_INFO;
+    int another = KCG_INFO_DEVICE_AND_VARIANT(body) != KCG_INFO_DEVICE_AND_VARIANT(e->info);
+    int events = KCG_INFO;
     if (!e->has_info || another)
         events |= KCG_NEW_STATE | (e->has_info ? KCG_LINK : 0);
     e->generation++;
-    memcpy(e->info, body, KCG_BODY);
+    memcpy(e->info, body, KCG_INFO_SIZE);
     e->has_info = e->had_info = 1;
     e->last_info_ns = when, e->info_bound = bound;
-    e->cells = e->settings.cells ? e->settings.cells : body[CELLS_AT];
+    e->cells = e->settings.cells ? e->settings.cells : (uint8_t)KCG_INFO_CELL_COUNT(body);
     return events;
 }
 
@@ -365,7 +374,7 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
     }
     if (f->is_info)
         return events | accept_info(e, f->body, when, bound);
-    e->count[KCG_N_SUSPECT_FRAMES] += f->layout == 2 && f->body[STATE_AT] > LARGEST_STATE;
+    e->count[KCG_N_SUSPECT_FRAMES] += f->layout == 2 && KCG_LIVE_OPERATING_STATE(f->body) > KCG_LARGEST_STATE;
     if (e->has_time) {
         if (when < e->live_ns)
             when = e->live_ns;
@@ -383,11 +392,11 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
         }
     }
     e->generation++;
-    if (!e->has_live || memcmp(e->live + ERRORS_AT, f->body + ERRORS_AT, 4))
+    if (!e->has_live || KCG_LIVE_OPERATING_ERRORS(e->live) != KCG_LIVE_OPERATING_ERRORS(f->body))
         events |= KCG_NEW_STATE;
-    memcpy(e->live, f->body, 30);
-    e->power = (int32_t)(wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16));
-    e->turns = u32(f->body) != 0;
+    memcpy(e->live, f->body, KCG_LIVE_SIZE);
+    e->power = (int32_t)(KCG_LIVE_BATTERY_VOLTAGE(f->body) * KCG_LIVE_BATTERY_CURRENT(f->body));
+    e->turns = KCG_LIVE_ELECTRICAL_SPEED(f->body) != 0;
     e->has_live = e->had_live = e->has_time = 1;
     e->live_ns = when, e->live_bound = bound;
     if (e->link != KCG_OK && e->link != KCG_DEGRADED) {
@@ -409,13 +418,14 @@ static int64_t floor_div(int64_t a, int64_t b)
 
 static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
 {
-    return (e->has_info || x) && !(e->had_info && not_on >> (e->info[1] >> 2) & 1);
+    int64_t device = KCG_INFO_DEVICE_AND_VARIANT(e->info) >> KCG_VARIANT_BITS;
+    return (e->has_info || x) && !(e->had_info && not_on >> device & 1);
 }
 
 /* A field of live data or info, or a part of it. */
 static inline int64_t field(const kcg_signal *s, const uint8_t *body)
 {
-    int64_t x = wire(body + s->place, s->wire);
+    int64_t x = kcg_field(body, s->place, s->wire);
     return s->mask ? x >> s->shift & s->mask : x;
 }
 
@@ -439,7 +449,7 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
     case KCG_OF_DIRECTED:
         if (!e->has_live)
             return 0;
-        *x = wire(e->live + s->place, s->wire);
+        *x = kcg_field(e->live, s->place, s->wire);
         if (e->live[s->shift] < 32 && s->mask >> e->live[s->shift] & 1)
             *x = -*x;
         break;
@@ -1391,7 +1401,7 @@ void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
 {
     kcg_esc *e = &g->esc[esc];
     e->settings = *settings;
-    e->cells = settings->cells ? settings->cells : e->has_info ? e->info[CELLS_AT] : 0;
+    e->cells = settings->cells ? settings->cells : e->has_info ? (uint8_t)KCG_INFO_CELL_COUNT(e->info) : 0;
     g->next_expiry = 0;
 }
 
@@ -1442,10 +1452,5 @@ uint32_t kcg_sizes(uint32_t what)
 {
     static const size_t size[] = {KCG_SOURCE, sizeof(kcg_signal), sizeof(kcg_message), sizeof(kcg_settings), sizeof(kcg_plan), sizeof(kcg_esc), sizeof(kcg_frame)};
     return what < sizeof size / sizeof *size ? (uint32_t)size[what] : 0;
-}
-
-const char *kcg_wire(void)
-{
-    return "IHhhhHHHHbBbbIBB HHIBIHHhhhHHbBbbbb";
 }
 #endif

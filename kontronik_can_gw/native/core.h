@@ -14,6 +14,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "wire.h" /* Generated: fields of the UART frames. */
+
 #ifndef KCG_DATA
 #define KCG_DATA 8   /* Size of a frame's data in bytes: 8, or 64 with CAN FD. */
 #endif
@@ -42,7 +44,7 @@
 #ifndef KCG_FOUND
 #define KCG_FOUND 2  /* UART frames of one kcg_receive that are stored before they are processed. */
 #endif
-enum { KCG_HELD = 43, KCG_BODY = 33, KCG_LONGEST = 44, KCG_PAGES = 64 };
+enum { KCG_PAGES = 64 };
 #define KCG_NEVER INT64_MAX
 #define KCG_BYTE_NS (11 * INT64_C(1000000000) / 115200) /* A byte on the wire (8E1), in ns. */
 
@@ -83,8 +85,6 @@ enum {
     KCG_ESCS_OK, KCG_GATEWAY_STATE, KCG_CAN_STATE, KCG_ESC_COUNT, KCG_SENT_FRAMES, KCG_REPLACED_FRAMES, KCG_SEND_FAILURES,
     KCG_RECEIVED_FRAMES, KCG_BUS_OFF_COUNT, KCG_DROPPED_FRAMES, KCG_ID_CONFLICTS, KCG_STARTED_NS, KCG_OF_GATEWAY_COUNT
 };
-/* kcg_signal.wire: type of a field on the wire, little-endian. */
-enum { KCG_U8, KCG_I8, KCG_U16, KCG_I16, KCG_U32 };
 /* kcg_signal.divisor: 1, pole pairs, pole pairs times gear, or number of cells. */
 enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
 /* Arguments of kcg_count. First the counters of a stream (twin: deframer.Counters), which are
@@ -190,11 +190,11 @@ typedef struct {
     uint64_t energy; /* In mW s. energy_rest: the rest in mW ns. */
     int64_t energy_rest, run_time;
     int64_t live_ns, live_bound, info_bound, last_info_ns, window_ns, interval;
-    int64_t arrival_bound[KCG_HELD + 1];
-    uint32_t arrival_end[KCG_HELD + 1];
+    int64_t arrival_bound[KCG_MAX_HELD + 1];
+    uint32_t arrival_end[KCG_MAX_HELD + 1];
     /* Increases when live data or info data change or expire. */
     uint32_t generation;
-    uint8_t live[KCG_BODY], info[KCG_BODY], held[KCG_HELD + KCG_LONGEST];
+    uint8_t live[KCG_BODY_SIZE], info[KCG_BODY_SIZE], held[KCG_MAX_HELD + KCG_LONGEST_FRAME];
 } kcg_esc;
 
 /* State of a message or slot. */
@@ -210,7 +210,7 @@ typedef struct {
 } kcg_sending;
 
 /* A UART frame that was found but not processed. end: its position in the stream. */
-typedef struct { uint32_t end; uint8_t is_info, layout, length, body[KCG_BODY]; } kcg_found;
+typedef struct { uint32_t end; uint8_t is_info, layout, length, body[KCG_BODY_SIZE]; } kcg_found;
 
 /* The core. The owner writes only `mask` and `gateway`. */
 typedef struct {
@@ -313,7 +313,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
    are packed again with newer values. The rest of a transfer that was sent in part is dropped. */
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
 #if KCG_SLOTS
-/* Slots (twin: slots.py) are messages that their owner starts and stops. A slot has one page, one
+/* Slots (twin: core/slots.py) are messages that their owner starts and stops. A slot has one page, one
    ESC and at most 8 bytes (a transfer: 16 bytes, with KCG_DATA 64). `cycle` counts from the last
    frame.
    slot: a number from 0, less than kcg_plan.slots.
@@ -350,8 +350,6 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
    kcg_plan, kcg_esc and kcg_frame. A caller that cannot include this file compares them with its
    own sizes. */
 uint32_t kcg_sizes(uint32_t what);
-/* Returns the fields of live data and of info data, as codes of Python's struct. */
-const char *kcg_wire(void);
 #endif
 
 #ifdef __cplusplus

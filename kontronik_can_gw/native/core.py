@@ -12,7 +12,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
-from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, held_settings
+from kontronik_can_gw.native.rows import Rows, Settings, held_settings
 from kontronik_can_gw.native.scale import END_OF_TIME
 from kontronik_can_gw.native.slots import NativeSlot, merge, reserve
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
@@ -59,8 +59,6 @@ class NativeCore:
         slots: int = 0,
     ) -> None:
         tables = Tables(layout, escs, silent)
-        if tables.wire not in ("", library.kcg_wire().decode()):
-            raise NotInCore(f"fields on the wire: {tables.wire}")
         self._places = reserve(tables, slots)
         self.slots_of_esc = len(self._places[0])
         self.library = library

@@ -7,7 +7,7 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-from kontronik_can_gw.native.objects import FOLDER, OPTIONS
+from kontronik_can_gw.native.objects import FOLDER, OPTIONS, wire_header
 
 
 class NotInCore(ValueError):
@@ -41,7 +41,8 @@ _FIELD = re.compile(r"(\*?)(\w+)(?:\[(.+)\])?")
 _TEXT = re.sub(
     r"/\*.*?\*/",
     "",
-    "".join((FOLDER / name).read_text(encoding="utf-8") for name in ("core.h", "offline.h", "linux.h")),
+    wire_header()
+    + "".join((FOLDER / name).read_text(encoding="utf-8") for name in ("core.h", "offline.h", "linux.h")),
     flags=re.DOTALL,
 )  # fmt: skip
 _STRUCTURES = {

@@ -8,6 +8,8 @@ import sys
 import zlib
 from pathlib import Path
 
+from kontronik_can_gw.esc.kontronik.c_header import wire_header as wire_header
+
 FOLDER = Path(__file__).parent
 NOT_BUILT = FOLDER / "not_built.txt"
 """Why the installation made no object; hatch_build.py writes it."""
@@ -28,13 +30,13 @@ def shared_object(machine: str = "") -> Path:
 
 
 def sources() -> list[Path]:
-    """All C files of the core, headers too."""
+    """All C files of the core, with their headers except the generated wire.h."""
     return sorted(FOLDER.glob("*.[ch]"))
 
 
 def source_number() -> int:
-    """A number of sources and options, which an object made of them carries."""
-    found = zlib.crc32(" ".join(OPTIONS).encode())
+    """Return a number of sources, wire.h and options, which an object made of them carries."""
+    found = zlib.crc32(" ".join((*OPTIONS, wire_header())).encode())
     for source in sources():
         found = zlib.crc32(source.read_bytes(), found)
     return found & 0x7FFF_FFFF

@@ -13,7 +13,14 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import MAX_GEAR, MAX_POLES, NotInCore
 from kontronik_can_gw.signals.plan import SignalPlan
 
-_TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
+_TYPE_RANGES = {
+    KCG.U8: (0, 0xFF),
+    KCG.I8: (-0x80, 0x7F),
+    KCG.U16: (0, 0xFFFF),
+    KCG.I16: (-0x8000, 0x7FFF),
+    KCG.U32: (0, 0xFFFF_FFFF),
+    KCG.I32: (-0x8000_0000, 0x7FFF_FFFF),
+}
 MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""
 _LARGEST_DIVISOR = {

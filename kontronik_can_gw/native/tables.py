@@ -20,6 +20,7 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
     GATEWAY,
+    WIRE_TYPES,
     Message,
     NotInCore,
     Pair,
@@ -34,7 +35,6 @@ from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 from kontronik_can_gw.status import GatewayState
 
-WIRE = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32}
 ALL_ESCS = 255
 MAX_ROWS = 0xFFFF
 """Of a table that is addressed by 16 bits."""
@@ -59,11 +59,6 @@ class Tables:
         self.esc_of: list[int] = []
         self.pages = 0
         self.settings = [settings_of(esc) for esc in escs]
-        self.wire = ""
-        """The fields that the tables were made for."""
-        for settings in escs:
-            if (wire := protocol_named(settings.protocol).wire) is not None:
-                self.wire = " ".join(codes for codes, _ in wire)
         self.watched: list[int] = []
         """Of each slot."""
         self.listeners_of: list[list[int]] = [[] for _ in escs]
@@ -254,7 +249,7 @@ def places_of(protocol: EscProtocol) -> Places:
     for places, (codes, _) in zip(found, protocol.wire, strict=True):
         at = 0
         for code in codes:
-            places.append((at, WIRE[code]))
+            places.append((at, WIRE_TYPES[code]))
             at += struct.calcsize("<" + code)
     return found
 

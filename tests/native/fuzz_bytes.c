@@ -122,7 +122,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
             abort();
         send(g, now, next(1));
         for (int i = 0; i < KCG_ESCS; i++)
-            if (g->esc[i].held_count > KCG_HELD)
+            if (g->esc[i].held_count > KCG_MAX_HELD)
                 abort();
     }
     free(memory);

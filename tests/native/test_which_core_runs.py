@@ -173,6 +173,14 @@ def test_settings_that_the_c_core_cannot_express_run_in_python(
 
 
 @needs_c
+def test_an_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number that an object carries covers the generated header, not only the C files."""
+    header = objects.wire_header()
+    monkeypatch.setattr(objects, "wire_header", lambda: header.replace("live, 4", "live, 5"))
+    assert why() == f"{objects.shared_object().name}: made of other sources than these"
+
+
+@needs_c
 @pytest.mark.parametrize(
     ("signal", "more", "said"),
     [
