@@ -236,8 +236,8 @@ static void flush(kcg *g, kcg_esc *e)
 
 /* --- the state of an ESC (twin: telemetry.py) ------------------------------------------------------------------------ */
 
-/* A field of live data or info; the macros of wire.h call this. */
-static int64_t kcg_field(const uint8_t *body, int offset, int type)
+/* Returns a field of live data or info data. The macros of wire.h call this. */
+static inline int64_t kcg_field(const uint8_t *body, int offset, int type)
 {
     const uint8_t *p = body + offset;
     switch (type) {
@@ -245,7 +245,6 @@ static int64_t kcg_field(const uint8_t *body, int offset, int type)
     case KCG_I8: return (int8_t)p[0];
     case KCG_U16: return (uint16_t)(p[0] | p[1] << 8);
     case KCG_I16: return (int16_t)(p[0] | p[1] << 8);
-    case KCG_I32: return (int32_t)u32(p);
     default: return u32(p);
     }
 }

@@ -17,7 +17,7 @@ COUNTS = enumeration("KCG_N_BYTES", "KCG_N_")
 """Of kcg_esc.count, in its order; the last ones, from ``link_state`` on, are states and sums."""
 GATEWAY = enumeration("KCG_ESCS_OK")[:-1]
 """Of kcg.gateway, in its order."""
-WIRE_TYPES = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32, "i": KCG.I32}
+WIRE_TYPES = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32}
 """Maps the struct code of a wire type to its number in wire.h."""
 _MASK_BITS = 32
 """Of kcg_signal.mask."""

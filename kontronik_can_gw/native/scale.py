@@ -19,7 +19,6 @@ _TYPE_RANGES = {
     KCG.U16: (0, 0xFFFF),
     KCG.I16: (-0x8000, 0x7FFF),
     KCG.U32: (0, 0xFFFF_FFFF),
-    KCG.I32: (-0x8000_0000, 0x7FFF_FFFF),
 }
 MAX_COUNT = 1 << 48
 """Of a counter or an integral: at 1 Mbit/s more than a human life."""

@@ -88,7 +88,7 @@ print(json.dumps({
     ("before", "type_code", "line"),
     [
         (FIRST_OF_LIVE, "B", "#define KCG_LIVE_DUMMY(live) kcg_field(live, 0, KCG_U8) /* 0.1 V; new */"),
-        (LAST_OF_INFO, "i", "#define KCG_INFO_DUMMY(info) kcg_field(info, 32, KCG_I32) /* 0.1 V; new */"),
+        (LAST_OF_INFO, "h", "#define KCG_INFO_DUMMY(info) kcg_field(info, 32, KCG_I16) /* 0.1 V; new */"),
     ],
     ids=["first byte of live data", "signed word of info"],
 )  # fmt: skip
