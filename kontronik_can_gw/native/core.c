@@ -449,7 +449,7 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
         if (!e->has_live)
             return 0;
         *x = kcg_field(e->live, s->place, s->wire);
-        if (e->live[s->shift] < 32 && s->mask >> e->live[s->shift] & 1)
+        if (e->live[s->state_place] < 32 && s->negative_states >> e->live[s->state_place] & 1)
             *x = -*x;
         break;
     case KCG_OF_INFO:
@@ -787,12 +787,22 @@ static void restart_timer(kcg *g, uint32_t i, int64_t now)
     moved(g, i);
 }
 
+static kcg_slot *slot_of(const kcg *g, uint32_t i)
+{
+    return &g->slot[i - g->plan->messages];
+}
+
+static const kcg_slot_row *slot_row_of(const kcg *g, uint32_t i)
+{
+    return &g->plan->slot_row[i - g->plan->messages];
+}
+
 static void slot_news(kcg *g, uint32_t i, int64_t now)
 {
     kcg_sending *s = &g->sending[i];
-    if (!(s->page & STARTED))
+    if (!(slot_of(g, i)->state & STARTED))
         return;
-    s->page |= NEWS;
+    slot_of(g, i)->state |= NEWS;
     if (!(g->plan->message[i].flags & KCG_EVENT) || s->why)
         return;
     if (!may_go(g, i, now)) {
@@ -807,11 +817,12 @@ static void slot_news(kcg *g, uint32_t i, int64_t now)
 
 static int watched_changed(kcg *g, uint32_t i, const uint64_t *bits)
 {
-    uint64_t *last = g->last + g->plan->message[i].first_word, now = *bits & g->plan->watched[i - g->plan->messages];
-    if (g->sending[i].page & SEEN && now == *last)
+    kcg_slot *slot = slot_of(g, i);
+    uint64_t watched = *bits & slot_row_of(g, i)->watched;
+    if (slot->state & SEEN && watched == slot->seen_bits)
         return 0;
-    g->sending[i].page |= SEEN;
-    *last = now;
+    slot->state |= SEEN;
+    slot->seen_bits = watched;
     return 1;
 }
 
@@ -820,9 +831,9 @@ static void slot_event(kcg *g, uint32_t i, int events, int64_t now)
     const kcg_message *m = &g->plan->message[i];
     const kcg_sending *s = &g->sending[i];
     uint64_t bits[WORDS];
-    if (!(s->page & STARTED && m->triggers & events) || s->why)
+    if (!(slot_of(g, i)->state & STARTED && m->triggers & events) || s->why)
         return;
-    if (s->deferred == KCG_NEVER && g->plan->watched[i - g->plan->messages]) {
+    if (s->deferred == KCG_NEVER && slot_row_of(g, i)->watched) {
         pack(g, m, 0, now, 0, bits);
         if (!watched_changed(g, i, bits))
             return;
@@ -846,8 +857,8 @@ static void slot_sent(kcg *g, uint32_t i, int64_t now)
     const kcg_message *m = &g->plan->message[i];
     kcg_sending *s = &g->sending[i];
     int64_t period = (m->delay + m->cycle) / 2, planned = s->last + period;
-    g->last[m->first_word + 1]++;
-    s->page &= STARTED | SEEN;
+    slot_of(g, i)->frames_sent++;
+    slot_of(g, i)->state &= STARTED | SEEN;
     s->why = 0;
     s->last = m->flags & KCG_PACED && planned - period < now && now < planned + period ? planned : now;
     s->deferred = KCG_NEVER;
@@ -877,7 +888,7 @@ void kcg_slot_start(kcg *g, uint32_t slot, int64_t now)
 {
     uint32_t i = g->plan->messages + slot;
     kcg_slot_stop(g, slot);
-    g->sending[i].page = STARTED;
+    g->slot[slot].state = STARTED;
     g->sending[i].last = LONG_AGO;
     restart_timer(g, i, now);
     slot_news(g, i, now);
@@ -895,7 +906,7 @@ void kcg_slot_stop(kcg *g, uint32_t slot)
 {
     uint32_t i = g->plan->messages + slot, at = 0;
     kcg_sending *s = &g->sending[i];
-    s->page = 0;
+    g->slot[slot].state = 0;
     s->cycle_due = s->deferred = KCG_NEVER;
     moved(g, i);
     if (!s->why)
@@ -914,13 +925,13 @@ void kcg_slot_news(kcg *g, uint32_t slot, int64_t now)
 void kcg_slot_send(kcg *g, uint32_t slot, int64_t now)
 {
     uint32_t i = g->plan->messages + slot;
-    if (g->sending[i].page & STARTED && !g->sending[i].why)
+    if (g->slot[slot].state & STARTED && !g->sending[i].why)
         mark(g, i, now, REQUEST);
 }
 
 int kcg_slot_is_news(const kcg *g, uint32_t slot)
 {
-    return (g->sending[g->plan->messages + slot].page & NEWS) != 0;
+    return (g->slot[slot].state & NEWS) != 0;
 }
 
 int kcg_slot_is_pending(const kcg *g, uint32_t slot)
@@ -930,7 +941,7 @@ int kcg_slot_is_pending(const kcg *g, uint32_t slot)
 
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot)
 {
-    return g->last[g->plan->message[g->plan->messages + slot].first_word + 1];
+    return g->slot[slot].frames_sent;
 }
 
 static uint32_t crc_16(uint32_t crc, const uint8_t *data, size_t size) /* CCITT */
@@ -944,23 +955,25 @@ static uint32_t crc_16(uint32_t crc, const uint8_t *data, size_t size) /* CCITT 
 }
 
 /* The frames of a transfer (twin: signals/transfer.py), of which the first holds the bare payload. */
-static void make_transfer(kcg *g, const kcg_message *m, kcg_frame *f)
+static void make_transfer(kcg *g, uint32_t i, kcg_frame *f)
 {
+    const kcg_message *m = &g->plan->message[i];
+    const kcg_slot_row *row = slot_row_of(g, i);
     uint8_t data[2 + WORDS * 8], *rest = data + 2;
     uint32_t parts = parts_of(m), size = m->length, first = g->plan->messages;
     while (g->plan->message[first].id != m->id)
         first++;
-    uint32_t number = g->sending[first].alive++ & 31u;
+    uint32_t number = slot_of(g, first)->transfer_number++ & 31u;
     memcpy(rest, f->data, size);
     if (parts > 1) {
-        uint32_t crc = crc_16(m->data_id, rest, size);
+        uint32_t crc = crc_16(row->crc_seed, rest, size);
         data[0] = (uint8_t)crc, data[1] = (uint8_t)(crc >> 8);
         rest = data, size += 2;
     }
     for (uint32_t k = 0; k < parts; k++, f++) {
         uint32_t length = size < 7 ? size : 7;
         memset(f, 0, sizeof *f);
-        f->id = m->id, f->length = (uint8_t)(length + 1), f->page = (uint8_t)(m->crc_at + k);
+        f->id = m->id, f->length = (uint8_t)(length + 1), f->page = (uint8_t)(row->page + k);
         memcpy(f->data, rest, length);
         f->data[length] = (uint8_t)(number | (k ? 0 : 0x80) | (k + 1 < parts ? 0 : 0x40) | (k & 1 ? 0x20 : 0));
         rest += length, size -= length;
@@ -1107,7 +1120,7 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     if (is_slot(g, i))
         watched_changed(g, i, bits);
     memset(f, 0, sizeof *f);
-    f->page = is_slot(g, i) ? m->crc_at : (uint8_t)place;
+    f->page = is_slot(g, i) ? slot_row_of(g, i)->page : (uint8_t)place;
     f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
     for (int k = 0; k < (int)WORDS_OF(m); k++) /* beyond the length they are 0 */
         put_u64(f->data + k * 8, bits[k]);
@@ -1115,7 +1128,7 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
 #if KCG_SLOTS
     if (m->flags & KCG_TRANSFER)
-        make_transfer(g, m, f);
+        make_transfer(g, i, f);
 #endif
 }
 
@@ -1406,7 +1419,7 @@ void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
 
 size_t kcg_size(const kcg_plan *p)
 {
-    return KCG_SIZE(p->messages + p->slots, p->escs, p->pages, p->words);
+    return KCG_SIZE(p->messages, p->slots, p->escs, p->pages, p->words);
 }
 
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now)
@@ -1417,7 +1430,8 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
     crc_init();
     g->esc = (kcg_esc *)(g + 1);
     g->sending = (kcg_sending *)(g->esc + plan->escs);
-    g->last = (uint64_t *)(g->sending + messages);
+    g->slot = (kcg_slot *)(g->sending + messages);
+    g->last = (uint64_t *)(g->slot + plan->slots);
     g->heap = (uint16_t *)(g->last + plan->words);
     g->pending = g->heap + messages;
     g->page = (uint8_t *)(g->pending + messages);

@@ -76,8 +76,8 @@ enum {
     KCG_OF_UPTIME,  /* Time since gateway[KCG_STARTED_NS], in ms. */
     KCG_OF_ALIVE,   /* The message's alive counter, modulo `div`. */
     KCG_OF_STATUS,  /* Link state. Bit 6: the gateway's state is `place`. Bit 7: info is fresh. */
-    KCG_OF_DIRECTED /* As KCG_OF_LIVE, but negative while the live byte at offset `shift` is the
-                       number of a bit that is set in `mask`. */
+    KCG_OF_DIRECTED /* As KCG_OF_LIVE, but negative while the live byte at offset `state_place` is
+                       the number of a bit that is set in `negative_states`. */
 };
 /* Indices of kcg.gateway. The core writes KCG_ESCS_OK, kcg_init writes KCG_STARTED_NS, and the
    owner writes all others. */
@@ -132,7 +132,11 @@ typedef struct {
        shift, mask: select a part of the field. mask 0: the whole field. */
     uint8_t kind, wire, place, shift, flags, pieces, page, esc;
     uint32_t mask, first_piece, first_pair, pairs;
-    uint8_t divisor, length, reserved[6]; /* length: in bits. */
+    uint8_t divisor, length; /* length: in bits. */
+    /* KCG_OF_DIRECTED: offset of the state in live data, and a bit for each state in which the
+       value is negative. */
+    uint8_t state_place, reserved;
+    uint32_t negative_states;
     uint64_t not_on;                      /* Bit n: device n does not supply the value. */
     int64_t mul, add, div, most;          /* |x| above `most` is sent as `error`. */
     int64_t low, high;                    /* Limits of the raw value. A float: bits of a double. */
@@ -142,17 +146,23 @@ typedef struct {
 typedef struct {
     uint32_t id; /* Bit 31 is set for a 29-bit id. */
     /* length: in bytes. words: number of 64-bit words in the frame.
-       triggers: events that request the message.
-       crc_at: offset of the E2E CRC in bytes; of a slot: the `page` of its frames.
+       triggers: events that request the message. crc_at: offset of the E2E CRC in bytes.
        escs: number of ESCs with values in the message. */
     uint8_t length, words, flags, triggers, pages, crc_at, escs, fd_flags;
-    /* data_id: E2E data id; of a transfer: start value of its CRC. first_page: index into kcg.page.
+    /* data_id: E2E data id. first_page: index into kcg.page.
        last_alive: highest value of the alive counter, which begins at 0. */
     uint16_t first_signal, signals, data_id, first_page, last_alive;
     uint32_t first_word; /* Index into kcg_plan.constant, which has `words` for each page. */
     uint32_t first_esc;  /* Index into kcg_plan.esc_of, which has `escs` numbers for the message. */
     int64_t cycle, delay, phase; /* In ns. delay: minimum distance between two frames. */
 } kcg_message;
+/* A slot, besides its kcg_message. */
+typedef struct {
+    uint64_t watched;  /* Bits whose change requests the slot. 0: each event in `triggers` does. */
+    uint16_t crc_seed; /* Start value of the CRC of its transfers. */
+    uint8_t page;      /* `page` of its frames. */
+    uint8_t reserved[5];
+} kcg_slot_row;
 /* Settings of an ESC. timeout: in ns. crc_errors: CRC errors in a second that make the link
    KCG_DEGRADED. cells: number of cells; 0: the number that the ESC reports. */
 typedef struct { int64_t timeout; uint32_t crc_errors, poles, gear_numerator, gear_denominator; uint8_t cells, reserved[7]; } kcg_settings;
@@ -169,8 +179,7 @@ typedef struct {
     const uint16_t *listener, *first_listener;
     uint32_t words;                        /* Length of `constant`. */
     uint16_t messages, escs, pages, slots; /* In `message`, the slots follow the messages. */
-    /* For each slot, the bits whose change requests the slot. 0: each event in `triggers` does. */
-    const uint64_t *watched;
+    const kcg_slot_row *slot_row;
 } kcg_plan;
 
 /* State of an ESC. Fields that are used often are at the beginning, because the instructions of
@@ -199,15 +208,22 @@ typedef struct {
 
 /* State of a message or slot. */
 typedef struct {
-    /* alive: the alive counter. In the first slot with the id of a transfer: the next transfer's
-       number. */
-    uint16_t place_in_heap, alive;
-    /* page: index of the next page; of a slot: its state. why: reasons why it is pending, or 0. */
+    uint16_t place_in_heap, alive; /* alive: the alive counter. */
+    /* page: index of the next page. why: reasons why it is pending, or 0. */
     uint8_t page, pages_to_send, cycle_deferred, why;
     /* last: time of the last frame. cycle_due, deferred: next times, or KCG_NEVER. since: time
        since which it is pending. */
     int64_t last, cycle_due, deferred, since;
 } kcg_sending;
+
+/* State of a slot, besides its kcg_sending. */
+typedef struct {
+    uint64_t seen_bits;      /* The watched bits of the last event or frame. */
+    uint64_t frames_sent;
+    uint8_t state;           /* Started, changed since the last frame, `seen_bits` is valid. */
+    uint8_t transfer_number; /* Number of the next transfer with this id; in the first slot with it. */
+    uint8_t reserved[6];
+} kcg_slot;
 
 /* A UART frame that was found but not processed. end: its position in the stream. */
 typedef struct { uint32_t end; uint8_t is_info, layout, length, body[KCG_BODY_SIZE]; } kcg_found;
@@ -216,9 +232,9 @@ typedef struct { uint32_t end; uint8_t is_info, layout, length, body[KCG_BODY_SI
 typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;
-    kcg_sending *sending;
-    /* Messages that are sent on change: bits of the last frame of each page. Slots: the watched
-       bits, then the number of frames sent. */
+    kcg_sending *sending; /* Of the messages, then of the slots. */
+    kcg_slot *slot;
+    /* Bits of the last frame of each page, for messages that are sent on change. */
     uint64_t *last;
     uint8_t *page;   /* For each page: is its last frame known, must it be sent. */
     uint8_t *report; /* ESCs with events that were not yet returned, oldest first. */
@@ -235,9 +251,11 @@ typedef struct {
     kcg_found found[KCG_FOUND];
 } kcg;
 
-/* Size in bytes of the memory for kcg_init. `messages` includes slots. */
-#define KCG_SIZE(messages, escs, pages, words) \
-    (sizeof(kcg) + (escs) * (sizeof(kcg_esc) + 1) + (messages) * (sizeof(kcg_sending) + 2 * sizeof(uint16_t)) + (pages) + (words) * sizeof(uint64_t))
+/* Size in bytes of the memory for kcg_init. */
+#define KCG_SIZE(messages, slots, escs, pages, words) \
+    (sizeof(kcg) + (escs) * (sizeof(kcg_esc) + 1) + (slots) * sizeof(kcg_slot) + \
+     ((messages) + (slots)) * (sizeof(kcg_sending) + 2 * sizeof(uint16_t)) + (pages) + \
+     (words) * sizeof(uint64_t))
 
 #if !KCG_SOURCE
 /* KCG_DATA and KCG_FOUND change structures, so all files of a program must agree on them. The names

@@ -12,7 +12,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
-from kontronik_can_gw.native.rows import Rows, Settings, held_settings
+from kontronik_can_gw.native.rows import Rows, Settings, SlotRow, held_settings
 from kontronik_can_gw.native.scale import END_OF_TIME
 from kontronik_can_gw.native.slots import NativeSlot, merge, reserve
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus
@@ -81,10 +81,10 @@ class NativeCore:
         self.messages, self.signals, self.pieces, self.constants = (
             arrays[name] for name in ("message", "signal", "piece", "constant")
         )
-        self.watched = _array(c.c_uint64, tables.watched)
-        self._kept = [*arrays.values(), self.watched]
+        self.slot_rows = _array(SlotRow, tables.slots)
+        self._kept = [*arrays.values(), self.slot_rows]
         self.plan = _Plan(
-            *map(c.addressof, arrays.values()), *tables.counts.values(), c.addressof(self.watched)
+            *map(c.addressof, arrays.values()), *tables.counts.values(), c.addressof(self.slot_rows)
         )
         size = self.library.kcg_size(c.byref(self.plan))
         self._memory = (c.c_uint64 * (size // 8 + 1))()

@@ -93,7 +93,7 @@ def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSe
         "/* ESCs: the number of each in calls of the core. */",
         f"enum {{ {', '.join([*places, 'KCG_ESCS'])} }};\n",
         "/* Bytes for kcg_init. */",
-        f"#define KCG_MEMORY KCG_SIZE(KCG_MESSAGES, KCG_ESCS, {tables.pages}, {len(tables.constants)})\n",
+        f"#define KCG_MEMORY KCG_SIZE(KCG_MESSAGES, 0, KCG_ESCS, {tables.pages}, {len(tables.constants)})\n",
         "#ifdef __cplusplus",
         'extern "C" {',
         "#endif",

@@ -33,7 +33,7 @@ class _Row(c.Structure):
             raise NotInCore(f"{name} {value} does not fit")
 
 
-_ROWS = {"kcg_piece", "kcg_pair", "kcg_signal", "kcg_message", "kcg_settings"}
+_ROWS = {"kcg_piece", "kcg_pair", "kcg_signal", "kcg_message", "kcg_settings", "kcg_slot_row"}
 _TYPES = {f"{name}_t": getattr(c, f"c_{name}") for name in ("int16", "int32", "int64")}
 _TYPES |= {f"{name}_t": getattr(c, f"c_{name}") for name in ("uint8", "uint16", "uint32", "uint64")}
 _TYPES |= {"int": c.c_int, "double": c.c_double, "size_t": c.c_size_t, "pollfd": _PollFd}

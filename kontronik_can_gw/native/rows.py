@@ -12,7 +12,7 @@ from kontronik_can_gw.native.header import NotInCore as NotInCore
 
 Piece, Pair = structure("kcg_piece"), structure("kcg_pair")
 Signal, Message = structure("kcg_signal"), structure("kcg_message")
-Settings = structure("kcg_settings")
+Settings, SlotRow = structure("kcg_settings"), structure("kcg_slot_row")
 COUNTS = enumeration("KCG_N_BYTES", "KCG_N_")
 """Of kcg_esc.count, in its order; the last ones, from ``link_state`` on, are states and sums."""
 GATEWAY = enumeration("KCG_ESCS_OK")[:-1]
@@ -57,8 +57,8 @@ def bind_direction(
     if row.kind != KCG.OF_LIVE or max(states) >= _MASK_BITS or row.mask:
         raise NotInCore("a sign by a state of this number")
     row.kind = KCG.OF_DIRECTED
-    row.shift = places[word][0]
-    row.mask = sum(1 << state for state in states)
+    row.state_place = places[word][0]
+    row.negative_states = sum(1 << state for state in states)
 
 
 def settings_of(esc: EscSettings) -> Any:

@@ -7,7 +7,7 @@ from kontronik_can_gw.core.slots import PendingSlot, PythonSlot, SlotPlan, SlotS
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.native.header import KCG
-from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
+from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal, SlotRow
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
 
@@ -45,7 +45,7 @@ def reserve(tables: Tables, slots: int) -> list[list[Place]]:
 
 def _add(tables: Tables, esc: int) -> Place:
     signal, piece = len(tables.signals), len(tables.pieces)
-    place = Place(len(tables.watched), len(tables.messages), signal, piece)
+    place = Place(len(tables.slots), len(tables.messages), signal, piece)
     tables.messages.append(
         Message(
             words=1,
@@ -63,7 +63,7 @@ def _add(tables: Tables, esc: int) -> Place:
     tables.constants += [0, 0]
     tables.pages += 1
     tables.esc_of.append(esc)
-    tables.watched.append(0)
+    tables.slots.append(SlotRow())
     return place
 
 
@@ -192,12 +192,15 @@ class NativeSlot:
                 signal.esc = self._esc
         for number, row in enumerate(rows.pieces):
             core.pieces[place.piece + number] = row
-        core.watched[place.number] = plan.watched
+        row = core.slot_rows[place.number]
+        row.watched = plan.watched
+        row.crc_seed = plan.seed or 0
+        row.page = settings.page
         message: Any = core.messages[place.message]
         is_transfer, length = plan.seed is not None, plan.message.length
         message.id = settings.can_id | EXTENDED * is_transfer
-        message.length, message.words = length, 1 + (length > 8)
-        message.crc_at, message.data_id = settings.page, plan.seed or 0
+        message.length = length
+        message.words = 1 + (length > 8)
         for word in range(2):
             core.constants[message.first_word + word] = settings.fill >> 64 * word & _WORD
         message.flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live

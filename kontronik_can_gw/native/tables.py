@@ -59,8 +59,8 @@ class Tables:
         self.esc_of: list[int] = []
         self.pages = 0
         self.settings = [settings_of(esc) for esc in escs]
-        self.watched: list[int] = []
-        """Of each slot."""
+        self.slots: list[Any] = []
+        """A row of kcg_slot_row for each slot."""
         self.listeners_of: list[list[int]] = [[] for _ in escs]
         """The messages that follow events of each ESC."""
         self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
@@ -119,22 +119,22 @@ class Tables:
     @property
     def counts(self) -> dict[str, int]:
         """The numbers of kcg_plan in its order."""
-        words, escs, slots = len(self.constants), len(self.settings), len(self.watched)
+        words, escs, slots = len(self.constants), len(self.settings), len(self.slots)
         counts = {"words": words, "messages": len(self.messages) - slots, "escs": escs}
         return counts | {"pages": self.pages, "slots": slots}
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
         traits = Traits(plan, silent)
-        flags = (
-            KCG.EVENT * traits.by_event
-            | KCG.ON_CHANGE * traits.on_change
-            | KCG.HAS_CRC * (crc is not None)
-        )
-        flags |= KCG.SILENT * traits.silent_able | KCG.OF_THE_GATEWAY * traits.follows_gateway
+        flags = KCG.EVENT * traits.by_event
+        flags |= KCG.ON_CHANGE * traits.on_change
+        flags |= KCG.HAS_CRC * (crc is not None)
+        flags |= KCG.SILENT * traits.silent_able
+        flags |= KCG.OF_THE_GATEWAY * traits.follows_gateway
         flags |= KCG.FREE * traits.is_free
-        first, words = len(self.signals), max(1, -(-plan.length // 8))
+        first_signal = len(self.signals)
         first_word = len(self.constants)
+        words = max(1, -(-plan.length // 8))
         for page in plan.pages:
             self.constants += _constants(plan, page, words)
         for signal in plan.signals:
@@ -142,16 +142,28 @@ class Tables:
                 self._add_signal(signal, plan, crc is not None)
         first_esc = len(self.esc_of)
         self.esc_of += sorted(plan.escs)
-        self.messages.append(
-            Message(
-                plan.can_id | (EXTENDED if plan.extended else 0),
-                *(plan.length, words, flags, traits.triggers, len(plan.pages)),
-                *(crc.pieces[0].at // 8 if crc else 0, len(plan.escs), int(plan.fd)),
-                *(first, len(self.signals) - first, plan.data_id & 0xFFFF, self.pages),
-                *(max(0, traits.alive_modulus - 1), first_word, first_esc),
-                *(plan.cycle_ns, plan.delay_ns, phase),
-            )
+        row = Message(
+            id=plan.can_id | (EXTENDED if plan.extended else 0),
+            length=plan.length,
+            words=words,
+            flags=flags,
+            triggers=traits.triggers,
+            pages=len(plan.pages),
+            crc_at=crc.pieces[0].at // 8 if crc else 0,
+            escs=len(plan.escs),
+            fd_flags=int(plan.fd),
+            first_signal=first_signal,
+            signals=len(self.signals) - first_signal,
+            data_id=plan.data_id & 0xFFFF,
+            first_page=self.pages,
+            last_alive=max(0, traits.alive_modulus - 1),
+            first_word=first_word,
+            first_esc=first_esc,
+            cycle=plan.cycle_ns,
+            delay=plan.delay_ns,
+            phase=phase,
         )
+        self.messages.append(row)
         self.pages += len(plan.pages)
 
     def _add_signal(self, signal: SignalPlan, plan: MessagePlan, has_crc: bool) -> None:
