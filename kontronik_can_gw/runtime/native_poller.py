@@ -34,7 +34,7 @@ class NativePoller(Poller):
         self._gateway = gateway
         self._core = cast("NativeCore", gateway.core)
         self._turns = self._core.turns()
-        self._turns.state.records = gateway.is_recorded
+        self._turns.request.is_recorded = gateway.is_recorded
         self._seen_changes = -1
         self._fits = True
         self._signals: tuple[int, int] | None = None
@@ -78,36 +78,42 @@ class NativePoller(Poller):
         if (bus := _plain_socket(can, gateway)) is None or not self._watches():
             return None
         turns = self._turns
-        state = turns.state
-        state.asked, state.before, state.bus = self.now, self.before, bus
-        state.now, state.leave, state.period = last, leave, period
-        state.max_turn = max_turn = can.transmitter.max_turn_ns()
-        state.max_late = max(MIN_HELD_UP_NS, max_turn)
-        state.due = min(due, self._core.deadline_in_python())
-        state.outputs_due = gateway.next_deadline(with_core=False)
+        request, times, result = turns.request, turns.times, turns.result
+        times.now = last
+        times.polled = self.now
+        times.bus_empty = self.before
+        request.bus = bus
+        request.leave = leave
+        request.period = period
+        request.max_turn = max_turn = can.transmitter.max_turn_ns()
+        request.max_late = max(MIN_HELD_UP_NS, max_turn)
+        request.due = min(due, self._core.deadline_in_python())
+        request.outputs_due = gateway.next_deadline(with_core=False)
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
             recorded.prepare_turns(last)
         turns.begin()
         while turns.run():
             if not self._follow():
-                self._core.follow_others(state.now)
-                if state.size:
+                self._core.follow_others(times.now)
+                if turns.has_unread:
                     self._core.receive(*turns.read())
                 turns.leave()
                 break
-        self.count += state.turns
-        self.before, self.now, self.late = state.before, state.asked, state.late
+        self.count += result.turns
+        self.before = times.bus_empty
+        self.now = times.polled
+        self.late = result.late
         if recorded is not None:
-            recorded.turned(turns.entries(), state.taken)
-        self.is_over = bool(state.is_over)
-        if state.unsent:
-            can.transmitter.put_refused(turns.unsent(), state.full_since)
-        if state.found >= 0 and state.advanced:  # it ends at its own time, as in a replay
-            self._core.advance_in_python(state.now)
-            gateway.advance(state.now, with_core=False)
-            can.transmit(state.now)
-        return self.handlers(turns.ready()) if state.happened else []
+            recorded.turned(turns.entries(), result.taken)
+        self.is_over = bool(result.is_over)
+        if unsent := turns.unsent():
+            can.transmitter.put_refused(unsent, turns.full_since)
+        if result.event >= 0 and turns.has_advanced:  # it ends at its own time, as in a replay
+            self._core.advance_in_python(times.now)
+            gateway.advance(times.now, with_core=False)
+            can.transmit(times.now)
+        return self.handlers(turns.ready()) if result.happened else []
 
     def _follow(self) -> bool:
         """Follow the event that C has come back with, or let time pass for the outputs; False where the rest of the turn is the loop's.
@@ -115,20 +121,21 @@ class NativePoller(Poller):
         As a rule nothing but frames comes of it, if anything, and C sends them first.
         """
         gateway, core, turns = self._gateway, self._core, self._turns
-        state, outputs = turns.state, gateway.outputs
+        request, outputs = turns.request, gateway.outputs
+        event, now = turns.result.event, turns.times.now
         before = [output.marks for output in outputs]
-        if is_due := state.found == OUTPUTS:
-            gateway.advance(state.now, with_core=False)
+        if is_due := event == OUTPUTS:
+            gateway.advance(now, with_core=False)
         else:
-            core.follow(state.found, state.now)
+            core.follow(event, now)
         if core.link_changes or core.reports_live or before != [each.marks for each in outputs]:
             return False
-        state.outputs_due = due = gateway.next_deadline(with_core=False)
-        state.due = min(state.due, core.deadline_in_python())
-        if state.now >= (min(state.due, due) if is_due else state.due):
+        request.outputs_due = outputs_due = gateway.next_deadline(with_core=False)
+        request.due = due = min(request.due, core.deadline_in_python())
+        if now >= (min(due, outputs_due) if is_due else due):
             return False
         if frames := gateway.output_frames:
-            if not turns.speak(frames):
+            if not turns.add_output_frames(frames):
                 return False
             frames.clear()
         return True
