@@ -127,7 +127,7 @@ class Member:
         """The link state's name. None if it is not available.
 
         The link state has its own message. After a gap that message is up to a cycle later than
-        live values, so the link counts as good while live values are available.
+        live values, so the link is reported as good while live values are available.
         """
         link = self.text("link_state")
         is_bad = link is not None and normalize(link) not in ("ok", "degraded")
