@@ -9,7 +9,8 @@ from kontronik_can_gw.config.export import schema
 
 OPTIONS = OUTPUT
 EPILOG = (
-    "Editors with TOML support (taplo, Even Better TOML) use it to check and complete gateway.toml. "
+    "Editors with TOML support (taplo, Even Better TOML) use it to check and complete "
+    "gateway.toml. "
     "Exit codes: 0 done, 1 the file cannot be written, 2 wrong usage."
 )
 
