@@ -1,8 +1,12 @@
-"""The receiver's view of the bus: the newest value of each signal while it is fresh. Pure; time is an argument.
+"""The receiver's view of the bus: the newest value of each signal while it is fresh.
 
-A value is None before its first frame, while the gateway sends it as not available, and when its message is missing: a cyclic one for
-three cycles, one sent with telemetry for a second, one sent on change when nothing of the gateway has come for three of the shortest
-cycles (at least 3 s; never if no message has a cycle).
+Pure: time is an argument. A value is None before its first frame, and while the gateway sends it as
+not available. It also becomes None if its message is missing for this time:
+
+* a cyclic message for three cycles,
+* a message that is sent with telemetry for a second,
+* a message that is sent on change if no frame of the gateway was received for three of the shortest
+  cycles, and at least 3 s. It never expires if no message has a cycle.
 """
 
 from collections.abc import Sequence
@@ -18,45 +22,57 @@ _MIN_SILENCE_NS = 3 * SECOND
 
 
 class Freshness:
-    """How long the parts of a layout hold their values. ``now`` never goes back."""
+    """The times at which the values of a layout's parts expire. ``now`` must not decrease."""
 
     def __init__(self, parts: Sequence[Part]) -> None:
         self.last_ns: int | None = None
         """Time of the newest frame."""
         self.next_expiry: int | None = None
-        """``expire`` has nothing to do before this time. None: it has nothing to do at any time."""
+        """``expire`` has no effect before this time. None: it has no effect at any time."""
         self._life = [_life(part) for part in parts]
         self._seen: list[int | None] = [None] * len(parts)
-        cycles = [part.plan.cycle_ns * len(part.plan.pages) for part in parts if part.plan.cycle_ns]
-        self._silence_ns = max(_MIN_SILENCE_NS, _CYCLES * min(cycles)) if cycles else None
+        """Time of each part's newest frame. None after its values have expired."""
+        self._silence_ns: int | None = None
+        """Time without a frame of the gateway after which all values expire. None: never."""
+        plans = [part.plan for part in parts if part.plan.cycle_ns]
+        if plans:
+            shortest_ns = min(plan.cycle_ns * len(plan.pages) for plan in plans)
+            self._silence_ns = max(_MIN_SILENCE_NS, _CYCLES * shortest_ns)
 
     def note(self, parts: Sequence[int], now: int) -> None:
-        """Take note of a frame with these parts."""
+        """Record the arrival of a frame with these parts."""
         self.last_ns = now
         for part in parts:
             is_new = self._seen[part] is None
             self._seen[part] = now
-            if is_new:  # otherwise its values held until a later time than ``next_expiry`` before
+            if is_new:  # otherwise ``next_expiry`` is already early enough for this part
                 due = self._due(part)
                 if due is not None and (self.next_expiry is None or due < self.next_expiry):
                     self.next_expiry = due
 
     def expire(self, now: int) -> list[int]:
-        """Return the parts that hold no longer. They are then as before their first frame."""
+        """Return the parts whose values have expired. Their next frame counts as the first one."""
         if self.next_expiry is None or now <= self.next_expiry:
             return []
-        dues = [self._due(index) for index in range(len(self._life))]
-        expired = [index for index, due in enumerate(dues) if due is not None and now > due]
+        expired = []
+        next_expiry = None
+        for index in range(len(self._life)):
+            due = self._due(index)
+            if due is None:
+                continue
+            if now > due:
+                expired.append(index)
+            elif next_expiry is None or due < next_expiry:
+                next_expiry = due
         for index in expired:
             self._seen[index] = None
-        self.next_expiry = min(
-            (due for due in dues if due is not None and due >= now), default=None
-        )
+        self.next_expiry = next_expiry
         return expired
 
     def _due(self, index: int) -> int | None:
-        """Until when a part's values hold; None: unknown, or there are none."""
-        seen, life = self._seen[index], self._life[index]
+        """Return the time at which a part's values expire. None if unknown or without values."""
+        seen = self._seen[index]
+        life = self._life[index]
         if seen is None:
             return None
         if life is not None:
@@ -69,7 +85,7 @@ class Freshness:
 class View:
     """The values of a layout's columns, in the order of ``reader.columns``.
 
-    ``now``: nanoseconds on the clock of the frames, which never goes back.
+    ``now`` is in ns on the clock of the frames, and must not decrease.
     """
 
     def __init__(self, reader: SignalReader) -> None:
@@ -79,6 +95,7 @@ class View:
         """Number of frames of the layout received."""
         self._freshness = Freshness(reader.parts)
         self._part_of = {part.first: index for index, part in enumerate(reader.parts)}
+        """Index of the part that begins at a column."""
 
     @property
     def last_ns(self) -> int | None:
@@ -86,7 +103,7 @@ class View:
         return self._freshness.last_ns
 
     def take(self, key: int, data: bytes, now: int) -> list[Chunk] | None:
-        """Take a frame and return its values. None if it is not of the layout.
+        """Evaluate a frame. Return its values, or None if it is not in the layout.
 
         ``key``: its id, with EXTENDED for 29 bits.
         """
@@ -100,7 +117,7 @@ class View:
         return chunks
 
     def expire(self, now: int) -> bool:
-        """Drop the values of missing messages; True where something was dropped."""
+        """Set the values of missing messages to None. Return True if a message is missing."""
         expired = self._freshness.expire(now)
         for index in expired:
             part = self.reader.parts[index]
@@ -109,7 +126,10 @@ class View:
 
 
 def _life(part: Part) -> int | None:
-    """How long a part's values hold without a new frame; None: as long as any frame of the gateway comes."""
+    """Return the time in ns after which a part's values expire without a new frame.
+
+    None if they are valid while any frame of the gateway is received.
+    """
     plan = part.plan
     if plan.cycle_ns:
         return max(_MIN_NS, _CYCLES * plan.cycle_ns * len(plan.pages))
