@@ -1,6 +1,8 @@
-"""The capture's format: every entry comes back, every intact block is found, damage is reported and costs nothing else.
+"""The format of captures.
 
-With right checksums and wrong contents: one line, or what makes sense; never another exception, nor a hang.
+Every entry is read as it was written, every intact block is found, and damage is reported without
+further losses. If the content is wrong although the checksum is right, the sensible part is read, or
+one line reports the reason. No other exception and no hang may occur.
 """
 
 import copy
@@ -63,7 +65,7 @@ def scanned(data: bytes, size: int | None = None) -> list[Block | Damage]:
 
 
 @given(st.lists(entries, max_size=20))
-def test_entries_come_back(listed: list[Entry]) -> None:
+def test_entries_are_read_as_they_were_written(listed: list[Entry]) -> None:
     expected = [
         entry if entry.kind in (Kind.BYTES, Kind.FRAME) else entry._replace(came_ns=None)
         for entry in listed
@@ -72,7 +74,7 @@ def test_entries_come_back(listed: list[Entry]) -> None:
 
 
 @given(st.binary(max_size=200))
-def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> None:
+def test_garbage_in_a_table_is_refused_or_read_exactly(data: bytes) -> None:
     try:
         found = list(read_entries(data))
     except ValueError:
@@ -85,7 +87,7 @@ def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> No
     st.lists(st.binary(max_size=60), min_size=6, max_size=6),
     st.data(),
 )
-def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
+def test_blocks_are_found_in_garbage_and_every_byte_is_counted(
     listed: list[bytes], rubbish: list[bytes], data: st.DataObject
 ) -> None:
     stream = b""
@@ -100,24 +102,26 @@ def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
     assert [(b.offset, b.payload) for b in blocks] == list(zip(places, listed, strict=True))
     assert [b.number for b in blocks] == list(range(len(listed)))
     damaged = sum(d.length for d in found if isinstance(d, Damage))
-    assert damaged == sum(len(rubbish[n]) for n in range(len(listed))) + len(rubbish[-1])
+    written = [*rubbish[: len(listed)], rubbish[-1]]
+    assert damaged == sum(map(len, written))
 
 
-def test_any_flipped_bit_costs_its_block_and_no_other() -> None:
+def test_any_flipped_bit_loses_only_its_own_block() -> None:
     parts = [block(b"D", n, bytes((n,)) * 50) for n in range(3)]
+    assert len({len(part) for part in parts}) == 1
     stream = b"".join(parts)
     rng = random.Random(1)
     for bit in rng.sample(range(len(stream) * 8), 300):
         broken = bytearray(stream)
         broken[bit // 8] ^= 1 << bit % 8
-        hit = next(n for n in range(3) if bit // 8 < sum(map(len, parts[: n + 1])))
+        hit = bit // 8 // len(parts[0])
         found = scanned(bytes(broken), 64)
         assert {b.number for b in found if isinstance(b, Block)} == {0, 1, 2} - {hit}
         assert [d.length for d in found if isinstance(d, Damage)] == [len(parts[hit])]
 
 
-def test_a_block_that_claims_to_be_huge_is_none() -> None:
-    """A deflated bomb, or a length from rubbish, must not make the reader wait or swell."""
+def test_a_block_with_a_huge_claimed_length_is_refused() -> None:
+    """A compressed bomb, or a length from garbage, must not cost the reader time or memory."""
     packed = zlib.compress(bytes(1 << 22), 9)
     head = struct.pack("<4scBHIII", MAGIC, b"D", 1, 0, len(packed), 1000, 0)
     bomb = head + struct.pack("<I", zlib.crc32(packed, zlib.crc32(head))) + packed
@@ -138,7 +142,7 @@ def test_a_block_that_claims_to_be_huge_is_none() -> None:
         queued=st.just(False),
     )
 )
-def test_a_can_frame_comes_back(frame: CanFrame) -> None:
+def test_a_can_frame_is_read_as_it_was_written(frame: CanFrame) -> None:
     assert read_frame(frame_data(frame)) == frame
 
 
@@ -193,11 +197,12 @@ def header(bench: Bench) -> dict[str, Any]:
 
 
 def places(found: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Every place in a JSON document."""
+    """Yield the path of every value in a JSON document."""
     yield path
     children = dict(enumerate(found)) if isinstance(found, list) else found
-    for key in children if isinstance(children, dict) else ():
-        yield from places(found[key], (*path, key))
+    if isinstance(children, dict):
+        for key, child in children.items():
+            yield from places(child, (*path, key))
 
 
 def changed(document: Any, path: tuple[Any, ...], value: Any) -> Any:
@@ -215,7 +220,7 @@ def changed(document: Any, path: tuple[Any, ...], value: Any) -> Any:
 
 
 def read_all(path: Path) -> None:
-    """Everything that is read of a capture; only our own errors may come."""
+    """Read everything of a capture. Only our own errors may occur."""
     lines: tuple[str, ...] = ("read",)
     try:
         with open_input(path) as found:
@@ -235,7 +240,7 @@ def read_all(path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_wrong_header_values(
+def test_wrong_header_values_cause_only_our_own_errors(
     seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.kcap"
@@ -254,7 +259,7 @@ PYTHON = re.compile(
     r"codec can't|' object|NoneType|subscript|invalid literal|unhashable|has no attribute|must be|"
     r"unpack|argument|fromhex|\bint\(|\bstr\b|\bdict\b|indices|Expecting|not iterable|expected"
 )
-"""Words of Python's own errors."""
+"""Words in Python's own error messages."""
 
 
 def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]) -> None:
@@ -294,7 +299,7 @@ def test_a_refused_header_names_its_part(
     assert refused.value.problems[0].startswith(f"{path}: the header cannot be used: {said}")
 
 
-def test_a_block_that_is_no_json_is_described_without_python(
+def test_a_block_without_json_is_described_in_words_for_users(
     header: dict[str, Any], bench: Bench, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.kcap"
@@ -323,7 +328,9 @@ def test_a_later_part_without_a_number_is_damage(
         assert any("has a part that is no number" in line for line in found.damage)
 
 
-def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+def test_wrong_entries_cause_only_our_own_errors(
+    header: dict[str, Any], bench: Bench, tmp_path: Path
+) -> None:
     path = tmp_path / "a.kcap"
     rng = random.Random(4)
     for _ in range(10):
@@ -343,16 +350,15 @@ def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> 
                     Entry(entry.time_ns, Kind.SAVED),
                 ]
             )
-        path.write_bytes(
-            block(b"H", 0, json_payload(header)) + block(b"D", 1, data_payload(entries))
-        )
+        head = block(b"H", 0, json_payload(header))
+        path.write_bytes(head + block(b"D", 1, data_payload(entries)))
         read_all(path)
 
 
-def test_what_only_looks_like_blocks_costs_little(
+def test_data_that_only_looks_like_blocks_costs_little_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Heads that promise megabytes, one after the other: each would have to be read to its end."""
+    """Many heads promise megabytes, and each would have to be read to its end."""
     head = struct.pack("<4scBHIII", MAGIC, b"D", 0, 0, 8_000_000, 8_000_000, 0) + b"\0\0\0\0"
     data = head * 3000 + bytes(9_000_000)
     costs = [0]
@@ -367,7 +373,9 @@ def test_what_only_looks_like_blocks_costs_little(
     assert 1 << 27 < costs[0] < 1 << 29, "of 24 GB that are promised"
 
 
-def test_a_file_of_nothing_but_damage_is_summed_up(header: dict[str, Any], tmp_path: Path) -> None:
+def test_damage_of_a_completely_damaged_file_is_summed_up(
+    header: dict[str, Any], tmp_path: Path
+) -> None:
     path = tmp_path / "a.kcap"
     empty = block(b"D", 1, data_payload([]))
     path.write_bytes(block(b"H", 0, json_payload(header)) + (empty + b"x") * 20_000)
@@ -386,8 +394,7 @@ def test_a_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_p
         with open_input(path) as found:
             assert isinstance(found, CaptureInput)
             assert found.channel == shown
-    path.write_bytes(
-        block(b"H", 0, json_payload(changed(header, ("escs", 0, "name"), "a\nb"))) + entries
-    )
+    forged = changed(header, ("escs", 0, "name"), "a\nb")
+    path.write_bytes(block(b"H", 0, json_payload(forged)) + entries)
     with pytest.raises(UserError, match="header cannot be used"):
         open_input(path)

@@ -1,4 +1,4 @@
-"""What a replay gives is what the live gateway sent: every frame, every byte, every time."""
+"""A replay gives the frames of the live gateway with the same bytes and times."""
 
 import pytest
 from capture_bench import START, Bench, made
@@ -19,7 +19,7 @@ from kontronik_can_gw.capture.replay import Replay, TimedFrame
 
 
 def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
-    """Through the bytes of a capture, and a gateway made from its header."""
+    """Replay a recording from the bytes of a capture, with a gateway made from its header."""
     data = block(b"H", 0, json_payload(bench.setup.header()))
     for number, at in enumerate(range(0, len(bench.entries), 500)):
         data += block(b"D", number + 1, data_payload(bench.entries[at : at + 500]))
@@ -44,7 +44,7 @@ def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
     ("escs", "canopen", "on_loss"),
     [(2, False, "silent"), (1, True, "not_available"), (3, True, "not_available")],
 )
-def test_frames_and_times_are_the_live_ones(
+def test_frames_and_times_of_a_replay_equal_the_live_ones(
     seed: int, escs: int, canopen: bool, on_loss: str
 ) -> None:
     bench = Bench(*made(escs, canopen, on_loss=on_loss)).live(seed, 8)
@@ -56,7 +56,7 @@ def test_frames_and_times_are_the_live_ones(
     assert received > 3
 
 
-def test_a_marked_replay_differs_in_the_state_and_nowhere_else() -> None:
+def test_a_marked_replay_differs_only_in_the_state() -> None:
     bench = Bench(*made(1)).live(3, 4, wild=False)
     found = bench.setup.database()
     assert found is not None

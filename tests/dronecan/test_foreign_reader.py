@@ -1,4 +1,7 @@
-"""The crate ``dronecan`` (Rust) puts our transfers together and reads their values. tests/foreign/install.sh builds it."""
+"""The Rust crate ``dronecan`` reads our transfers and their values.
+
+tests/foreign/install.sh builds it.
+"""
 
 import math
 import random
@@ -15,7 +18,7 @@ protocol = dronecan_bench.dronecan.uavcan.protocol
 pytestmark = pytest.mark.extended
 
 
-def test_the_crate_reads_what_the_package_reads() -> None:
+def test_the_crate_reads_the_same_transfers_as_the_package() -> None:
     need(READER.exists(), "dronecan-reader")
     rng = random.Random(3)
     bench = Bench(4, extended_hz=10)
