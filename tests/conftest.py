@@ -31,7 +31,10 @@ if not os.environ.get("KCG_VCAN"):
 
     # Every run uses the same examples, and the duration of an example is not judged.
     settings.register_profile(
-        "suite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+        "suite",
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=[HealthCheck.too_slow],
     )
     settings.load_profile("suite")
 

@@ -176,7 +176,13 @@ def missing(step: str) -> str:
     return ""
 
 
-def run(step: str, limit_s: float, scratch: Path, arguments: Sequence[str], live: bool) -> Result:
+def run(
+    step: str,
+    limit_s: float,
+    scratch: Path,
+    arguments: Sequence[str],
+    live: bool,
+) -> Result:
     """Run a step. Its output appears immediately if ``live``, otherwise when the step ends."""
     result = Result(step)
     if lacking := missing(step):
@@ -279,7 +285,8 @@ def main() -> int:
         arguments = own[at + 1 :]
         own = own[:at]
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("tier", choices=TIERS)
     parser.add_argument("--only", action="append", choices=STEPS, metavar="STEP")

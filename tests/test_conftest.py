@@ -45,7 +45,13 @@ def test_tests_still_ignore_a_hangup_under_nohup() -> None:
     assert run_ignoring(script).stdout == "alive\n"
 
 
-@pytest.mark.parametrize(("ignored", "code"), [(True, 0), (False, 128 + HUP)])
+@pytest.mark.parametrize(
+    ("ignored", "code"),
+    [
+        (True, 0),
+        (False, 128 + HUP),
+    ],
+)
 def test_make_test_continues_after_a_hangup_only_under_nohup(ignored: bool, code: int) -> None:
     script = (
         "import run, sys; run.STEPS['lint'] = 'kill -HUP $PPID; sleep 0.1'; "
@@ -56,7 +62,13 @@ def test_make_test_continues_after_a_hangup_only_under_nohup(ignored: bool, code
         assert done.stdout.endswith("1 passed, 0 failed, 0 skipped\n")
     else:
         command = [sys.executable, "-c", script]
-        done = subprocess.run(command, cwd=TESTS, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command,
+            cwd=TESTS,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     assert done.returncode == code, done.stderr
 
 

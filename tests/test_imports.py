@@ -147,7 +147,9 @@ def test_a_running_gateway_imports_only_the_listed_modules(name: str, tmp_path: 
 def test_a_module_that_is_not_listed_is_found(tmp_path: Path) -> None:
     """The test imports a library and a module of ours that a gateway does not need."""
     modules = imported(
-        tmp_path, "", "import rich.console, kontronik_can_gw.desk.recordings.layouts"
+        tmp_path,
+        "",
+        "import rich.console, kontronik_can_gw.desk.recordings.layouts",
     )
     found = surplus(modules, ALWAYS | CANTOOLS)
     assert {"rich", "kontronik_can_gw.desk.recordings.layouts"} <= found

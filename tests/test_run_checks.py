@@ -25,7 +25,11 @@ def step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     With ``cases`` the step leaves a report of them.
     """
 
-    def run(command: str, *cases: str, arguments: tuple[str, ...] = ()) -> Any:
+    def run(
+        command: str,
+        *cases: str,
+        arguments: tuple[str, ...] = (),
+    ) -> Any:
         report = tmp_path / "made.xml"
         report.write_text(f"<testsuite>{''.join(CASES[case] for case in cases)}</testsuite>")
         copy = f"cp {report} {{report}}; " if cases else ": {report}; "
@@ -50,7 +54,11 @@ def step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     ],
 )
 def test_a_step_is_judged_by_its_report_and_its_exit_code(
-    step: Any, command: str, cases: list[str], counts: tuple[int, int, int], state: str
+    step: Any,
+    command: str,
+    cases: list[str],
+    counts: tuple[int, int, int],
+    state: str,
 ) -> None:
     result = step(command, *cases, arguments=("-k", "crc") if command == "exit 5" else ())
     assert (result.passed, result.failed, len(result.skipped), result.state) == (*counts, state)
@@ -58,7 +66,8 @@ def test_a_step_is_judged_by_its_report_and_its_exit_code(
 
 
 def test_a_step_without_tests_is_one_check_with_a_time_limit(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     for command, limit_s, counts, note in (
         ("true", 60, (1, 0), ""),
@@ -67,25 +76,34 @@ def test_a_step_without_tests_is_one_check_with_a_time_limit(
     ):
         monkeypatch.setitem(checks.STEPS, "lint", command)
         result = checks.run("lint", limit_s, tmp_path, (), False)
-        assert ((result.passed, result.failed), result.note) == (counts, note)
+        assert (result.passed, result.failed) == counts
+        assert result.note == note
 
 
 def test_a_step_without_its_tools_is_not_run_and_the_remedy_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(checks.NEEDS, "faults", ("no-such-program", "sudo make one"))
     result = checks.run("faults", 60, tmp_path, (), False)
-    assert (result.state, result.note) == ("not run", "there is no no-such-program")
+    assert result.state == "not run"
+    assert result.note == "there is no no-such-program"
     assert checks.summarize([result], strict=False) == 0
     assert checks.summarize([result], strict=True) == 1
     assert "to enable it:  sudo make one" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("failed", "skipped", "code", "strict_code"), [(0, 0, 0, 0), (1, 0, 1, 1), (0, 2, 0, 1)]
+    ("failed", "skipped", "code", "strict_code"),
+    [(0, 0, 0, 0), (1, 0, 1, 1), (0, 2, 0, 1)],
 )
 def test_the_last_line_has_the_totals(
-    capsys: pytest.CaptureFixture[str], failed: int, skipped: int, code: int, strict_code: int
+    capsys: pytest.CaptureFixture[str],
+    failed: int,
+    skipped: int,
+    code: int,
+    strict_code: int,
 ) -> None:
     reasons = [("a.b", "no such tool")] * skipped
     failures = ["a.crc: 3 is not 4"] * failed

@@ -54,7 +54,12 @@ def changed(eds: Eds, changes: Changes) -> Eds:
     return replace(eds, entries=tuple(entries))
 
 
-def default(index: int, sub: int, value: float | bytes, relative: bool | None = None) -> Changes:
+def default(
+    index: int,
+    sub: int,
+    value: float | bytes,
+    relative: bool | None = None,
+) -> Changes:
     """Return the change of one default."""
     if relative is None:
         (entry,) = (e for e in shipped_eds().entries if (e.index, e.sub) == (index, sub))
@@ -210,7 +215,12 @@ class Bench(Talker):
         self.put(0x600 + node, request)
         return self._answer(node)
 
-    def read(self, index: int, sub: int = 0, node: int = 1) -> bytes | int:
+    def read(
+        self,
+        index: int,
+        sub: int = 0,
+        node: int = 1,
+    ) -> bytes | int:
         """Return the data of an upload, or its abort code."""
         try:
             return upload(partial(self.ask, node), index, sub)
@@ -218,7 +228,12 @@ class Bench(Talker):
             return refused.code
 
     def write(
-        self, index: int, sub: int, data: bytes | int, node: int = 1, size: int = 4
+        self,
+        index: int,
+        sub: int,
+        data: bytes | int,
+        node: int = 1,
+        size: int = 4,
     ) -> int | None:
         """Download data. Return None if it is confirmed, or its abort code.
 
@@ -232,7 +247,12 @@ class Bench(Talker):
             return refused.code
         return None
 
-    def number(self, index: int, sub: int = 0, node: int = 1) -> int:
+    def number(
+        self,
+        index: int,
+        sub: int = 0,
+        node: int = 1,
+    ) -> int:
         """Return the data of an upload as an unsigned number."""
         data = self.read(index, sub, node)
         assert isinstance(data, bytes), f"{index:04X}h:{sub:02X}: {data:08X}h"
@@ -471,7 +491,13 @@ def _attribute(text: str) -> Any:
         return text
 
 
-def tpdo(number: int, kind: int = 254, inhibit: int = 0, timer: int = 0, *mapped: int) -> Changes:
+def tpdo(
+    number: int,
+    kind: int = 254,
+    inhibit: int = 0,
+    timer: int = 0,
+    *mapped: int,
+) -> Changes:
     """Return the changes for a TPDO with its shipped COB-ID, by default of the battery voltage."""
     mapped = mapped or (0x20000210,)
     index = 0x1800 + number - 1

@@ -21,7 +21,12 @@ def with_key(source: str, section: str, key: str, value: str) -> str:
     return source.replace(part, changed)
 
 
-def variable(data_type: int, access: str = "rw", name: str = "Test object", **keys: object) -> str:
+def variable(
+    data_type: int,
+    access: str = "rw",
+    name: str = "Test object",
+    **keys: object,
+) -> str:
     """Return the content of the section of a VAR."""
     values = {
         "ParameterName": name,

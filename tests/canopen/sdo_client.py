@@ -56,7 +56,13 @@ def uploaded(ask: Ask, answer: bytes) -> bytes:
             return data
 
 
-def download(ask: Ask, index: int, sub: int, data: bytes, tell_size: bool = True) -> None:
+def download(
+    ask: Ask,
+    index: int,
+    sub: int,
+    data: bytes,
+    tell_size: bool = True,
+) -> None:
     """Write an object. Up to four bytes are expedited, more are sent in segments."""
     where = multiplexer(index, sub)
     if 1 <= len(data) <= 4:

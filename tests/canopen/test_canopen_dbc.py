@@ -175,9 +175,13 @@ def test_every_frame_of_running_nodes_decodes_to_the_telemetry() -> None:
     bench.run(9 * SECOND)
     count = {name: len(values) for name, values in bench.seen.items()}
     assert set(count) == {message.name for message in bench.database.messages} - {"RightREmergency"}
-    assert count["RightRTpdo1"] > 300 and count["RightRTpdo2"] > 100 and count["RightRTpdo3"] > 60
+    assert count["RightRTpdo1"] > 300
+    assert count["RightRTpdo2"] > 100
+    assert count["RightRTpdo3"] > 60
     ids = {message.name: message.frame_id for message in bench.database.messages}
-    assert (ids["LeftTpdo1"], ids["RightRHeartbeat"], ids["LeftEmergency"]) == (0x185, 0x709, 0x85)
+    assert ids["LeftTpdo1"] == 0x185
+    assert ids["RightRHeartbeat"] == 0x709
+    assert ids["LeftEmergency"] == 0x85
     assert "node 5 (left), node 9 (right_r)" in str(bench.database.buses[0].comment)
     states = [values["LeftNodeState"] for values in bench.seen["LeftHeartbeat"]]
     assert states == ["BootUp", *["Operational"] * 9]
@@ -195,7 +199,9 @@ def test_every_frame_of_running_nodes_decodes_to_the_telemetry() -> None:
     register = {name for name in first if "ErrorRegister" in name and first[name]}
     assert register == {"LeftErrorRegisterGeneric", "LeftErrorRegisterVoltage"}
     seen = [values["LeftLinkState"] for values in bench.seen["LeftTpdo4"]]
-    assert seen[0] == "NeverSeen" and "Lost" in seen and seen[-1] in ("Ok", "Degraded")
+    assert seen[0] == "NeverSeen"
+    assert "Lost" in seen
+    assert seen[-1] in ("Ok", "Degraded")
     seen = [values["RightROperatingState"] for values in bench.seen["RightRTpdo4"]]
     assert {"MotorOff", "SpoolUpFromStill"} <= set(seen)
     assert bench.seen["RightRTpdo3"][-1]["RightRBecCurrent"] == NA
@@ -285,7 +291,8 @@ def test_names_that_are_too_long_are_cut_and_remain_unique() -> None:
 
 
 def test_a_node_that_waits_for_lss_has_no_frames_and_causes_a_warning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = tmp_path / "gateway.toml"
     esc = '[[esc]]\nname = "{}"\nport = "/dev/tty{}"\n'

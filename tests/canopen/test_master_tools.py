@@ -121,7 +121,8 @@ def test_a_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
     for number in range(1, 7):
         ok, found = master.fast_scan()
         place = found[3] - 77
-        assert ok and tuple(found) == bench.nodes[place].identity.identity
+        assert ok
+        assert tuple(found) == bench.nodes[place].identity.identity
         assert [n for n, node in enumerate(bench.nodes) if node.lss.configuring] == [place]
         master.configure_node_id(number)
         assert master.inquire_lss_address(canopen.lss.CS_INQUIRE_SERIAL_NUMBER) == found[3]

@@ -66,7 +66,13 @@ nmt_frames = st.builds(
     st.sampled_from([1, 2, 128, 129, 130]),
     st.sampled_from([0, 1, 2]),
 )
-frames = st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests(), lss_requests())
+frames = st.one_of(
+    any_frames,
+    plain_frames,
+    nmt_frames,
+    sdo_requests(),
+    lss_requests(),
+)
 happenings = st.one_of(
     st.tuples(st.just("frame"), frames),
     st.tuples(st.just("uart"), st.integers(0, NODES - 1), st.integers(0, 0xFFFFFFFF)),

@@ -60,9 +60,16 @@ def test_all_pdos_caused_by_a_uart_frame_carry_its_values() -> None:
     assert sent == [(0x81 + 0x100 * number, speed) for speed in speeds for number in numbers]
 
 
-@pytest.mark.parametrize(("threshold", "link_status"), [(3, 3), (4, 2)])
+@pytest.mark.parametrize(
+    ("threshold", "link_status"),
+    [
+        (3, 3),
+        (4, 2),
+    ],
+)
 def test_2100h_8_sets_the_crc_errors_a_second_of_a_degraded_link(
-    threshold: int, link_status: int
+    threshold: int,
+    link_status: int,
 ) -> None:
     bench = Bench(changes=QUIET)
     assert bench.write(0x2100, 8, threshold, size=2) is None
@@ -178,7 +185,8 @@ EVENT_TIMERS = {(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
     ],
 )
 def test_no_stored_value_prevents_the_gateway_from_starting(
-    tmp_path: Path, stored: dict[str, Stored]
+    tmp_path: Path,
+    stored: dict[str, Stored],
 ) -> None:
     keep(tmp_path, **stored)
     loaded, nodes = loaded_nodes(tmp_path)
@@ -190,16 +198,24 @@ def test_no_stored_value_prevents_the_gateway_from_starting(
     assert loaded.warnings or any(node.parameters.rejected for node in nodes)
 
 
-@pytest.mark.parametrize("clashing", [Stored(2), Stored(communication={0x101400: u32(0x82)})])
+@pytest.mark.parametrize(
+    "clashing",
+    [
+        Stored(2),
+        Stored(communication={0x101400: u32(0x82)}),
+    ],
+)
 def test_1020h_is_cleared_if_a_value_stored_with_it_is_rejected(
-    tmp_path: Path, clashing: Stored
+    tmp_path: Path,
+    clashing: Stored,
 ) -> None:
     verify = {0x102001: u32(15685), 0x102002: u32(43_200_000), 0x101700: b"\xf4\x01"}
     for stored, expected in ((Stored(7), 15685), (clashing, 0)):
         keep(tmp_path, esc1=Stored(stored.node_id, {**stored.communication, **verify}))
         _, nodes = loaded_nodes(tmp_path)
         number = nodes[0].dictionary.number
-        assert (number(0x1020, 1), number(0x1017)) == (expected, 500)
+        assert number(0x1020, 1) == expected
+        assert number(0x1017) == 500
 
 
 def test_swapped_node_ids_are_kept(tmp_path: Path) -> None:

@@ -82,7 +82,8 @@ def test_each_request_gets_one_valid_answer_and_later_clients_are_served(
             bench.pass_time(bench.now + 60 * MS)  # segments before the client sees an abort
     bench.pass_time(bench.now + 2000 * MS)
     bench.server.confirm(None)
-    assert not bench.server.busy and bench.server.due == NEVER
+    assert not bench.server.busy
+    assert bench.server.due == NEVER
     client = Client(bench)
     client.block_download(b"anything", tell_size=True, with_crc=True)
     assert upload(client.answer, 0x2003, 0) == b"anything"
@@ -99,7 +100,11 @@ class Client:
 
     multiplexer = b"\x03\x20\0"
 
-    def __init__(self, bench: Bench, lose: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        lose: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.bench = bench
         self.lose = lose
 
@@ -137,7 +142,9 @@ class Client:
             is_last = done + len(block) == len(parts)
             command = len(block) | is_last << 7
             answer = self.ask(bytes((command,)) + block[-1].ljust(7, b"\xee"))
-            assert answer[0] == 0xA2 and answer[1] == received + whole and not any(answer[3:])
+            assert answer[0] == 0xA2
+            assert answer[1] == received + whole
+            assert not any(answer[3:])
             done += answer[1]
             block_size = answer[2]
         unused = 7 - len(parts[-1])
@@ -145,7 +152,12 @@ class Client:
         assert self.ask(bytes((0xC1 | unused << 2,)) + crc) == b"\xa1" + bytes(7)
         return rounds
 
-    def block_upload(self, block_sizes: Sequence[int], with_crc: bool, threshold: int = 0) -> bytes:
+    def block_upload(
+        self,
+        block_sizes: Sequence[int],
+        with_crc: bool,
+        threshold: int = 0,
+    ) -> bytes:
         turn = 0
         initiate = bytes((0xA0 | with_crc << 2,)) + self.multiplexer
         answer = self.ask(initiate + bytes((block_sizes[0], threshold)))
@@ -188,7 +200,9 @@ SIZES = st.one_of(
     st.integers(0, 2000),
 )
 DATA = st.builds(
-    lambda size, seed: random.Random(seed).randbytes(size), SIZES, st.integers(0, 2**32)
+    lambda size, seed: random.Random(seed).randbytes(size),
+    SIZES,
+    st.integers(0, 2**32),
 )
 
 
@@ -248,8 +262,13 @@ def test_a_download_of_more_than_64_kib_is_refused(in_blocks: bool) -> None:
 def master(bench: Bench) -> Any:
     """Return the SDO client of a node. The other end is the server."""
 
-    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
-        assert cob_id == 0x601 and not remote
+    def exchange(
+        cob_id: int,
+        data: bytes,
+        remote: bool,
+    ) -> list[tuple[int, bytes]]:
+        assert cob_id == 0x601
+        assert not remote
         bench.now += MS
         answers = list(bench.request(data))
         while bench.server.due < bench.now + 1000 * MS:
@@ -264,7 +283,10 @@ def master(bench: Bench) -> Any:
 
 
 @pytest.mark.parametrize("segment_ns", [0, MS // 2])
-@pytest.mark.parametrize("size", [1, 4, 5, 7, 8, 7 * 127, 7 * 127 + 1, 5000])
+@pytest.mark.parametrize(
+    "size",
+    [1, 4, 5, 7, 8, 7 * 127, 7 * 127 + 1, 5000],
+)
 def test_the_canopen_package_can_use_every_kind_of_transfer(size: int, segment_ns: int) -> None:
     data = random.Random(size).randbytes(size)
     bench = Bench(segment_ns)

@@ -73,7 +73,9 @@ def test_names_are_unique_in_the_file_and_have_at_least_two_characters(shipped: 
     ids=["live frame", "logged extremes"],
 )
 def test_fields_are_in_wire_order_and_have_their_types(
-    entries: dict[tuple[int, int], Entry], index: int, data: DataType
+    entries: dict[tuple[int, int], Entry],
+    index: int,
+    data: DataType,
 ) -> None:
     fields_of_frame = rows(LiveData) if data is LiveData else extremes()
     assert max(sub for at, sub in entries if at == index) == len(fields_of_frame)
@@ -82,14 +84,18 @@ def test_fields_are_in_wire_order_and_have_their_types(
         expected = title(name).replace("Max ", "Maximum ").replace("Min ", "Minimum ")
         assert entry.name == expected
         assert entry.data_type == TYPE_OF_WIRE[row.wire], name
-        assert (entry.access, entry.mappable) == ("ro", True)
-        assert (entry.low, entry.high, entry.default) == (None, None, 0)
+        assert entry.access == "ro"
+        assert entry.mappable
+        assert entry.low is None
+        assert entry.high is None
+        assert entry.default == 0
 
 
 def test_unit_codes_agree_with_the_table_of_fields(entries: dict[tuple[int, int], Entry]) -> None:
     for sub, (name, row) in enumerate(rows(LiveData).items(), 1):
         entry = entries[0x2002, sub]
-        assert (entry.access, entry.data_type) == ("const", U32)
+        assert entry.access == "const"
+        assert entry.data_type == U32
         assert entry.name.lower() == f"unit of {title(name).lower()}"
         if row.unit == "mAh":  # 3.6 C, for which there is no code
             assert entry.default == 0
@@ -99,10 +105,13 @@ def test_unit_codes_agree_with_the_table_of_fields(entries: dict[tuple[int, int]
 
 
 @pytest.mark.parametrize(
-    ("sub", "key"), [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")]
+    ("sub", "key"),
+    [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")],
 )
 def test_settings_have_the_ranges_and_defaults_of_the_configuration(
-    entries: dict[tuple[int, int], Entry], sub: int, key: str
+    entries: dict[tuple[int, int], Entry],
+    sub: int,
+    key: str,
 ) -> None:
     definition: Any = next(each for each in fields(EscConfig) if each.name == key)
     entry = entries[0x2100, sub]
@@ -110,7 +119,8 @@ def test_settings_have_the_ranges_and_defaults_of_the_configuration(
     most = entry.high
     if most is None:
         most = {U8: 0xFF, U16: 0xFFFF}[entry.data_type]
-    assert (entry.low or 0, most) == (allowed["minimum"], allowed["maximum"])
+    assert (entry.low or 0) == allowed["minimum"]
+    assert most == allowed["maximum"]
     assert entry.default == definition.default
 
 
@@ -163,7 +173,9 @@ def test_the_mirrors_can_be_dropped(shipped: Eds, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("node_id", [1, 5, 127])
 def test_dcfchk_finds_no_mistake_in_the_eds_and_in_its_dcf(
-    shipped: Eds, tmp_path: Path, node_id: int
+    shipped: Eds,
+    tmp_path: Path,
+    node_id: int,
 ) -> None:
     values = {}
     for entry in shipped.entries:

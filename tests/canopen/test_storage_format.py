@@ -107,9 +107,11 @@ OTHER_CONTENT: list[Any] = [
 
 
 @pytest.mark.parametrize(
-    ("data", "reason"), [*DAMAGED, *((with_crc(body), FORM) for body in OTHER_CONTENT)]
+    ("data", "reason"),
+    [*DAMAGED, *((with_crc(body), FORM) for body in OTHER_CONTENT)],
 )
 def test_text_that_this_version_does_not_write_is_refused_with_the_reason(
-    data: bytes, reason: str
+    data: bytes,
+    reason: str,
 ) -> None:
     assert reason in refused(data)

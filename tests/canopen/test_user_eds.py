@@ -77,7 +77,10 @@ def rows_of(name: str) -> Iterator[Any]:
 
 @pytest.mark.parametrize(("section", "old", "new", "message"), list(rows_of("mistakes.txt")))
 def test_a_mistake_is_reported_with_section_and_key(
-    section: str, old: str, new: str, message: str
+    section: str,
+    old: str,
+    new: str,
+    message: str,
 ) -> None:
     new = re.sub(r"\{var (0x[0-9A-F]+)\}", lambda match: variable(int(match[1], 16)), new)
     found = problems(changed(section, old.replace("~", "\r\n"), new.replace("~", "\r\n")))
@@ -124,7 +127,8 @@ def test_a_damaged_file_is_either_read_or_refused(data: st.DataObject) -> None:
         more = [f"{line.split('=')[0]}={value}"], [value], [f"[{value}]"], [line, "CompactSubObj=2"]
         lines[at : at + 1] = data.draw(st.sampled_from([[], [line] * 2, *more]))
     for problem in problems("\r\n".join(lines).encode("utf-8", "replace")):
-        assert problem.startswith("mine.eds: ") and problem.endswith((".", ";'."))
+        assert problem.startswith("mine.eds: ")
+        assert problem.endswith((".", ";'."))
 
 
 def test_cob_ids_of_one_node_and_of_missing_objects_are_checked() -> None:
@@ -176,7 +180,10 @@ def entry_2200(content: str) -> Entry:
 
 @pytest.mark.parametrize(("data_type", "text", "read", "written"), list(rows_of("values.txt")))
 def test_values_of_every_type_are_read_from_an_eds_and_written_to_a_dcf(
-    data_type: str, text: str, read: str, written: str
+    data_type: str,
+    text: str,
+    read: str,
+    written: str,
 ) -> None:
     content = variable(int(data_type, 16), DefaultValue=text)
     eds = reader.load(with_object(content).encode("ascii"), "mine.eds")
@@ -186,7 +193,14 @@ def test_values_of_every_type_are_read_from_an_eds_and_written_to_a_dcf(
         shown += " + node-ID"
     assert shown == read
     assert entry.default is not None
-    text = dcf.dcf(eds, 1, 500_000, {(0x2200, 0): entry.default}, "left", "left.dcf")
+    text = dcf.dcf(
+        eds,
+        1,
+        500_000,
+        {(0x2200, 0): entry.default},
+        "left",
+        "left.dcf",
+    )
     expected = [written] if written != "-" else []
     assert re.findall("(?m)^ParameterValue=(.*)\r$", text) == expected
 
@@ -207,12 +221,28 @@ def test_signed_limits_and_keys_without_a_value_are_read() -> None:
 # --- the DCF
 
 
-@pytest.mark.parametrize("value", ["Gaß".encode("latin-1"), b"a\r\nb", b" a", b"a ; b", b"a\x00"])
+@pytest.mark.parametrize(
+    "value",
+    [
+        "Gaß".encode("latin-1"),
+        b"a\r\nb",
+        b" a",
+        b"a ; b",
+        b"a\x00",
+    ],
+)
 def test_a_text_that_a_dcf_cannot_contain_is_refused(value: bytes) -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
     expected = r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot stand"
     with pytest.raises(UserError, match=expected):
-        dcf.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left", "left.dcf")
+        dcf.dcf(
+            eds,
+            1,
+            500_000,
+            {(0x2010, 6): value},
+            "left",
+            "left.dcf",
+        )
 
 
 # --- dropped objects
@@ -340,7 +370,14 @@ def test_files_of_windows_editors_result_in_the_same_node(data: bytes) -> None:
 
 def test_a_dcf_of_a_file_with_other_letters_is_ascii() -> None:
     data = LATIN.encode("latin-1")
-    text = dcf.dcf(reader.load(data, "mine.eds"), 1, 250_000, {}, "left", "left.dcf")
+    text = dcf.dcf(
+        reader.load(data, "mine.eds"),
+        1,
+        250_000,
+        {},
+        "left",
+        "left.dcf",
+    )
     assert text.isascii()
     assert "ParameterName=Akkuspannung grosser 5deg" in text
     assert problems(dcf.without(data, {0x606C})) == ()
@@ -350,7 +387,8 @@ def test_a_dcf_of_a_file_with_other_letters_is_ascii() -> None:
 def test_a_mistake_in_a_file_of_a_windows_editor_is_reported_in_one_line(coding: str) -> None:
     text = LATIN.replace("LowLimit=0x01", "LowLimit=\u00fcbel", 1).replace("\r\n", "\r")
     (found,) = problems((text + "\x1a").encode(coding))
-    assert found.startswith("mine.eds: [") and "LowLimit=ubel: not a number" in found
+    assert found.startswith("mine.eds: [")
+    assert "LowLimit=ubel: not a number" in found
 
 
 def test_a_default_text_with_other_letters_is_refused() -> None:

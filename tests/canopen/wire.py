@@ -27,7 +27,11 @@ class Wire(canopen.Network):
 def wire_to(bench: Bench) -> Wire:
     """Return a network with all nodes of a bench."""
 
-    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
+    def exchange(
+        cob_id: int,
+        data: bytes,
+        remote: bool,
+    ) -> list[tuple[int, bytes]]:
         bench.put(cob_id, data, remote=remote)
         bench.answer_saves()
         return [(frame.can_id, frame.data) for frame in bench.take()]

@@ -82,7 +82,13 @@ class Bench:
         self._is_open = True
 
     def _put(
-        self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None
+        self,
+        time_ns: int,
+        kind: int,
+        esc: int,
+        data: bytes,
+        flags: int,
+        came_ns: int | None,
     ) -> None:
         self.entries.append(Entry(time_ns, kind, esc, data, flags, came_ns))
 
@@ -106,7 +112,11 @@ class Bench:
         self.take(now)
         return self
 
-    def running(self, seed: int, wild: bool = True) -> Callable[[float], int]:
+    def running(
+        self,
+        seed: int,
+        wild: bool = True,
+    ) -> Callable[[float], int]:
         """Start the gateway. Return a function that runs it for a number of seconds.
 
         The function returns the time after that.
@@ -151,7 +161,12 @@ class Bench:
 
         return run
 
-    def _happens(self, rng: random.Random, now: int, open_ports: list[bool]) -> None:
+    def _happens(
+        self,
+        rng: random.Random,
+        now: int,
+        open_ports: list[bool],
+    ) -> None:
         gateway = self.gateway
         index = rng.randrange(len(open_ports))
         what = rng.random()
@@ -194,7 +209,10 @@ class Bench:
 
 
 def capture_file(
-    setup: CaptureSetup, entries: Sequence[Entry], devices: Sequence[str] = (), **more: object
+    setup: CaptureSetup,
+    entries: Sequence[Entry],
+    devices: Sequence[str] = (),
+    **more: object,
 ) -> bytes:
     """Return a capture in the recorder's format.
 
@@ -214,7 +232,12 @@ def capture_file(
     return b"".join(block(kind, number, data) for number, (kind, data) in enumerate(blocks))
 
 
-def capture(path: Path, setup: CaptureSetup, entries: Sequence[Entry], **more: object) -> Path:
+def capture(
+    path: Path,
+    setup: CaptureSetup,
+    entries: Sequence[Entry],
+    **more: object,
+) -> Path:
     """Write a ``capture_file``. Return its path."""
     path.write_bytes(capture_file(setup, entries, **more))  # type: ignore[arg-type]
     return path

@@ -88,7 +88,9 @@ def test_garbage_in_a_table_is_refused_or_read_exactly(data: bytes) -> None:
     st.data(),
 )
 def test_blocks_are_found_in_garbage_and_every_byte_is_counted(
-    listed: list[bytes], rubbish: list[bytes], data: st.DataObject
+    listed: list[bytes],
+    rubbish: list[bytes],
+    data: st.DataObject,
 ) -> None:
     stream = b""
     places = []
@@ -123,7 +125,16 @@ def test_any_flipped_bit_loses_only_its_own_block() -> None:
 def test_a_block_with_a_huge_claimed_length_is_refused() -> None:
     """A compressed bomb, or a length from garbage, must not cost the reader time or memory."""
     packed = zlib.compress(bytes(1 << 22), 9)
-    head = struct.pack("<4scBHIII", MAGIC, b"D", 1, 0, len(packed), 1000, 0)
+    head = struct.pack(
+        "<4scBHIII",
+        MAGIC,
+        b"D",
+        1,
+        0,
+        len(packed),
+        1000,
+        0,
+    )
     bomb = head + struct.pack("<I", zlib.crc32(packed, zlib.crc32(head))) + packed
     good = block(b"D", 1, b"good")
     found = scanned(bomb + good)
@@ -236,12 +247,16 @@ def read_all(path: Path) -> None:
             assert len(found.damage) < 100
     except (UserError, RunError) as error:
         lines = error.problems
-    assert lines and all(line.isprintable() for line in lines)
+    assert lines
+    assert all(line.isprintable() for line in lines)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_wrong_header_values_cause_only_our_own_errors(
-    seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path
+    seed: int,
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     data = block(b"D", 1, data_payload(bench.entries[:40])) + block(b"E", 2, b"")
@@ -290,7 +305,11 @@ def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]
     ],
 )
 def test_a_refused_header_names_its_part(
-    header: dict[str, Any], place: tuple[Any, ...], value: Any, said: str, tmp_path: Path
+    header: dict[str, Any],
+    place: tuple[Any, ...],
+    value: Any,
+    said: str,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     path.write_bytes(block(b"H", 0, json_payload(changed(header, place, value))))
@@ -300,7 +319,9 @@ def test_a_refused_header_names_its_part(
 
 
 def test_a_block_without_json_is_described_in_words_for_users(
-    header: dict[str, Any], bench: Bench, tmp_path: Path
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     head = block(b"H", 0, json_payload(header))
@@ -316,7 +337,10 @@ def test_a_block_without_json_is_described_in_words_for_users(
 
 @pytest.mark.parametrize("part", ["x", [], None])
 def test_a_later_part_without_a_number_is_damage(
-    header: dict[str, Any], bench: Bench, tmp_path: Path, part: Any
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
+    part: Any,
 ) -> None:
     data = block(b"D", 1, data_payload(bench.entries[:40]))
     for number, value in enumerate((0, part), 1):
@@ -329,7 +353,9 @@ def test_a_later_part_without_a_number_is_damage(
 
 
 def test_wrong_entries_cause_only_our_own_errors(
-    header: dict[str, Any], bench: Bench, tmp_path: Path
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     rng = random.Random(4)
@@ -364,7 +390,12 @@ def test_data_that_only_looks_like_blocks_costs_little_time(
     costs = [0]
     real = capture._payload
 
-    def counting(buffer: bytearray, deflated: int, stored: int, size: int) -> bytes | None:
+    def counting(
+        buffer: bytearray,
+        deflated: int,
+        stored: int,
+        size: int,
+    ) -> bytes | None:
         costs[0] += stored
         return real(buffer, deflated, stored, size)
 
@@ -374,7 +405,8 @@ def test_data_that_only_looks_like_blocks_costs_little_time(
 
 
 def test_damage_of_a_completely_damaged_file_is_summed_up(
-    header: dict[str, Any], tmp_path: Path
+    header: dict[str, Any],
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     empty = block(b"D", 1, data_payload([]))

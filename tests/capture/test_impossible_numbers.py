@@ -50,7 +50,10 @@ def test_an_impossible_state_is_refused_in_header_and_entry(name: str, tmp_path:
         pass
 
 
-@pytest.mark.parametrize("started_ns", [END_OF_TIME, (1 << 63) - 1, 1 << 63, (1 << 64) - 1])
+@pytest.mark.parametrize(
+    "started_ns",
+    [END_OF_TIME, (1 << 63) - 1, 1 << 63, (1 << 64) - 1],
+)
 def test_impossible_counters_are_rejected_and_change_nothing(started_ns: int) -> None:
     bench = Bench(*made(1)).live(1, 0.5)
     counters = [3] * (len(COUNTERS) - 1)
@@ -82,7 +85,8 @@ def test_an_impossible_time_is_rejected(time_ns: int) -> None:
 
 
 def test_rows_of_a_capture_with_impossible_counters_are_equal_in_c(
-    native_library: Any, tmp_path: Path
+    native_library: Any,
+    tmp_path: Path,
 ) -> None:
     """A table's uptime is computed from ``started_ns``."""
     from offline_equality import core
@@ -90,7 +94,17 @@ def test_rows_of_a_capture_with_impossible_counters_are_equal_in_c(
     bench = Bench(*made(1)).live(1, 1)
     half = len(bench.entries) // 2
     now = bench.entries[half].time_ns
-    data = struct.pack("<8Q", 9, 9, 9, 9, 9, 9, 9, (1 << 63) - 1)
+    data = struct.pack(
+        "<8Q",
+        9,
+        9,
+        9,
+        9,
+        9,
+        9,
+        9,
+        (1 << 63) - 1,
+    )
     entries = [*bench.entries[:half], Entry(now, Kind.COUNTERS, 0, data), *bench.entries[half:]]
     path = capture(tmp_path / "far.kcap", bench.setup, entries)
     found = []

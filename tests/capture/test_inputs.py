@@ -100,7 +100,13 @@ def test_a_run_is_selected_by_its_folder_or_the_beginning_of_its_name(tmp_path: 
         assert isinstance(found, CaptureInput)
         assert found.header["run"] == "b"
     other = tmp_path / "20260102T000000Z-bbbbbb-0001.kcap"
-    capture(other, bench.setup, bench.entries, run="c", part=1)
+    capture(
+        other,
+        bench.setup,
+        bench.entries,
+        run="c",
+        part=1,
+    )
     with open_input(tmp_path / "20260102") as found, pytest.raises(UserError, match="another run"):
         list(found.samples())
 
@@ -120,7 +126,14 @@ def byte_entry(time_ns: int) -> Entry:
 
 
 def clock_entry(time_ns: int, wall_ns: int) -> Entry:
-    return Entry(time_ns, Kind.CLOCK, 0, numbers_data(wall_ns), 0, None)
+    return Entry(
+        time_ns,
+        Kind.CLOCK,
+        0,
+        numbers_data(wall_ns),
+        0,
+        None,
+    )
 
 
 def test_a_changed_wall_clock_applies_to_later_entries(tmp_path: Path) -> None:

@@ -27,7 +27,11 @@ class Bed:
     """A recorder whose thread sleeps until the end. ``step`` does its work at the test's time."""
 
     def __init__(
-        self, folder: Path, wait: bool = False, header: dict[str, Any] = HEADER, **settings: float
+        self,
+        folder: Path,
+        wait: bool = False,
+        header: dict[str, Any] = HEADER,
+        **settings: float,
     ) -> None:
         self.folder = folder
         self.now = 10 * SECOND
@@ -100,7 +104,8 @@ def test_entries_are_written_in_order(tmp_path: Path) -> None:
 
 
 def test_the_name_of_a_capture_has_the_utc_of_its_first_entry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The recorder's clock is at 10 s, and the entry is nearly 10 s older."""
     clocks = {name: getattr(time, name) for name in ("strftime", "gmtime", "localtime")}
@@ -143,7 +148,9 @@ def test_a_new_part_begins_after_the_configured_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("trouble", ["full", "broken", "removed", "no folder"])
 def test_writing_to_a_failed_disk_is_tried_again(
-    trouble: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trouble: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Entries meanwhile are counted as lost, and earlier entries are kept.
 
@@ -221,13 +228,15 @@ def test_a_capture_that_another_gateway_writes_is_kept(tmp_path: Path) -> None:
     os.utime(closed, (1, 1))
     second = Bed(tmp_path, keep_mb=0.000001)
     second.step(*entries(5))
-    assert in_use.exists() and not closed.exists()
+    assert in_use.exists()
+    assert not closed.exists()
     second.it.close()
     first.it.close()
 
 
 def test_a_blocked_disk_is_reported_and_lost_entries_are_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     is_blocked = threading.Event()
     may_continue = threading.Event()
@@ -248,11 +257,14 @@ def test_a_blocked_disk_is_reported_and_lost_entries_are_counted(
     assert "does not answer" in reports[0].text
     may_continue.set()
     found, lost, begins = bed.closed()
-    assert (len(found), lost, begins) == (CAPACITY, 500, [False])
+    assert len(found) == CAPACITY
+    assert lost == 500
+    assert begins == [False]
 
 
 def test_no_file_is_overwritten_and_no_link_is_followed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(os, "urandom", lambda n: bytes(n))
     monkeypatch.setattr(time, "strftime", lambda *_: "20260101T000000Z")

@@ -39,7 +39,8 @@ def test_a_replay_stops_immediately_at_sigint(tmp_path: Path) -> None:
     bench.take(START + 3600 * SECOND)
     path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
     with playing(path) as player:
-        assert player.stdout and player.stderr
+        assert player.stdout
+        assert player.stderr
         assert player.stdout.readline().startswith("e0 "), "it runs"
         player.send_signal(signal.SIGINT)
         assert player.wait(600) == 0, "in an hour it would end by itself"

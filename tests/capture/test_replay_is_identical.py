@@ -35,7 +35,8 @@ def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
     for b in blocks[1:]:
         entries += read_entries(b.payload)
     frames = list(replay.follow(entries))
-    assert (replay.lost, replay.rejected) == (0, 0)
+    assert replay.lost == 0
+    assert replay.rejected == 0
     return frames
 
 
@@ -45,7 +46,10 @@ def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
     [(2, False, "silent"), (1, True, "not_available"), (3, True, "not_available")],
 )
 def test_frames_and_times_of_a_replay_equal_the_live_ones(
-    seed: int, escs: int, canopen: bool, on_loss: str
+    seed: int,
+    escs: int,
+    canopen: bool,
+    on_loss: str,
 ) -> None:
     bench = Bench(*made(escs, canopen, on_loss=on_loss)).live(seed, 8)
     frames = replayed(bench)

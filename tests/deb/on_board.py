@@ -17,7 +17,13 @@ LIMIT_S = 120.0
 
 
 def run(*words: str) -> str:
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+    done = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LIMIT_S,
+    )
     return done.stdout + done.stderr
 
 

@@ -70,7 +70,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("is_git_installed", [True, False])
 def test_without_a_repository_the_remedy_is_given_in_one_line(
-    is_git_installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    is_git_installed: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
     monkeypatch.setattr(make_deb, "PROJECT", tmp_path)
@@ -86,7 +88,10 @@ def contents(package: bytes, part: str = "--fsys-tarfile") -> dict[str, tarfile.
 
 def opened(package: bytes, part: str = "--fsys-tarfile") -> tarfile.TarFile:
     done = subprocess.run(
-        ["dpkg-deb", part, "/dev/stdin"], input=package, capture_output=True, check=True
+        ["dpkg-deb", part, "/dev/stdin"],
+        input=package,
+        capture_output=True,
+        check=True,
     )
     return tarfile.open(fileobj=io.BytesIO(done.stdout))
 
@@ -110,7 +115,8 @@ def test_each_package_has_only_its_object_and_depends_only_on_python(
         assert text(package, objects[0]) == make_deb.MACHINES[architecture]
         lines = text(package, "./control", "--ctrl-tarfile")
         control = dict(re.findall(r"^(\S+): (.*)$", lines, re.MULTILINE))
-        assert (control["Architecture"], control["Depends"]) == (architecture, "python3 (>= 3.11)")
+        assert control["Architecture"] == architecture
+        assert control["Depends"] == "python3 (>= 3.11)"
         assert control["Version"] == make_deb.version()
 
 
@@ -180,9 +186,14 @@ def script(board: Path, name: str, *words: str) -> str:
     path = board / "usr/lib/kontronik-can-gw" / name
     environment = os.environ | {"PATH": f"{board}/bin:{os.environ['PATH']}"}
     done = subprocess.run(
-        [path, *words], env=environment, capture_output=True, text=True, check=False
+        [path, *words],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stderr == ""
+    assert done.returncode == 0
     return done.stdout
 
 
@@ -194,7 +205,14 @@ def installed(board: Path) -> list[Path]:
     return sorted(path for path in (board / "etc").rglob("*") if path.is_file())
 
 
-@pytest.mark.parametrize("words", [("take-over",), ("prerm", "upgrade", "99"), ("prerm", "remove")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("take-over",),
+        ("prerm", "upgrade", "99"),
+        ("prerm", "remove"),
+    ],
+)
 def test_the_package_removes_files_of_service_install(board: Path, words: tuple[str, ...]) -> None:
     """It also does so before another version's files replace the files to compare with."""
     installed(board)
@@ -226,7 +244,8 @@ def test_a_purge_keeps_network_files_and_another_installations_files(board: Path
         make_deb.put(path, "x")
     installed(board)
     said = script(board, "postrm", "purge")
-    assert ".service: is not part of the package. Configurations" in said and "userdel" not in said
+    assert ".service: is not part of the package. Configurations" in said
+    assert "userdel" not in said
     assert all(path.exists() for path in kept)
     script(board, "take-over")
     assert "userdel kontronik-can-gw" in script(board, "postrm", "purge")
@@ -236,7 +255,8 @@ def test_a_purge_keeps_network_files_and_another_installations_files(board: Path
 
 @pytest.mark.parametrize("is_there", [False, True])
 def test_without_systemd_the_user_is_the_one_that_sysusers_would_create(
-    is_there: bool, tmp_path: Path
+    is_there: bool,
+    tmp_path: Path,
 ) -> None:
     """Only replacements are in PATH, so systemd-sysusers is missing."""
     for name in ("useradd", "groupadd"):
@@ -311,5 +331,11 @@ def test_no_command_imports_a_library_that_is_left_out() -> None:
     modules = ["wrapt", "markdown_it", "pygments", "argparse_addons", "crccheck", "diskcache"]
     modules += ["msgpack", "bitstruct.c", "numpy", "pyarrow", "asammdf"]
     command = [sys.executable, "-c", script, *modules]
-    done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command,
+        cwd=PROJECT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr

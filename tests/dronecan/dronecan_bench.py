@@ -34,7 +34,12 @@ LIVE = LiveData(
 )
 
 
-def loaded(escs: int = 1, dbc: bool = False, canopen: bool = False, **table: Any) -> Loaded:
+def loaded(
+    escs: int = 1,
+    dbc: bool = False,
+    canopen: bool = False,
+    **table: Any,
+) -> Loaded:
     """Return a loaded configuration with these keys of [dronecan]."""
     tables: dict[str, Any] = {
         "can": {"interface": "virtual", "bitrate": 1_000_000},
@@ -111,7 +116,12 @@ class Bench:
     Every 10 ms each ESC sends its frame of ``live``, unless that is None.
     """
 
-    def __init__(self, escs: int = 1, given: Loaded | None = None, **table: Any) -> None:
+    def __init__(
+        self,
+        escs: int = 1,
+        given: Loaded | None = None,
+        **table: Any,
+    ) -> None:
         self.loaded = given or loaded(escs, **table)
         self.now = START
         self.gateway = Gateway(
@@ -203,7 +213,12 @@ class Bench:
         self.frames.clear()
 
 
-def peers_frames(payload: Any, source: int, to: int | None = None, **more: Any) -> list[CanFrame]:
+def peers_frames(
+    payload: Any,
+    source: int,
+    to: int | None = None,
+    **more: Any,
+) -> list[CanFrame]:
     """Return the frames of a transfer, created by the package."""
     is_service = to is not None
     made = transport.Transfer(

@@ -20,7 +20,11 @@ def waiting(escs: int = 1) -> Bench:
 
 
 def receive_allocation(
-    bench: Bench, node_id: int, unique_id: bytes, source: int = 100, first: int = 0
+    bench: Bench,
+    node_id: int,
+    unique_id: bytes,
+    source: int = 100,
+    first: int = 0,
 ) -> None:
     """Receive a message of an allocator, or of another requesting node if ``source`` is 0."""
     message = Allocation(node_id=node_id, first_part_of_unique_id=bool(first))
@@ -61,7 +65,8 @@ def test_the_parts_of_an_id_are_sent_in_turn_and_repeated_without_answer() -> No
     receive_allocation(bench, 0, own[:6])
     bench.run(5)  # the allocator does not answer
     firsts = [each.payload.first_part_of_unique_id for each in bench.of("Allocation")]
-    assert firsts[:3] == [True, False, True] and all(firsts[2:])
+    assert firsts[:3] == [True, False, True]
+    assert all(firsts[2:])
     for known in (6, 12):
         bench.clear()
         receive_allocation(bench, 0, own[:known])
@@ -121,7 +126,13 @@ def test_requests_of_other_nodes_delay_ours(source: int) -> None:
     """A request of another client and the allocator's answer to it delay our request."""
     bench = waiting()
     for turn in range(20):
-        receive_allocation(bench, 0, b"others", source, first=0 if source else turn + 1)
+        receive_allocation(
+            bench,
+            0,
+            b"others",
+            source,
+            first=0 if source else turn + 1,
+        )
         bench.run(0.5)
     assert not bench.of("Allocation")
     assert bench.run(1.1).of("Allocation")

@@ -98,13 +98,25 @@ class World:
         last = history[-1][0] if history else -(1 << 60)
         return self.bench.now - last
 
-    def sent(self, esc: int, since: int) -> list[tuple[int, int, float]]:
+    def sent(
+        self,
+        esc: int,
+        since: int,
+    ) -> list[tuple[int, int, float]]:
         return [entry for entry in self.history[esc][-200:] if entry[0] >= since]
 
 
-@pytest.mark.parametrize(("rpm", "ratio"), [("motor", 7), ("output", 70), ("electrical", 1)])
+@pytest.mark.parametrize(
+    ("rpm", "ratio"),
+    [
+        ("motor", 7),
+        ("output", 70),
+        ("electrical", 1),
+    ],
+)
 def test_no_stale_value_is_taken_for_fresh_and_arming_is_never_blocked(
-    rpm: str, ratio: int
+    rpm: str,
+    ratio: int,
 ) -> None:
     """Betaflight takes ``rpm`` for the electrical speed. Its temperature is in whole degrees."""
     world = World(1, 4, rpm)

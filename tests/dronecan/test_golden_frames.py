@@ -52,7 +52,13 @@ class Measuring:
         layout = Layout("", "", ())
         self.core: Any = PythonCore(escs, layout, 0, False)
         if not is_pure:
-            self.core, why = make_core(escs, layout, 0, False, slots=1)
+            self.core, why = make_core(
+                escs,
+                layout,
+                0,
+                False,
+                slots=1,
+            )
             if why:
                 pytest.skip(why)
         self.kind = kind
@@ -61,7 +67,13 @@ class Measuring:
         self.slot = self.core.slot(0)
         self.slot.start(0)
 
-    def sent(self, live: LiveData, index: int, errors: int = 0, turns: int = 1) -> list[CanFrame]:
+    def sent(
+        self,
+        live: LiveData,
+        index: int,
+        errors: int = 0,
+        turns: int = 1,
+    ) -> list[CanFrame]:
         """Return the frames of node 42 with priority 16 for the last of ``turns`` ESC frames."""
         can_id = message_id(self.kind.number, 42, 16)
         bits = fill(self.kind, index, errors)
@@ -114,9 +126,14 @@ BACKWARD = {OperatingState.Sync_Backward, OperatingState.Backward}
 
 @pure
 @pytest.mark.parametrize("has_direction", [True, False])
-@pytest.mark.parametrize("speed", [0, 1, 40_583, 131_071, 131_072, 131_073, 1_000_000, 0xFFFF_FFFF])
+@pytest.mark.parametrize(
+    "speed",
+    [0, 1, 40_583, 131_071, 131_072, 131_073, 1_000_000, 0xFFFF_FFFF],
+)
 def test_rpm_is_negative_in_the_backward_states_only(
-    is_pure: bool, has_direction: bool, speed: int
+    is_pure: bool,
+    has_direction: bool,
+    speed: int,
 ) -> None:
     measuring = Measuring(wire.STATUS, is_pure, has_direction=has_direction)
     for state in (*range(32), 0x96, 0xFF):
@@ -157,7 +174,9 @@ def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
         word = live.operating_errors
         assert got.input_pct == abs(live.throttle)
         assert got.output_pct == min(live.output_opening, 127)
-        assert (got.motor_temperature_degC, got.motor_angle, got.esc_index) == (-256, 0, index)
+        assert got.motor_temperature_degC == -256
+        assert got.motor_angle == 0
+        assert got.esc_index == index
         assert got.status_flags == word & 0x3FFFF | (word > 0x3FFFF) << 18
 
 

@@ -62,7 +62,13 @@ def storm(count: int, seed: int, node_id: int) -> Bench:
 
 
 @pytest.mark.parametrize("node_id", [42, 0])
-@pytest.mark.parametrize("count", [20_000, pytest.param(10**6, marks=pytest.mark.extended)])
+@pytest.mark.parametrize(
+    "count",
+    [
+        20_000,
+        pytest.param(10**6, marks=pytest.mark.extended),
+    ],
+)
 def test_a_hostile_bus_does_no_harm(count: int, node_id: int) -> None:
     """The storm is reported, and after it everything works as before."""
     tracemalloc.start()

@@ -29,7 +29,10 @@ def test_node_info_identifies_the_node_and_a_restart_is_refused() -> None:
 
 
 def ask_for_parameter(
-    bench: Bench, name: str = "", index: int = 0, given: tuple[str, Any] = ("", 0)
+    bench: Bench,
+    name: str = "",
+    index: int = 0,
+    given: tuple[str, Any] = ("", 0),
 ) -> object:
     """Return name and value of a parameter after a GetSet request, or None if it does not exist."""
     request = GetSet.Request(index=index)

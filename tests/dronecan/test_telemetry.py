@@ -40,11 +40,21 @@ def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh(
 
 
 @pytest.mark.parametrize(
-    ("rpm", "speed"), [("motor", 6000), ("output", 600), ("electrical", 42_000)]
+    ("rpm", "speed"),
+    [("motor", 6000), ("output", 600), ("electrical", 42_000)],
 )
-@pytest.mark.parametrize(("negative_rpm", "sign"), [(True, -1), (False, 1)])
+@pytest.mark.parametrize(
+    ("negative_rpm", "sign"),
+    [
+        (True, -1),
+        (False, 1),
+    ],
+)
 def test_rpm_of_a_backward_motor_is_negative_unless_that_is_off(
-    rpm: str, speed: int, negative_rpm: bool, sign: int
+    rpm: str,
+    speed: int,
+    negative_rpm: bool,
+    sign: int,
 ) -> None:
     """The motor is started forward, reversed, and started forward again."""
     bench = Bench(rpm=rpm, negative_rpm=negative_rpm)
@@ -56,7 +66,16 @@ def test_rpm_of_a_backward_motor_is_negative_unless_that_is_off(
     assert seen == [{speed}, {sign * speed}, {speed}]
 
 
-@pytest.mark.parametrize(("rate_hz", "live_ms"), [(50, 50), (50, 14), (100, 10), (30, 10), (7, 10)])
+@pytest.mark.parametrize(
+    ("rate_hz", "live_ms"),
+    [
+        (50, 50),
+        (50, 14),
+        (100, 10),
+        (30, 10),
+        (7, 10),
+    ],
+)
 def test_the_rate_is_kept_on_average_at_any_rate_of_telemetry(rate_hz: int, live_ms: int) -> None:
     """A frame of the ESC causes a Status if it arrives at about the right time, else the clock.
 
@@ -73,9 +92,16 @@ def test_the_rate_is_kept_on_average_at_any_rate_of_telemetry(rate_hz: int, live
     assert 0 <= min(late) < max(late) + 1 <= live_ms * MS + 1
 
 
-@pytest.mark.parametrize(("device", "amperes"), [(Device.KOSMIK, 1.25), (Device.JIVEPRO, math.nan)])
+@pytest.mark.parametrize(
+    ("device", "amperes"),
+    [
+        (Device.KOSMIK, 1.25),
+        (Device.JIVEPRO, math.nan),
+    ],
+)
 def test_the_bec_is_sent_once_a_second_with_nan_for_missing_values(
-    device: Device, amperes: float
+    device: Device,
+    amperes: float,
 ) -> None:
     bench = Bench(first_index=2)
     bench.hear(InfoData(device_and_variant=device_and_variant(device, 1)))
@@ -83,10 +109,12 @@ def test_the_bec_is_sent_once_a_second_with_nan_for_missing_values(
     bench.run(3)
     circuit = bench.of("CircuitStatus")[-1].payload
     warm = bench.of("Temperature")[-1].payload
-    assert (circuit.circuit_id, circuit.error_flags) == (2, 2)
+    assert circuit.circuit_id == 2
+    assert circuit.error_flags == 2
     assert circuit.voltage == pytest.approx(5.981, abs=0.004)
     assert circuit.current == pytest.approx(amperes, abs=0.001, nan_ok=True)
-    assert (warm.device_id, warm.error_flags) == (2, 1)
+    assert warm.device_id == 2
+    assert warm.error_flags == 1
     assert warm.temperature == pytest.approx(314.15, abs=0.25)
     assert len(bench.of("CircuitStatus")) == len(bench.of("Temperature")) == 4
     assert max(bench.intervals("CircuitStatus")) == SECOND
@@ -119,7 +147,8 @@ def test_the_bec_is_sent_once_a_second_with_nan_for_missing_values(
     ids=["the motor is started again", "telemetry returns with errors"],
 )
 def test_error_count_counts_errors_since_the_motor_was_started(
-    flight: list[tuple[int, int] | None], counts: list[int]
+    flight: list[tuple[int, int] | None],
+    counts: list[int],
 ) -> None:
     bench = Bench()
     found = []
@@ -153,10 +182,13 @@ def test_a_node_sends_its_status_and_the_gateways_health_each_second() -> None:
     bench = Bench()
     bench.live[0] = None
     bench.run(2)
-    assert ({each.name for each in bench.read}, bench.read[0].at) == ({"NodeStatus"}, START)
+    assert {each.name for each in bench.read} == {"NodeStatus"}
+    assert bench.read[0].at == START
     bench.live[0] = LIVE._replace(operating_errors=1 << HOT | 1 << 17)
     got = bench.run(1.5).of("NodeStatus")[-1].payload
-    assert (got.uptime_sec, got.health, got.vendor_specific_status_code) == (3, 0, 1 << HOT)
+    assert got.uptime_sec == 3
+    assert got.health == 0
+    assert got.vendor_specific_status_code == 1 << HOT
     assert bench.intervals("NodeStatus") == {SECOND}
     for state, health in ((CanState.ERROR_PASSIVE, 1), (CanState.ERROR_ACTIVE, 0)):
         bench.gateway.set_can_state(state, bench.now)
@@ -169,7 +201,8 @@ def test_a_node_sends_its_status_and_the_gateways_health_each_second() -> None:
 
 @pytest.mark.parametrize("is_pure", [True, False])
 def test_transfer_ids_count_from_0_to_31_for_each_message_of_a_node(
-    is_pure: bool, monkeypatch: pytest.MonkeyPatch
+    is_pure: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A receiver takes a transfer with the same id as the one before for a repetition."""
     monkeypatch.setenv(load.PURE, str(int(is_pure)))

@@ -108,7 +108,12 @@ def adapters(_: Path) -> Iterator[Bench]:
 
 
 def fault(
-    area: str, name: str, limit_s: float | None, *, bed: MakesBench = two, **further: Any
+    area: str,
+    name: str,
+    limit_s: float | None,
+    *,
+    bed: MakesBench = two,
+    **further: Any,
 ) -> Callable[[Injects], Injects]:
     """Register a function as a fault.
 

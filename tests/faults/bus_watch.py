@@ -78,7 +78,12 @@ class Judge:
     ``slack_ns`` is the time that the machine may take in addition to the time-out.
     """
 
-    def __init__(self, table: Table, escs: Sequence[FedEsc], slack_ns: int = 60 * MS) -> None:
+    def __init__(
+        self,
+        table: Table,
+        escs: Sequence[FedEsc],
+        slack_ns: int = 60 * MS,
+    ) -> None:
         self.table = table
         self.escs = escs
         self.slack_ns = slack_ns
@@ -135,7 +140,12 @@ class Judge:
         """Return the device number of an ESC's newest right EscInfo."""
         return self._devices[esc]
 
-    def first_fresh(self, esc: int, after_ns: int, sent_after_ns: int = 0) -> Fresh | None:
+    def first_fresh(
+        self,
+        esc: int,
+        after_ns: int,
+        sent_after_ns: int = 0,
+    ) -> Fresh | None:
         """Return the first frame with right values of an ESC after a time, or None.
 
         Its live frame was sent at ``sent_after_ns`` or later.
@@ -192,7 +202,8 @@ class Judge:
             newer = self._newest.get(can_id, -1)
             if n < newer:
                 self._is_wrong(
-                    at_ns, f"{received}: values of frame {n} after those of frame {newer}"
+                    at_ns,
+                    f"{received}: values of frame {n} after those of frame {newer}",
                 )
                 return
             self._newest[can_id] = n
@@ -229,7 +240,8 @@ class Judge:
     def _judge_age(self, message: Message, at_ns: int) -> None:
         """Check that the age of the data is not lower than the age of the newest frame."""
         age = self.value(message.name, "data_age")
-        assert message.esc is not None and age is not None
+        assert message.esc is not None
+        assert age is not None
         if age >= 65_000:
             return
         fed = self.escs[message.esc]

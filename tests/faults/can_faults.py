@@ -18,7 +18,13 @@ from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter
 
 CONFLICT = 0x8150
-traffic = partial(fault, "Traffic", limit_s=None, escs=[], settle_s=1)
+traffic = partial(
+    fault,
+    "Traffic",
+    limit_s=None,
+    escs=[],
+    settle_s=1,
+)
 ACTIVE = 1
 PASSIVE = 3
 BUS_OFF_LEFT = 0x8140
@@ -266,7 +272,10 @@ def sync(bench: Bench, injection: Injection, _n: int) -> None:
 
 
 def conflict(
-    bench: Bench, injection: Injection, n: int, frames: tuple[tuple[int, str], ...]
+    bench: Bench,
+    injection: Injection,
+    n: int,
+    frames: tuple[tuple[int, str], ...],
 ) -> None:
     """Send these frames as if another node were node 1, and then node 2.
 

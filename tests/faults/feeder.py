@@ -160,7 +160,12 @@ class FedEsc:
     path: str
     """The path that the gateway opens."""
 
-    def __init__(self, identity: Identity, rate_hz: float = 50, info_every: int = 100) -> None:
+    def __init__(
+        self,
+        identity: Identity,
+        rate_hz: float = 50,
+        info_every: int = 100,
+    ) -> None:
         self.rate_hz = rate_hz
         self.info_every = info_every
         self.on = True

@@ -96,7 +96,12 @@ class LoggedProcess:
 class Gateway(LoggedProcess):
     """``kontronik-can-gw run`` with an optional prefix such as ``setpriv``, and an environment."""
 
-    def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        config: Path,
+        prefix: Sequence[str],
+        environment: Mapping[str, str],
+    ) -> None:
         program = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
         self.started_ns = time.monotonic_ns()
         super().__init__([*AHEAD, *prefix, *program], environment)
@@ -111,7 +116,11 @@ class Gateway(LoggedProcess):
             "threads": int(status["Threads"]),
         }
 
-    def growth(self, before: dict[str, int], rss_kib: int) -> list[str]:
+    def growth(
+        self,
+        before: dict[str, int],
+        rss_kib: int,
+    ) -> list[str]:
         """Return the figures that have grown, as text. Memory may grow by ``rss_kib``."""
         limits = before | {"rss": before["rss"] + rss_kib}
         after = self.figures()
@@ -265,7 +274,11 @@ class Bench:
             gateway.kill()
 
     def wait_fresh(
-        self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0
+        self,
+        escs: Sequence[int],
+        after_ns: int,
+        seconds: float,
+        sent_after_ns: int = 0,
     ) -> int:
         """Wait until each of these ESCs has had a right value on the bus after a time.
 
@@ -282,7 +295,12 @@ class Bench:
         self.wait_until(all_came, seconds, f"right values of {names}")
         return max(came)
 
-    def wait_until(self, condition: Callable[[], object], seconds: float, what: str) -> None:
+    def wait_until(
+        self,
+        condition: Callable[[], object],
+        seconds: float,
+        what: str,
+    ) -> None:
         """Wait until a condition is true. Raise NotRecovered if it stays false."""
         begin = time.monotonic()
         last = False
@@ -296,7 +314,12 @@ class Bench:
             else:
                 time.sleep(0.01)
 
-    def wait_log(self, text: str, since: int = 0, seconds: float = 10) -> None:
+    def wait_log(
+        self,
+        text: str,
+        since: int = 0,
+        seconds: float = 10,
+    ) -> None:
         """Wait for a line with this text in the gateway's log, beginning at line ``since``."""
         lines = self.gateway.lines
         texts = [each for each in (text, self.said_instead) if each]
@@ -326,7 +349,12 @@ class Bench:
 
     # --- accounts
 
-    def leave_out(self, escs: Sequence[int] | range, begin_ns: int, end_ns: int) -> None:
+    def leave_out(
+        self,
+        escs: Sequence[int] | range,
+        begin_ns: int,
+        end_ns: int,
+    ) -> None:
         """Do not expect frames on the bus that these ESCs sent in this time."""
         for esc in escs:
             self._excluded[esc].append((begin_ns, end_ns))
@@ -431,7 +459,10 @@ class Injection:
         assert self.cleared_ns is not None
         limit_s = (self.fault.limit_s or 1.0) * 3 + 2
         self.recovered_ns = self.bench.wait_fresh(
-            self.escs, self.cleared_ns, limit_s, self.cleared_ns
+            self.escs,
+            self.cleared_ns,
+            limit_s,
+            self.cleared_ns,
         )
         self.healed_at(self.recovered_ns)
 

@@ -100,7 +100,13 @@ def second(bench: Bench, injection: Injection, reason: str) -> None:
     port = PtyPort(extra, bench.escs[0].identity)
     try:
         command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(other)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
     finally:
         port.close()
     errors = done.stderr.strip()
@@ -168,7 +174,12 @@ def frozen(bench: Bench, injection: Injection, n: int) -> None:
         bench.environment = before
 
 
-def clock_set(bench: Bench, _injection: Injection, _n: int, to: Callable[[], float]) -> None:
+def clock_set(
+    bench: Bench,
+    _injection: Injection,
+    _n: int,
+    to: Callable[[], float],
+) -> None:
     right = time.time() - time.monotonic()
     time.clock_settime(time.CLOCK_REALTIME, to())
     try:

@@ -102,7 +102,12 @@ def run(faults: Sequence[Fault], report: Report, folder: Path) -> None:
                 del waiting[:1]
 
 
-def run_one(bench: Bench, fault: Fault, rounds: Sequence[object], report: Report) -> bool:
+def run_one(
+    bench: Bench,
+    fault: Fault,
+    rounds: Sequence[object],
+    report: Report,
+) -> bool:
     """Run the rounds of a fault. Return True if the bench is still usable."""
     begin = time.monotonic()
     row = report.of(fault)
@@ -111,7 +116,12 @@ def run_one(bench: Bench, fault: Fault, rounds: Sequence[object], report: Report
     return good
 
 
-def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> None:
+def soak(
+    bench: Bench,
+    report: Report,
+    generator: random.Random,
+    end: float,
+) -> None:
     """Inject faults that do not end the process until ``end``. Then check the process.
 
     Descriptors and threads must not grow. The memory is judged by its growth and, after an hour or
@@ -143,7 +153,8 @@ def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("part", nargs="?", choices=("uml", "qemu", "soak"), default="uml")
     parser.add_argument("--junit", type=Path, help="write what came of it as a JUnit report")

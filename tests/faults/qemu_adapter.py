@@ -34,7 +34,11 @@ _CONFIGURATION = 2
 _STRING = 3
 
 
-def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
+def wait_until(
+    condition: Callable[[], Any],
+    seconds: float,
+    what: str,
+) -> None:
     """Wait until a condition is true. Raise AssertionError if it stays false."""
     begin = time.monotonic()
     while not condition():
@@ -224,7 +228,13 @@ class SerialAdapter:
         else:
             self._answer(number, answer[:length] if kind & _DEVICE_TO_HOST else b"", taken)
 
-    def vendor(self, request: int, value: int, index: int, length: int) -> bytes:
+    def vendor(
+        self,
+        request: int,
+        value: int,
+        index: int,
+        length: int,
+    ) -> bytes:
         """Return the answer to a request of the driver ftdi_sio."""
         line = self.line
         if request == 0:  # reset, or clear a buffer; 1 clears the receive buffer
@@ -251,10 +261,28 @@ class SerialAdapter:
         self._is_set = self._is_set or line == ESC_LINE
         return bytes(length)
 
-    def _answer(self, number: int, data: bytes = b"", taken: int = 0, status: int = 0) -> None:
+    def _answer(
+        self,
+        number: int,
+        data: bytes = b"",
+        taken: int = 0,
+        status: int = 0,
+    ) -> None:
         """Complete a request with data for the host, or with the number of bytes taken from it."""
         size = len(data) or taken
-        head = struct.pack(">5I5i8x", _RET_SUBMIT, number, 0, 0, 0, status, size, 0, 0, 0)
+        head = struct.pack(
+            ">5I5i8x",
+            _RET_SUBMIT,
+            number,
+            0,
+            0,
+            0,
+            status,
+            size,
+            0,
+            0,
+            0,
+        )
         self._send(head + data)
 
     def _unlink(self, number: int, victim: int) -> None:

@@ -223,7 +223,13 @@ class MachineBench(Bench):
         for name in ("can0", "can1"):
             can_up(name)
         known = table(("--esc", "2"), True, 2)
-        super().__init__("can0", "can1", [self.wire, self.uart], known, slack_ns=SLACK_NS)
+        super().__init__(
+            "can0",
+            "can1",
+            [self.wire, self.uart],
+            known,
+            slack_ns=SLACK_NS,
+        )
 
     def _has_open(self, device: str) -> bool:
         """Return whether the gateway has this file open."""

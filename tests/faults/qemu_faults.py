@@ -101,7 +101,12 @@ def renumbered(bench: MachineBench, injection: Injection, _n: int) -> None:
 
 
 def misread(
-    bench: MachineBench, injection: Injection, n: int, how: Mangle, error: int, counter: str
+    bench: MachineBench,
+    injection: Injection,
+    n: int,
+    how: Mangle,
+    error: int,
+    counter: str,
 ) -> None:
     """Change the bytes on the line as in User Mode Linux.
 
@@ -211,7 +216,10 @@ def reset_by_other(bench: MachineBench, injection: Injection, index: int) -> Non
 
 
 @on_machine(
-    "CAN", "controller taken from its driver and given back", CAN_LIMIT_S, rounds=(0.1, 1.0, 3.0)
+    "CAN",
+    "controller taken from its driver and given back",
+    CAN_LIMIT_S,
+    rounds=(0.1, 1.0, 3.0),
 )
 def rebound(bench: MachineBench, injection: Injection, pause: float) -> None:
     """Remove the interface, and create another one with the same name."""

@@ -39,7 +39,12 @@ class RawBus:
         packed = b"".join(struct.pack("=II", *each) for each in filters)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed)
 
-    def send(self, can_id: int, data: bytes = b"", wait: bool = True) -> bool:
+    def send(
+        self,
+        can_id: int,
+        data: bytes = b"",
+        wait: bool = True,
+    ) -> bool:
         """Send a frame. Return False if the queue is full and ``wait`` is False."""
         return self._send(FRAME.pack(can_id, len(data), data), wait)
 
@@ -75,16 +80,34 @@ class RawBus:
         return answer and answer[1]
 
     def write(
-        self, node: int, index: int, sub: int, value: int, size: int, seconds: float = 2
+        self,
+        node: int,
+        index: int,
+        sub: int,
+        value: int,
+        size: int,
+        seconds: float = 2,
     ) -> int | None:
         """Write a number by SDO download. Return 0, the abort code, or None without an answer."""
-        request = struct.pack("<BHBI", 0x23 | (4 - size) << 2, index, sub, value)
+        request = struct.pack(
+            "<BHBI",
+            0x23 | (4 - size) << 2,
+            index,
+            sub,
+            value,
+        )
         answer = self._ask(node, request, seconds)
         if answer is None:
             return None
         return 0 if answer[0] == 0x60 else int.from_bytes(answer[4:8], "little")
 
-    def read(self, node: int, index: int, sub: int, seconds: float = 2) -> int | None:
+    def read(
+        self,
+        node: int,
+        index: int,
+        sub: int,
+        seconds: float = 2,
+    ) -> int | None:
         """Read a number of at most four bytes by SDO upload. Return None without answer or on abort."""
         answer = self._ask(node, struct.pack("<BHB4x", 0x40, index, sub), seconds)
         if answer is None or answer[0] >> 5 != 2:
@@ -94,7 +117,14 @@ class RawBus:
 
     def store(self, node: int, seconds: float = 8) -> int | None:
         """Write "save" to 1010h:1. Return the same as ``write``."""
-        return self.write(node, 0x1010, 1, int.from_bytes(b"save", "little"), 4, seconds)
+        return self.write(
+            node,
+            0x1010,
+            1,
+            int.from_bytes(b"save", "little"),
+            4,
+            seconds,
+        )
 
     def close(self) -> None:
         self._socket.close()

@@ -158,7 +158,13 @@ def slow_stream(generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
     return bytes(generator.choices((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0), k=12)), False
 
 
-def mangled(bench: Bench, injection: Injection, n: int, how: Mangle, readable: bool) -> None:
+def mangled(
+    bench: Bench,
+    injection: Injection,
+    n: int,
+    how: Mangle,
+    readable: bool,
+) -> None:
     """Change the bytes of the first ESC for a while.
 
     If they are ``readable``, no value may be disturbed. Otherwise the link is lost, and the log

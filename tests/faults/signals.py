@@ -71,9 +71,9 @@ def _message(message: Any, count: int) -> Message:
     places: list[Place] = []
     flags: list[Place] = []
     for signal in sorted(message.signals, key=lambda s: int(s.start)):
-        assert (
-            signal.byte_order == "little_endian" and not signal.offset and not signal.is_multiplexer
-        )
+        assert signal.byte_order == "little_endian"
+        assert not signal.offset
+        assert not signal.is_multiplexer
         choices = {str(text): raw for raw, text in (signal.choices or {}).items()}
         place = Place(
             name=_snake(signal.name.removeprefix(prefix)),
@@ -102,7 +102,14 @@ def _message(message: Any, count: int) -> Message:
     error_bits = (0, 0)
     if flags and kind != "other":
         error_bits = (flags[0].start, (1 << len(flags)) - 1)
-    return Message(message.frame_id, stem, esc, kind, tuple(places), error_bits)
+    return Message(
+        message.frame_id,
+        stem,
+        esc,
+        kind,
+        tuple(places),
+        error_bits,
+    )
 
 
 def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:

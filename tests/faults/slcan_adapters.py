@@ -56,7 +56,12 @@ class Adapter:
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, text.encode() + b"\r")
 
-    def tell_state(self, state: str, receive: int = 0, transmit: int = 0) -> None:
+    def tell_state(
+        self,
+        state: str,
+        receive: int = 0,
+        transmit: int = 0,
+    ) -> None:
         """Report the state ``a`` (active), ``w`` (warning), ``p`` (passive) or ``b`` (bus-off).
 
         The error counters are part of the report.

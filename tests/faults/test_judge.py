@@ -27,7 +27,12 @@ def judge() -> Judge:
     return Judge(beds.table(("--esc", "2"), True, 2), escs)
 
 
-def frame(judge: Judge, can_id: int, n: int, esc: int = 0) -> bytes:
+def frame(
+    judge: Judge,
+    can_id: int,
+    n: int,
+    esc: int = 0,
+) -> bytes:
     """Return a frame as the gateway sends it, computed from the DBC alone."""
     values = judge.escs[esc].values(n)
     message = judge.table[can_id]
@@ -47,7 +52,8 @@ def test_right_and_fresh_values_are_accepted_and_recorded(judge: Judge) -> None:
             judge.take(can_id, frame(judge, can_id, n), START + n * PERIOD + MS)
     assert wrong(judge) == ""
     assert all(seen == SPEED | CURRENT for seen in judge.escs[0].seen)
-    assert (judge.values, judge.by_more) == (100, 0)
+    assert judge.values == 100
+    assert judge.by_more == 0
     assert judge.first_fresh(0, START + 10 * PERIOD + 2 * MS) == (START + 11 * PERIOD + MS, 11)
 
 
@@ -57,14 +63,17 @@ def test_values_marked_as_not_available_are_never_wrong(judge: Judge) -> None:
         for place in judge.table[SPEED_ID].places
     )
     judge.take(SPEED_ID, bits.to_bytes(8, "little"), START + 5 * SECOND)
-    assert (wrong(judge), judge.marked) == ("", 1)
+    assert wrong(judge) == ""
+    assert judge.marked == 1
 
 
 def test_values_delayed_by_a_slow_bus_are_right_and_counted(judge: Judge) -> None:
     judge.more_ns = SECOND
     judge.take(SPEED_ID, frame(judge, SPEED_ID, 10), START + 10 * PERIOD + 400 * MS)
     judge.take(SPEED_ID, frame(judge, SPEED_ID, 11), START + 11 * PERIOD + 300 * MS)
-    assert (wrong(judge), judge.values, judge.by_more) == ("", 2, 1)
+    assert wrong(judge) == ""
+    assert judge.values == 2
+    assert judge.by_more == 1
 
 
 @pytest.mark.parametrize(
@@ -77,7 +86,10 @@ def test_values_delayed_by_a_slow_bus_are_right_and_counted(judge: Judge) -> Non
     ],
 )
 def test_a_wrong_value_is_reported_with_its_reason(
-    judge: Judge, given: list[int | tuple[int, int]], late: int, why: str
+    judge: Judge,
+    given: list[int | tuple[int, int]],
+    late: int,
+    why: str,
 ) -> None:
     """A number is a frame of the first ESC, a negative one has values of the other ESC.
 
@@ -106,7 +118,8 @@ def test_a_data_age_that_is_too_low_is_wrong(judge: Judge) -> None:
     assert wrong(judge) == "Esc1Link: an age of 100 ms; the newest is 1000 ms old"
     judge.more_ns = SECOND
     judge.take(LINK_ID, (100 << place.start).to_bytes(8, "little"), late)
-    assert (judge.wrong_count, judge.by_more) == (1, 1)
+    assert judge.wrong_count == 1
+    assert judge.by_more == 1
 
 
 def test_every_value_message_of_the_shipped_layouts_is_judged(judge: Judge) -> None:

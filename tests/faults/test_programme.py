@@ -16,7 +16,12 @@ from programme import PROJECT, conclude
 from qemu_adapter import SerialAdapter
 
 
-def row(name: str = "x", injected: int = 3, recovered: int = 3, **counts: Any) -> Row:
+def row(
+    name: str = "x",
+    injected: int = 3,
+    recovered: int = 3,
+    **counts: Any,
+) -> Row:
     return Row(name, 2.0, injected=injected, recovered=recovered, **counts)
 
 
@@ -32,13 +37,15 @@ def row(name: str = "x", injected: int = 3, recovered: int = 3, **counts: Any) -
     ],
 )
 def test_a_fault_is_good_if_it_always_healed_without_wrong_or_lost_values(
-    counts: dict[str, Any], state: str
+    counts: dict[str, Any],
+    state: str,
 ) -> None:
     assert row(**counts).state == state
 
 
 def test_both_reports_contain_the_states(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     report = Report(good=row("good"))
     assert conclude(report) == 0
@@ -114,7 +121,14 @@ def test_the_page_shows_each_fault_healed_without_wrong_or_lost_values() -> None
 def test_new_rows_replace_older_ones_whatever_their_state() -> None:
     before = PAGE.read_text()
     fault = str(in_order()[3])
-    run = Row(fault, 2.0, injected=3, recovered=3, worst_s=0.1, wrong=1)
+    run = Row(
+        fault,
+        2.0,
+        injected=3,
+        recovered=3,
+        worst_s=0.1,
+        wrong=1,
+    )
     after = put(before, Report({fault: run}))
     line = f"| {fault} | 3 | 3 | 0.10 s (limit 2 s) | 1 | 0 | failed |"
     assert shown(after) == shown(before) | {fault: line}

@@ -110,7 +110,8 @@ def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
     (conflict,) = gateway.conflicts.take()
-    assert (conflict.whose, conflict.node) == ("voltage", 1)
+    assert conflict.whose == "voltage"
+    assert conflict.node == 1
 
 
 @pytest.mark.parametrize(
@@ -122,7 +123,9 @@ def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
     ],
 )
 def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused(
-    tmp_path: Path, number: int, said: str
+    tmp_path: Path,
+    number: int,
+    said: str,
 ) -> None:
     text = f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Logger\nBO_ {number} Volts: 8 Gw\n'
     text += ' SG_ esc2BatteryVoltage : 0|16@1+ (0.01,0) [0|0] "V" Logger\n'

@@ -71,13 +71,27 @@ class Bench:
         return [frame.data for frame in self.gateway.take_frames(self.now)]
 
 
-BEC_CURRENT = Sig("BecCurrent", 0, 16, factor="0.01", maximum="655", unit="A")
+BEC_CURRENT = Sig(
+    "BecCurrent",
+    0,
+    16,
+    factor="0.01",
+    maximum="655",
+    unit="A",
+)
 NO_BEC_CURRENT = 0xFFFF
 
 
-@pytest.mark.parametrize(("device", "then"), [(Device.JIVEPRO, NO_BEC_CURRENT), (Device.KOSMIK, 5)])
+@pytest.mark.parametrize(
+    ("device", "then"),
+    [
+        (Device.JIVEPRO, NO_BEC_CURRENT),
+        (Device.KOSMIK, 5),
+    ],
+)
 def test_a_jivepros_bec_current_stays_unavailable_without_information(
-    device: Device, then: int
+    device: Device,
+    then: int,
 ) -> None:
     bench = Bench(BEC_CURRENT)
     bench.info(device)
@@ -97,7 +111,8 @@ def test_messages_without_a_cycle_are_sent_again_after_a_bus_outage() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "per_second"), [(EVENT, "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)]
+    ("kind", "name", "per_second"),
+    [(EVENT, "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)],
 )
 def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_second: int) -> None:
     bench = Bench(Sig(name, 0, 32, unit="s" if name == "Uptime" else ""), kind)
@@ -109,7 +124,13 @@ def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_seco
     assert 3 * per_second <= int.from_bytes(sent[-1][:4], "little") <= 5 * per_second
 
 
-@pytest.mark.parametrize(("more", "link"), [(0, LinkState.OK), (1, LinkState.DEGRADED)])
+@pytest.mark.parametrize(
+    ("more", "link"),
+    [
+        (0, LinkState.OK),
+        (1, LinkState.DEGRADED),
+    ],
+)
 def test_a_link_is_degraded_above_a_tenth_of_dropped_bytes(more: int, link: LinkState) -> None:
     """18 frames and noise of two frames' length arrive in a second, and ``more`` bytes."""
     bench = Bench(SPEED)

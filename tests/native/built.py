@@ -46,6 +46,12 @@ def run_sanitized(folder: Path, *command: str) -> str:
         "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
     }
     words = [sys.executable, *command, str(target)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
     return done.stdout

@@ -68,7 +68,11 @@ def settings(chance: random.Random, number: int) -> EscSettings:
     )
 
 
-def dbc(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) -> tuple[str, DbcConfig]:
+def dbc(
+    chance: random.Random,
+    escs: Sequence[EscSettings],
+    most: int = 8,
+) -> tuple[str, DbcConfig]:
     """Return a random DBC with up to ``most`` messages, and its bindings.
 
     The gateway does not accept all of them.
@@ -92,7 +96,11 @@ def dbc(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) -> tu
     return dbc_text(messages, "\n".join(attributes)), config
 
 
-def layout(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) -> Layout:
+def layout(
+    chance: random.Random,
+    escs: Sequence[EscSettings],
+    most: int = 8,
+) -> Layout:
     """Return a random layout that the gateway accepts."""
     while True:
         try:
@@ -296,7 +304,17 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
     )
     seed = chance.randrange(1 << 16)
     paced = chance.random() < 0.7
-    found = SlotPlan(plan, compile_pack(plan), Event.LIVE, 0, None, False, "", seed, paced)
+    found = SlotPlan(
+        plan,
+        compile_pack(plan),
+        Event.LIVE,
+        0,
+        None,
+        False,
+        "",
+        seed,
+        paced,
+    )
     try:
         _rows(found, EscSettings().protocol)
     except NotInCore:
@@ -430,7 +448,13 @@ class Both:
         cuts = sorted(chance.choices(range(len(data) + 1), k=count))
         for begin, end in zip([0, *cuts], [*cuts, len(data)], strict=True):
             since = self.now - chance.choice((0, 0, 0, MS, 10 * MS, 200 * MS, 2 * SECOND))
-            self.call("receive", esc, data[begin:end], self.now, since)
+            self.call(
+                "receive",
+                esc,
+                data[begin:end],
+                self.now,
+                since,
+            )
             if chance.random() < 0.3:
                 self.now += chance.randrange(3 * MS)
 
@@ -439,7 +463,12 @@ def some_escs(chance: random.Random) -> list[EscSettings]:
     return [settings(chance, n) for n in range(chance.randint(1, 3))]
 
 
-def run(library: Any, seed: int, steps: int = 300, most: int = 8) -> int:
+def run(
+    library: Any,
+    seed: int,
+    steps: int = 300,
+    most: int = 8,
+) -> int:
     """Return the number of compared frames, or 0 for a layout that the C core cannot express."""
     chance = random.Random(seed)
     escs = some_escs(chance)

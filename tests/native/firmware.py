@@ -62,7 +62,13 @@ class Case:
         Raise AssertionError with its error output if it failed.
         """
         nothing = subprocess.DEVNULL
-        run = partial(subprocess.run, stdin=nothing, capture_output=True, text=True, timeout=300)
+        run = partial(
+            subprocess.run,
+            stdin=nothing,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
         done = run(command, cwd=self.folder, check=False)
         assert done.returncode == 0, done.stderr[:3000]
         return done.stdout
@@ -70,7 +76,15 @@ class Case:
     def build(self, compiler: str, *options: str) -> Path:
         """Compile the example in the folder. Return its path."""
         target = self.folder / f"example-{Path(compiler).name}"
-        self.output(compiler, "-std=c99", *STRICT, *options, "-o", str(target), *SOURCES)
+        self.output(
+            compiler,
+            "-std=c99",
+            *STRICT,
+            *options,
+            "-o",
+            str(target),
+            *SOURCES,
+        )
         return target
 
     def run(self, *command: str) -> str:

@@ -42,7 +42,8 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Case, str]]:
 
 @pytest.mark.parametrize("compiler", MACHINES)
 def test_the_exported_core_sends_the_same_frames_on_other_machines(
-    cases: list[tuple[Case, str]], compiler: str
+    cases: list[tuple[Case, str]],
+    compiler: str,
 ) -> None:
     for case, text in cases:
         program = case.build(compiler, "-O2", "-static")
@@ -55,7 +56,14 @@ def test_the_exported_core_sends_the_same_frames_on_a_cortex_m4(
     for case, text in cases:
         inputs = "-DINPUTS=" + ",".join(f'"{name}"' for name in case.inputs)
         start = str(HERE / "cortex_m4.c")
-        program = case.build("arm-none-eabi-gcc", *CORTEX_M4, *BARE, "-Wno-pedantic", inputs, start)
+        program = case.build(
+            "arm-none-eabi-gcc",
+            *CORTEX_M4,
+            *BARE,
+            "-Wno-pedantic",
+            inputs,
+            start,
+        )
         assert case.output(*QEMU, str(program)) == text
 
 
@@ -84,13 +92,23 @@ def deepest(graph: str) -> int:
     [(("-DKCG_LEGACY=0",), 576), (("-DKCG_DATA=64", "-DKCG_PAGED=1", "-DKCG_E2E=1"), 704)],
 )
 def test_the_core_needs_little_stack_of_a_cortex_m4(
-    tmp_path: Path, options: tuple[str, ...], limit: int
+    tmp_path: Path,
+    options: tuple[str, ...],
+    limit: int,
 ) -> None:
     """The limit is for the core alone. The compiler's division and memcpy need < 64 bytes more."""
     bus = layout_of_dbc(FIVE)
     case = Case(tmp_path, 1, bus.layout, bus.escs)
     flags = (*CORTEX_M4, "-fstack-usage", "-fcallgraph-info=su", *options)
-    case.output("arm-none-eabi-gcc", "-std=c99", *STRICT, *flags, "-c", "core.c", "example_main.c")
+    case.output(
+        "arm-none-eabi-gcc",
+        "-std=c99",
+        *STRICT,
+        *flags,
+        "-c",
+        "core.c",
+        "example_main.c",
+    )
     core = deepest((tmp_path / "core.ci").read_text())
     example = deepest((tmp_path / "example_main.ci").read_text())
     machine = f"Cortex-M4 {' '.join(options)}"
@@ -111,7 +129,11 @@ MEMORY = {"memcpy", "memset", "memmove", "memchr", "memcmp"}
     ],
 )
 def test_the_core_needs_little_flash_and_ram_of_a_cortex_m4(
-    tmp_path: Path, dbc: Path, options: tuple[str, ...], flash: int, ram: int | None
+    tmp_path: Path,
+    dbc: Path,
+    options: tuple[str, ...],
+    flash: int,
+    ram: int | None,
 ) -> None:
     """The limits are for one ESC.
 
@@ -119,7 +141,15 @@ def test_the_core_needs_little_flash_and_ram_of_a_cortex_m4(
     """
     bus = layout_of_dbc(dbc)
     case = Case(tmp_path, 1, bus.layout, bus.escs)
-    case.output("arm-none-eabi-gcc", "-std=c99", *STRICT, *CORTEX_M4, *options, "-c", *SOURCES)
+    case.output(
+        "arm-none-eabi-gcc",
+        "-std=c99",
+        *STRICT,
+        *CORTEX_M4,
+        *options,
+        "-c",
+        *SOURCES,
+    )
     names = [source.replace(".c", ".o") for source in SOURCES]
     lines = case.output("arm-none-eabi-size", *names).splitlines()[1:]
     core, tables, example = (tuple(map(int, line.split()[:3])) for line in lines)

@@ -31,7 +31,8 @@ SEEDS = 16
 
 @pytest.mark.parametrize("group", range(4))
 def test_both_cores_give_equal_frames_events_counters_and_deadlines(
-    native_library: Any, group: int
+    native_library: Any,
+    group: int,
 ) -> None:
     counts = [equality.run(native_library, seed) for seed in range(group, SEEDS, 4)]
     assert sum(counts) > 500, "the layouts are hardly sent"
@@ -107,7 +108,9 @@ def test_a_factor_of_many_digits_gives_the_same_frames_in_c(native_library: Any,
 @pytest.mark.parametrize("offset", ["0", "1e9"])
 @pytest.mark.parametrize("factor", ["1e-300", "-5e-324", "1e30", "0.00000012345678"])
 def test_a_factor_that_does_not_fit_is_refused_with_one_that_fits(
-    factor: str, offset: str, kind: str
+    factor: str,
+    offset: str,
+    kind: str,
 ) -> None:
     signal = f'SG_ S : 0|32@1- ({{}},{offset}) [0|0] "" X'
     text = f'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n {signal}\n{kind}\n'
@@ -153,7 +156,13 @@ def _sort_calls(library: Any, messages: int) -> int:
     by_time = replace(plan, send_type=SendType.CYCLIC, cycle_ns=10 * MS, delay_ns=0)
     plans = [replace(by_event, can_id=n) for n in range(messages)]
     plans += [replace(by_time, can_id=messages + n) for n in range(messages)]
-    core = NativeCore(library, [EscSettings("esc1")], Layout("", "", tuple(plans)), 0, False)
+    core = NativeCore(
+        library,
+        [EscSettings("esc1")],
+        Layout("", "", tuple(plans)),
+        0,
+        False,
+    )
     core.receive(0, encode(LiveData(electrical_speed=1), WireLayout.V4), 10 * MS, 10 * MS)
     core.advance(10 * MS)
     calls = c.c_ulong.in_dll(library, "kcg_calls")

@@ -42,7 +42,8 @@ def test_all_macros_compile_without_a_warning(tmp_path: Path, program: str, opti
 
 
 def test_the_command_exports_the_messages_of_a_configuration(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     config = tmp_path / "gateway.toml"
     folder = tmp_path / "firmware"
@@ -60,7 +61,8 @@ def test_the_command_exports_the_messages_of_a_configuration(
     settings = r"\.poles = 7,.*\n.*\.gear_numerator = 5, \.gear_denominator = 2"
     assert re.search(settings, (folder / "tables.c").read_text())
     page = (folder / "README.md").read_text()
-    assert "left, rear" in page and "Permission is hereby granted" in page
+    assert "left, rear" in page
+    assert "Permission is hereby granted" in page
 
     own = folder / "example_main.c"
     own.write_text("int main(void) { return 0; }\n")
@@ -72,7 +74,8 @@ def test_the_command_exports_the_messages_of_a_configuration(
 
 
 def test_existing_files_are_only_replaced_with_force(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "README.md").write_text("# My firmware\n")
     assert main(["export", "c", str(tmp_path)]) == 2
@@ -83,7 +86,8 @@ def test_existing_files_are_only_replaced_with_force(
 
 
 def test_a_signal_that_the_core_cannot_express_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     dbc = tmp_path / "big.dbc"
     dbc.write_text(
@@ -132,7 +136,16 @@ def test_an_export_links_with_a_cpp_program(shipped_case: Case) -> None:
     case = shipped_case
     (case.folder / "main.cpp").write_text(_FROM_CPP)
     case.output(there("gcc"), "-std=c99", "-c", "core.c", "tables.c")
-    case.output(there("g++"), "-Wall", "-Werror", "-o", "cpp", "main.cpp", "core.o", "tables.o")
+    case.output(
+        there("g++"),
+        "-Wall",
+        "-Werror",
+        "-o",
+        "cpp",
+        "main.cpp",
+        "core.o",
+        "tables.o",
+    )
     assert case.output("./cpp") == ""
 
 
@@ -143,15 +156,35 @@ def test_files_that_differ_in_a_structure_do_not_link(shipped_case: Case, option
     gcc = there("gcc")
     case.output(gcc, "-std=c99", option, "-c", "core.c")
     words = [gcc, "-std=c99", "-o", "differs", "core.o", "tables.c", "example_main.c"]
-    done = subprocess.run(words, cwd=case.folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words,
+        cwd=case.folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode != 0
     for name in ("kcg_init", "kcg_take"):
         expected = rf"undefined reference to .{name}_with_KCG_DATA_8_KCG_FOUND_2"
         assert re.search(expected, done.stderr)
-    case.output(*words[:2], option, "-o", "same", "core.o", "tables.c", "example_main.c")
+    case.output(
+        *words[:2],
+        option,
+        "-o",
+        "same",
+        "core.o",
+        "tables.c",
+        "example_main.c",
+    )
 
 
-@pytest.mark.parametrize(("option", "count"), [("-DKCG_SLOTS=0", 0), ("-DKCG_SLOTS=1", 8)])
+@pytest.mark.parametrize(
+    ("option", "count"),
+    [
+        ("-DKCG_SLOTS=0", 0),
+        ("-DKCG_SLOTS=1", 8),
+    ],
+)
 def test_every_declared_function_is_defined(shipped_case: Case, option: str, count: int) -> None:
     """core.c defines every function that core.h declares. Slots need KCG_SLOTS."""
     case = shipped_case
@@ -214,7 +247,16 @@ def test_the_example_survives_a_failed_uart_and_bus_off(shipped_case: Case) -> N
     live = encode(LiveData(battery_voltage=2400), WireLayout.V4)
     text = _FAULTS.replace("LIVE", ", ".join(map(str, live)))
     (case.folder / "faults.c").write_text(text)
-    case.output(there("gcc"), "-std=c99", *STRICT, "-o", "faults", "core.c", "tables.c", "faults.c")
+    case.output(
+        there("gcc"),
+        "-std=c99",
+        *STRICT,
+        "-o",
+        "faults",
+        "core.c",
+        "tables.c",
+        "faults.c",
+    )
     blocks = {}
     states = {}
     frames = []

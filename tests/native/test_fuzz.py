@@ -43,7 +43,13 @@ def test_any_bytes_and_times_do_no_harm(tmp_path: Path, layout: int) -> None:
     subprocess.run([*command, "-o", str(program), *sources], check=True)
     limits = f"-max_total_time={max(1, SECONDS // len(FUZZED))}", f"-seed={SEED}", "-max_len=4096"
     words = [str(program), *limits, "-timeout=10", "-print_final_stats=1", str(corpus)]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-6000:]
     print(done.stderr[-600:])
 

@@ -44,7 +44,13 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     build = ["wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(wheels), str(sources)]
     command = [*pip, *build]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     (wheel,) = wheels.iterdir()
     venv.create(folder, symlinks=True)
@@ -69,7 +75,9 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
     ids=["with a compiler", "without one", "with one that fails"],
 )
 def test_an_installed_gateway_works_and_logs_which_core_runs_and_why(
-    sources: Path, compiles: str | None, why: str
+    sources: Path,
+    compiles: str | None,
+    why: str,
 ) -> None:
     programs = sources.parent / "programs"
     environment = dict(os.environ)

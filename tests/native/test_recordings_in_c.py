@@ -21,7 +21,9 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("group", range(4))
 def test_rows_frames_damage_and_text_equal_those_of_python(
-    native_library: Any, tmp_path: Path, group: int
+    native_library: Any,
+    tmp_path: Path,
+    group: int,
 ) -> None:
     counts = [offline_equality.run(native_library, seed, tmp_path) for seed in range(group, 12, 4)]
     assert sum(counts) > 200
@@ -30,14 +32,17 @@ def test_rows_frames_damage_and_text_equal_those_of_python(
 @pytest.mark.extended
 @pytest.mark.parametrize("group", range(10))
 def test_many_more_recordings_equal_those_of_python(
-    native_library: Any, tmp_path: Path, group: int
+    native_library: Any,
+    tmp_path: Path,
+    group: int,
 ) -> None:
     seeds = range(1_000 + group, 1_040, 10)
     assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 200
 
 
 def test_recordings_that_c_cannot_play_are_played_by_python(
-    native_library: Any, tmp_path: Path
+    native_library: Any,
+    tmp_path: Path,
 ) -> None:
     """These are captures of 0.5.0, and the frames of CANopen nodes. C plays the rows of nodes."""
     bench = Bench(*made(2, canopen=True)).live(3, 2)

@@ -55,7 +55,13 @@ needs_c = pytest.mark.skipif(
 def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
     text = HEAD.format(signal).replace("M: 8", f"M: {length}") + more
     database = parse_database(text.encode(), "t.dbc")
-    return prepare(database, "t.dbc", (EscSettings(),), DbcConfig(), fd_allowed=True)
+    return prepare(
+        database,
+        "t.dbc",
+        (EscSettings(),),
+        DbcConfig(),
+        fd_allowed=True,
+    )
 
 
 def why(layout: Layout = EMPTY, **settings: object) -> str:
@@ -66,9 +72,18 @@ def why(layout: Layout = EMPTY, **settings: object) -> str:
 
 
 @needs_c
-@pytest.mark.parametrize(("pure", "said"), [("", ""), ("0", ""), ("1", "KONTRONIK_PURE is set")])
+@pytest.mark.parametrize(
+    ("pure", "said"),
+    [
+        ("", ""),
+        ("0", ""),
+        ("1", "KONTRONIK_PURE is set"),
+    ],
+)
 def test_the_c_core_runs_unless_the_python_core_is_requested(
-    monkeypatch: pytest.MonkeyPatch, pure: str, said: str
+    monkeypatch: pytest.MonkeyPatch,
+    pure: str,
+    said: str,
 ) -> None:
     monkeypatch.setenv(load.PURE, pure)
     assert why() == said
@@ -108,7 +123,9 @@ def test_the_python_core_runs_if_the_c_core_cannot_be_loaded(
         not_built.write_text(f"{said}\n")
     found = why()
     assert load.in_words("Python", found) == f"core: Python ({found})"
-    assert found.startswith(said) and "\n" not in found and len(found) < 200
+    assert found.startswith(said)
+    assert "\n" not in found
+    assert len(found) < 200
 
 
 @pytest.mark.parametrize(
@@ -121,7 +138,10 @@ def test_the_python_core_runs_if_the_c_core_cannot_be_loaded(
     ],
 )
 def test_a_process_of_32_bits_loads_its_own_object(
-    monkeypatch: pytest.MonkeyPatch, machine: str, bits: int, its: str
+    monkeypatch: pytest.MonkeyPatch,
+    machine: str,
+    bits: int,
+    its: str,
 ) -> None:
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine=machine))
     monkeypatch.setattr(sys, "maxsize", (1 << bits - 1) - 1)
@@ -196,11 +216,13 @@ def test_an_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -
 )
 def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str, said: str) -> None:
     found = why(layout_of(signal, more, 64))
-    assert said in found and bool(said) == bool(found)
+    assert said in found
+    assert bool(said) == bool(found)
 
 
 def test_a_failing_compiler_is_reported_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     program = tmp_path / "cc"
     target = tmp_path / "core.so"

@@ -90,7 +90,13 @@ class FakeNativePoller(NativePoller):
         self._kernel = _Kernel(*(kind(call) for kind, call in pairs))
         library().fake_use(c.byref(self._kernel))
 
-    def register(self, fd: int, handler: Handler, events: int = 1, esc: int | None = None) -> None:
+    def register(
+        self,
+        fd: int,
+        handler: Handler,
+        events: int = 1,
+        esc: int | None = None,
+    ) -> None:
         self._world.register(fd, handler, events)
         if fd >= 1000:  # smaller numbers are real descriptors
             self._watched[fd] = (handler, events, esc)
@@ -102,11 +108,26 @@ class FakeNativePoller(NativePoller):
         self.changes += 1
 
     def turn(
-        self, can: CanLink, last: int, due: int, leave: int, period: int
+        self,
+        can: CanLink,
+        last: int,
+        due: int,
+        leave: int,
+        period: int,
     ) -> list[tuple[Handler, int]] | None:
-        return super().turn(can, last, min(due, self._world.until), leave, period)
+        return super().turn(
+            can,
+            last,
+            min(due, self._world.until),
+            leave,
+            period,
+        )
 
-    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+    def wait(
+        self,
+        last: int,
+        due: int,
+    ) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
         self.before = self._world.before
         self.now = self._world.looked

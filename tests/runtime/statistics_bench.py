@@ -59,10 +59,19 @@ class Bench:
                         self.sent[number].append(frame.data)
             self.gateway.advance(self.now)
 
-    def newest(self, esc: int, kind: type[LiveData] | type[InfoData]) -> Any:
+    def newest(
+        self,
+        esc: int,
+        kind: type[LiveData] | type[InfoData],
+    ) -> Any:
         return next(data for data in reversed(self.sent[esc]) if isinstance(data, kind))
 
-    def document(self, *, at: int | None = None, **facts: Any) -> dict[str, Any]:
+    def document(
+        self,
+        *,
+        at: int | None = None,
+        **facts: Any,
+    ) -> dict[str, Any]:
         """Return the document as a reader of the file gets it.
 
         ``at`` is the time of the document, by default now. ``facts`` replace fields of the Moment.
@@ -88,7 +97,11 @@ def moment_of(gateway: Gateway, now: int) -> Moment:
     )
 
 
-def with_nodes(document: Mapping[str, Any], count: int = 2, sent: int = 0) -> dict[str, Any]:
+def with_nodes(
+    document: Mapping[str, Any],
+    count: int = 2,
+    sent: int = 0,
+) -> dict[str, Any]:
     """Return the document of a gateway with CANopen nodes."""
     nodes = []
     for number in range(count):

@@ -38,7 +38,15 @@ def locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(folders, "RUN", tmp_path / "run")
 
 
-ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))
+ACTIVE = LinkFacts(
+    True,
+    True,
+    "can",
+    CanState.ERROR_ACTIVE,
+    500_000,
+    100,
+    (0, 0),
+)
 OFF = ACTIVE._replace(state=CanState.BUS_OFF)
 BOOT_UP = (0x701, b"\0")
 
@@ -83,7 +91,12 @@ class Kernel:
 
 
 class Bench:
-    def __init__(self, kernel: Kernel, self_start: bool = True, has_node: bool = True) -> None:
+    def __init__(
+        self,
+        kernel: Kernel,
+        self_start: bool = True,
+        has_node: bool = True,
+    ) -> None:
         canopen = {"enabled": has_node, "self_start": self_start, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
@@ -182,7 +195,9 @@ def boot_ups_and_emergencies(frames: list[tuple[int, bytes]]) -> list[str]:
 
 @pytest.mark.parametrize("late_ms", [0, 1, 40, 300])
 def test_a_node_boots_and_sends_8140h_when_the_queue_runs_after_a_restart(
-    bench: Bench, kernel: Kernel, late_ms: int
+    bench: Bench,
+    kernel: Kernel,
+    late_ms: int,
 ) -> None:
     """The kernel first sends the error frame "restarted", then starts the queue.
 
@@ -222,7 +237,9 @@ def test_a_driver_that_reports_bus_off_late_causes_one_boot_up(
 
 
 def test_a_controller_without_restart_is_reported_once_with_the_remedy(
-    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture
+    bench: Bench,
+    kernel: Kernel,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     kernel.facts = ACTIVE._replace(restart_ms=0)
     bench.start()
@@ -261,7 +278,10 @@ def test_own_frames_returned_after_an_outage_are_no_conflict(bench: Bench) -> No
 
 
 def test_an_outage_is_logged_with_the_remedy_and_when_it_ends(
-    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
+    kernel: Kernel,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     bench.begin()
@@ -274,7 +294,8 @@ def test_an_outage_is_logged_with_the_remedy_and_when_it_ends(
     with monkeypatch.context() as patch:
         patch.setattr(can_opener, "open_can", is_down)
         bench.turn(5000)
-    assert (bench.can.is_open, bench.gateway.status.can_state) == (False, CanState.DOWN)
+    assert not bench.can.is_open
+    assert bench.gateway.status.can_state == CanState.DOWN
     bench.changes(ACTIVE)
     bench.turn(100)
     down, back = caplog.messages
@@ -283,13 +304,17 @@ def test_an_outage_is_logged_with_the_remedy_and_when_it_ends(
 
 
 def test_a_bus_that_was_stalled_gets_no_backlog(
-    bench: Bench, caplog: pytest.LogCaptureFixture
+    bench: Bench,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     bench.kernel.facts = ACTIVE
     bench.start()
     bench.gateway.receive_bytes(
-        0, encode(LiveData(battery_voltage=2400), Layout.V4), bench.now, bench.now
+        0,
+        encode(LiveData(battery_voltage=2400), Layout.V4),
+        bench.now,
+        bench.now,
     )
     bench.turn(100)
     bench.take()
@@ -310,7 +335,8 @@ def test_a_bus_that_was_stalled_gets_no_backlog(
 
 
 def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The adapter does not report which of the two it is, but still takes a frame now and then."""
     monkeypatch.setattr(Port, "is_socket", False)
@@ -350,7 +376,8 @@ def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
 def test_changed_receive_ids_are_set_on_the_open_port(bench: Bench) -> None:
     bench.start()
     bench.turn(10)
-    assert 0x601 in bench.port._ids and 0x705 not in bench.port._ids
+    assert 0x601 in bench.port._ids
+    assert 0x705 not in bench.port._ids
     watch_node_5 = bytes.fromhex("23 16 10 01 2c 01 05 00")
     bench.gateway.receive_frame(CanFrame(0x601, watch_node_5), bench.now, bench.now)
     bench.turn(1)
@@ -365,7 +392,8 @@ def test_an_adapter_that_fails_while_it_is_read_is_opened_again(bench: Bench) ->
     bench.can.serve(bench.now)
     assert not bench.can.is_open
     bench.turn(600)
-    assert bench.port is not before and bench.port._ids == before._ids
+    assert bench.port is not before
+    assert bench.port._ids == before._ids
     assert boot_ups_and_emergencies(bench.take()) == ["boot-up"]
 
 
@@ -400,7 +428,9 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
     ],
 )
 def test_no_frame_is_sent_in_bus_off(
-    kernel: Kernel, facts: LinkFacts | None, is_drone: bool
+    kernel: Kernel,
+    facts: LinkFacts | None,
+    is_drone: bool,
 ) -> None:
     made = drone(kernel) if is_drone else Bench(kernel)
     before = None
@@ -428,7 +458,9 @@ def test_no_frame_is_sent_in_bus_off(
 
 @pytest.mark.parametrize("told_by", ["state of no controller", "nothing", "no rtnetlink"])
 def test_a_forged_bus_off_on_a_virtual_bus_ends_after_a_second(
-    kernel: Kernel, monkeypatch: pytest.MonkeyPatch, told_by: str
+    kernel: Kernel,
+    monkeypatch: pytest.MonkeyPatch,
+    told_by: str,
 ) -> None:
     if told_by == "no rtnetlink":  # as with the buses of python-can
         monkeypatch.setattr(can_controller, "link_monitor", lambda _name: None)
@@ -466,7 +498,9 @@ def test_a_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: K
 
 @pytest.mark.parametrize("wait", [False, True])
 def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
-    bench: Bench, wait: bool, monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
+    wait: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It is opened neither at the start nor later, when an adapter is back under another name."""
     opened: list[object] = []
@@ -500,7 +534,8 @@ def test_a_node_boots_when_an_adapter_unplugged_in_bus_off_is_back(
 
 
 def test_frames_discarded_in_an_outage_are_reported_to_the_recorder(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Otherwise a replay would contain them."""
     bench.begin()

@@ -97,13 +97,26 @@ def uart() -> Iterator[tuple[int, str]]:
 class Running:
     """A loop with one port. The test runs each turn."""
 
-    def __init__(self, uart: tuple[int, str], interface: str, channel: str, wait: bool) -> None:
+    def __init__(
+        self,
+        uart: tuple[int, str],
+        interface: str,
+        channel: str,
+        wait: bool,
+    ) -> None:
         self.esc, path = uart
         self.status = Status()
         gateway = Gateway(ESCS, layout_of(ESCS), 0)
         config = CanConfig(interface=interface, channel=channel)
         poller = poller_for(gateway)
-        self.loop = Loop(gateway, [path], config, wait, poller=poller, notifier=self.status)
+        self.loop = Loop(
+            gateway,
+            [path],
+            config,
+            wait,
+            poller=poller,
+            notifier=self.status,
+        )
         self.loop.open()
         self.loop.begin()
         self.sent = 0
@@ -141,7 +154,9 @@ def wait_for_opener() -> None:
 
 @pytest.mark.parametrize("wait", [True, False])
 def test_ports_are_served_while_a_driver_opens_and_frames_follow(
-    wait: bool, uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    wait: bool,
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.may_close.set()
@@ -156,11 +171,13 @@ def test_ports_are_served_while_a_driver_opens_and_frames_follow(
     assert it.status.is_ready
     it.loop.end()
     wait_for_opener()
-    assert (driver.opened, driver.closed_by) == (1, ["can-opener"])
+    assert driver.opened == 1
+    assert driver.closed_by == ["can-opener"]
 
 
 def test_a_driver_that_takes_long_to_close_does_not_hold_up_the_end(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The thread is not joined. It ends with the process, or when the driver has returned."""
     driver = Driver(monkeypatch)
@@ -175,7 +192,8 @@ def test_a_driver_that_takes_long_to_close_does_not_hold_up_the_end(
 
 
 def test_a_driver_that_fails_at_start_ends_a_loop_that_may_not_wait(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.error = RunError("CAN slcan /dev/none: cannot be opened: there is none.")
@@ -195,7 +213,8 @@ def test_a_driver_that_fails_at_start_ends_a_loop_that_may_not_wait(
 
 
 def test_a_lost_driver_is_closed_beside_the_loop_and_opened_again(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.may_open.set()
@@ -210,12 +229,14 @@ def test_a_lost_driver_is_closed_beside_the_loop_and_opened_again(
     count = len(driver.bus.sent)
     driver.may_close.set()
     it.turn_until(lambda: len(driver.bus.sent) > count)
-    assert (driver.opened, driver.closed_by) == (2, ["can-opener"])
+    assert driver.opened == 2
+    assert driver.closed_by == ["can-opener"]
     it.loop.end()
 
 
 def test_a_port_that_opens_after_the_end_is_closed(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.may_close.set()
@@ -224,12 +245,15 @@ def test_a_port_that_opens_after_the_end_is_closed(
     it.loop.end()
     driver.may_open.set()
     wait_for_opener()
-    assert (driver.opened, driver.closed_by) == (1, ["can-opener"])
+    assert driver.opened == 1
+    assert driver.closed_by == ["can-opener"]
 
 
 @pytest.mark.parametrize("error", [None, RunError("CAN slcan /dev/none: there is none.")])
 def test_a_driver_that_does_not_return_from_opening_is_logged_until_it_does(
-    error: RunError | None, uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    error: RunError | None,
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(can_link, "SLOW_OPENING_NS", 1000 * SECOND)  # no test takes that long
     driver = Driver(monkeypatch)
@@ -297,7 +321,9 @@ class Clock:
 
 
 def test_slcan_sleeps_while_it_opens_and_no_byte_is_lost(
-    uart: tuple[int, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """python-can's driver sleeps after it has opened the port, here until the test wakes it."""
     may_wake = threading.Event()

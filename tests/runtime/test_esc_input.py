@@ -167,7 +167,8 @@ def test_an_esc_is_found_by_its_adapter(there: dict[str, Identity | None], bench
 
 
 def test_attempts_to_open_do_not_change_since_when_a_port_is_lost(
-    there: dict[str, Identity | None], bench: Bench
+    there: dict[str, Identity | None],
+    bench: Bench,
 ) -> None:
     esc = bench.escs[0]
     there.clear()
@@ -201,7 +202,8 @@ def test_line_errors_are_counted_by_kind_across_replugging(
 
 
 def test_a_diagnosis_is_logged_once_and_ends_with_telemetry(
-    bench: Bench, caplog: pytest.LogCaptureFixture
+    bench: Bench,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     esc = bench.escs[0]
@@ -220,7 +222,8 @@ def test_a_diagnosis_is_logged_once_and_ends_with_telemetry(
     esc.serve(21 * SECOND)
     esc.log.follow_link(21 * SECOND)
     assert caplog.messages[-1] == "left: telemetry ok (V4)"
-    assert (esc.log.complaint, esc.facts().diagnosis) == ("", None)
+    assert esc.log.complaint == ""
+    assert esc.facts().diagnosis is None
     for now in range(21 * SECOND, 23 * SECOND, 100 * MS):
         bench.gateway.advance(now)
         esc.report(now)
@@ -279,7 +282,8 @@ def test_a_mini_uart_causes_a_warning_when_it_is_opened(
 
 
 def test_a_loss_is_reported_with_its_errors(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     world = World()
@@ -395,7 +399,9 @@ def test_settings_are_checked_every_100_ms_while_the_esc_sends(
 
 @pytest.mark.parametrize("hangs_up", [False, True])
 def test_an_unreadable_port_is_lost_in_that_turn_and_others_are_read(
-    hangs_up: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    hangs_up: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Both ports are readable in that turn."""
     caplog.set_level(logging.INFO, "kontronik_can_gw")

@@ -80,7 +80,14 @@ def test_the_loop_leaves_no_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     setup, layout = EVERYTHING
     world = World(2)
     further = [each.make for each in setup.outputs]
-    loop = loop_in(world, monkeypatch, setup.escs, layout, setup.canopen, further=further)
+    loop = loop_in(
+        world,
+        monkeypatch,
+        setup.escs,
+        layout,
+        setup.canopen,
+        further=further,
+    )
     loop.open()
     loop.begin()
     for second in range(0, 8, 2):

@@ -81,7 +81,12 @@ LAYOUTS = {count: layout_of(TWO[:count]) for count in (1, 2)}
     st.booleans(),
 )
 def test_after_any_hold_up_values_end_in_time_and_ages_are_true(
-    seed: int, timeout_ms: int, period_ms: int, stops: float, neighbour: bool, bundled: bool
+    seed: int,
+    timeout_ms: int,
+    period_ms: int,
+    stops: float,
+    neighbour: bool,
+    bundled: bool,
 ) -> None:
     rng = random.Random(seed)
     world = World(1 + neighbour)
@@ -134,7 +139,8 @@ def test_after_any_hold_up_values_end_in_time_and_ages_are_true(
 
 @pytest.mark.parametrize("sends", [True, False])
 def test_the_loop_checks_its_ports_four_times_per_shortest_time_out(
-    monkeypatch: pytest.MonkeyPatch, sends: bool
+    monkeypatch: pytest.MonkeyPatch,
+    sends: bool,
 ) -> None:
     """A master may change the time-out. No message wakes the loop, and it checks no more often."""
     world = World(2)
@@ -159,7 +165,8 @@ def test_the_loop_checks_its_ports_four_times_per_shortest_time_out(
 
 @pytest.mark.parametrize("interrupted", ["no poll", "polls of ports that were read", "all polls"])
 def test_bytes_beyond_one_read_are_dated_by_their_position(
-    monkeypatch: pytest.MonkeyPatch, interrupted: str
+    monkeypatch: pytest.MonkeyPatch,
+    interrupted: str,
 ) -> None:
     """If a signal interrupts a poll in C, the poll does not show that a port is empty."""
     world = World()
@@ -217,7 +224,8 @@ def test_a_port_that_always_has_bytes_does_not_delay_other_ports(
 
 @pytest.mark.parametrize("is_reopened", [False, True])
 def test_a_frame_that_waits_in_a_newly_opened_port_is_never_sent(
-    monkeypatch: pytest.MonkeyPatch, is_reopened: bool
+    monkeypatch: pytest.MonkeyPatch,
+    is_reopened: bool,
 ) -> None:
     """The age of such a frame is unknown."""
     world = World()
@@ -307,7 +315,8 @@ def test_bytes_left_in_a_lost_port_do_not_age_the_bytes_after_reopening(
 
 
 def test_a_hold_up_is_logged_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Delays that are shorter than the shortest time-out are not logged."""
     world = World()
@@ -330,7 +339,8 @@ def test_a_hold_up_is_logged_in_one_line(
 
 @pytest.mark.parametrize("frames_before", [0, 64])
 def test_frames_that_become_old_while_being_sent_are_computed_again(
-    monkeypatch: pytest.MonkeyPatch, frames_before: int
+    monkeypatch: pytest.MonkeyPatch,
+    frames_before: int,
 ) -> None:
     """The process is held up after the read, or when the kernel has taken 64 of 100 frames."""
     world = World()
@@ -379,7 +389,8 @@ def test_frames_that_become_old_while_being_sent_are_computed_again(
 
 
 def test_a_bus_that_takes_only_some_frames_gets_the_others_later(
-    monkeypatch: pytest.MonkeyPatch, core_language: str
+    monkeypatch: pytest.MonkeyPatch,
+    core_language: str,
 ) -> None:
     """The kernel takes six of 25 frames at once. The others are sent before the next values."""
     world = World()
@@ -410,9 +421,18 @@ def test_a_bus_that_takes_only_some_frames_gets_the_others_later(
         assert cast("NativePoller", loop._poller).count > 500
 
 
-@pytest.mark.parametrize("blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}])
+@pytest.mark.parametrize(
+    "blind",
+    [
+        set(),
+        {1000},
+        {CAN_FD},
+        {1000, CAN_FD},
+    ],
+)
 def test_the_watchdog_is_fed_only_while_everything_is_served(
-    monkeypatch: pytest.MonkeyPatch, blind: set[int]
+    monkeypatch: pytest.MonkeyPatch,
+    blind: set[int],
 ) -> None:
     world = World()
     fed: list[int] = []
@@ -463,7 +483,8 @@ def test_bytes_received_while_the_interface_was_opened_are_old(
 
 
 def test_a_slow_bus_gets_the_newest_values_in_order(
-    monkeypatch: pytest.MonkeyPatch, core_language: str
+    monkeypatch: pytest.MonkeyPatch,
+    core_language: str,
 ) -> None:
     """The frames of four ESCs arrive together, and the kernel takes six frames in advance.
 
@@ -496,7 +517,8 @@ def test_a_slow_bus_gets_the_newest_values_in_order(
 
 @pytest.mark.parametrize("clock_error_s", [-3600, 3600])
 def test_a_frame_received_in_a_hold_up_has_its_true_age(
-    monkeypatch: pytest.MonkeyPatch, clock_error_s: int
+    monkeypatch: pytest.MonkeyPatch,
+    clock_error_s: int,
 ) -> None:
     """The wall clock may be set meanwhile. The frame arrived between two checks of the bus."""
     world = World()
@@ -610,7 +632,12 @@ def of(frames: list[tuple[int, bytes]], *ids: int) -> list[tuple[int, str]]:
     ],
 )
 def test_a_waiting_command_is_obeyed_and_answered_once(
-    bench: Bench, can_id: int, request_hex: str, answer_id: int, answer: str, state: NmtState
+    bench: Bench,
+    can_id: int,
+    request_hex: str,
+    answer_id: int,
+    answer: str,
+    state: NmtState,
 ) -> None:
     bus = bench.world.bus
     now = bench.world.now
@@ -667,7 +694,9 @@ def test_waiting_syncs_are_counted_and_not_answered(bench: Bench) -> None:
     ],
 )
 def test_heartbeats_are_judged_by_the_time_of_their_arrival(
-    bench: Bench, came_ms: Iterable[int], codes: list[str]
+    bench: Bench,
+    came_ms: Iterable[int],
+    codes: list[str],
 ) -> None:
     """The process is held up for the first second. More frames wait than one call reads."""
     bench.write(*WATCH)
@@ -753,7 +782,9 @@ def emergencies(bench: Bench) -> list[str]:
     [(100, [SYNC_LENGTH, LOST]), (380, [LOST, SYNC_LENGTH])],
 )
 def test_emergencies_of_a_hold_up_are_sent_in_order_of_time(
-    bench: Bench, came_ms: int, codes: list[str]
+    bench: Bench,
+    came_ms: int,
+    codes: list[str],
 ) -> None:
     """Telemetry ends when the hold-up begins, and is lost 250 ms later."""
     bench.world.bus.came(0x80, b"\x01", bench.world.now + came_ms * MS)

@@ -104,9 +104,11 @@ def test_a_service_notifies_ready_and_alive_records_and_notifies_its_end(
     assert found_totals is not None, last
     assert min(map(int, found_totals.groups())) > 20
     if "not permitted" in logged:
-        assert "Running without." in logged and policy == os.SCHED_OTHER
+        assert "Running without." in logged
+        assert policy == os.SCHED_OTHER
     else:
-        assert (policy, priority) == (os.SCHED_FIFO, 7)
+        assert policy == os.SCHED_FIFO
+        assert priority == 7
     assert {path.suffix for path in captures.iterdir()} == {".kcap"}
     converted = tmp_path / "converted.log"
     subprocess.run([*PROGRAM, "convert", "-q", str(captures), str(converted)], check=True)
@@ -227,7 +229,9 @@ def test_status_finds_gateways_run_by_hand_until_they_end(tmp_path: Path) -> Non
 
 
 def test_a_second_gateway_with_the_same_configuration_has_no_status(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     first = open_statistics(None, tmp_path / "gateway.toml")

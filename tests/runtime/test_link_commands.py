@@ -41,7 +41,11 @@ class Kernel:
     ],
 )
 def test_the_advice_of_run_and_monitor_fits_the_kind(
-    name: str, kind: str, number: int, said: str, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    kind: str,
+    number: int,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     facts = LinkFacts(exists=bool(kind), kind=kind)
     monkeypatch.setattr(link_commands, "link_monitor", lambda _name: Kernel(facts))

@@ -19,7 +19,10 @@ def attribute(kind: int, value: bytes) -> bytes:
 
 
 def link_message(
-    kind: int = 16, name: str = "can0", flags: int = 0x10041, can: bytes | None = b""
+    kind: int = 16,
+    name: str = "can0",
+    flags: int = 0x10041,
+    can: bytes | None = b"",
 ) -> bytes:
     info = b""
     if can is not None:
@@ -91,10 +94,22 @@ def heard(*datagrams: bytes | int) -> list[LinkFacts]:
     ],
 )
 def test_the_state_of_a_controller_is_read_from_its_report(
-    number: int, flags: int, state: CanState | None, runs: bool
+    number: int,
+    flags: int,
+    state: CanState | None,
+    runs: bool,
 ) -> None:
     """An interface in bus-off is up but does not run."""
-    expected = LinkFacts(True, True, "can", state, 125_000, 0, (130, 7), runs)
+    expected = LinkFacts(
+        True,
+        True,
+        "can",
+        state,
+        125_000,
+        0,
+        (130, 7),
+        runs,
+    )
     assert heard(link_message(can=can_data(number), flags=flags)) == [expected]
 
 
@@ -112,7 +127,10 @@ def test_the_kernel_is_asked_again_after_an_overrun() -> None:
 
 @given(st.integers(1, len(LINK)), st.integers(0, 255), st.integers(0, 200), st.binary(max_size=200))
 def test_damaged_messages_raise_no_exception(
-    end: int, value: int, place: int, rubbish: bytes
+    end: int,
+    value: int,
+    place: int,
+    rubbish: bytes,
 ) -> None:
     message = bytearray(LINK)
     message[min(place, len(message) - 1)] = value
@@ -129,5 +147,7 @@ def test_the_real_kernel_reports_an_interface_and_a_missing_one() -> None:
         found.append(monitor.take()[-1])
         monitor.close()
     is_up = bool(int(Path("/sys/class/net/lo/flags").read_text(), 16) & 1)  # IFF_UP
-    assert (found[0].exists, found[0].up, found[0].state) == (True, is_up, None)
+    assert found[0].exists
+    assert found[0].up == is_up
+    assert found[0].state is None
     assert found[1] == LinkFacts(False)

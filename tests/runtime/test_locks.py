@@ -53,7 +53,8 @@ def test_a_lock_is_exclusive_until_it_is_released(folder: Path) -> None:
 
 
 def test_a_lock_file_that_its_holder_removes_is_created_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The holder removes its file after we open it and before we lock it.
 
@@ -89,7 +90,13 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -
     try:
         for _ in range(2):
             made = [setup.make for setup in loaded.outputs]
-            gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen, further=made)
+            gateway = Gateway(
+                loaded.escs,
+                loaded.layout,
+                0,
+                canopen=loaded.canopen,
+                further=made,
+            )
             sides.append(CanLink(loaded.config.can, gateway, Poller(), FaultLog()))
         sides[0].open(0, wait=True)
         said = "CAN can0: (messages from 680h on|CANopen node 42|29-bit ids with 2Ah .*): another"
@@ -104,7 +111,10 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -
 
 @pytest.mark.parametrize("kind", ["folder", "link", "no locks there"])
 def test_a_lock_that_cannot_be_taken_is_reported_once_and_not_needed(
-    kind: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def no_locks(_fd: int, _kind: int) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
@@ -121,11 +131,15 @@ def test_a_lock_that_cannot_be_taken_is_reported_once_and_not_needed(
     mine = Locks(said.append)
     assert mine.hold(NODES[:1]) == mine.hold(NODES) == []
     mine.close()
-    assert len(said) == 1 and "Nothing keeps a second gateway" in said[0]
+    assert len(said) == 1
+    assert "Nothing keeps a second gateway" in said[0]
     assert not (tmp_path / "other").exists()
 
 
-@pytest.mark.parametrize("name", [NODES[0], "/dev/serial/by-id/usb-A%2F_1@115200", "/ä" * 150])
+@pytest.mark.parametrize(
+    "name",
+    [NODES[0], "/dev/serial/by-id/usb-A%2F_1@115200", "/ä" * 150],
+)
 def test_every_lock_has_a_distinct_and_valid_file_name(name: str) -> None:
     assert "/" not in file_name(name)
     assert len(os.fsencode(file_name(name))) < 250
@@ -174,7 +188,8 @@ def test_a_node_id_assigned_by_lss_is_locked(
 
 
 def test_a_node_id_assigned_by_lss_that_another_gateway_has_is_logged(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     link = waiting_gateway(monkeypatch)
     other = Locks()

@@ -40,7 +40,14 @@ class Everything:
         patch.setattr(wire_world, "Gateway", partial(RecordedGateway, self.recorder.put))
         further = [each.make for each in setup.outputs]
         canopen = setup.canopen
-        self.loop = loop_in(world, patch, setup.escs, layout, canopen, further=further)
+        self.loop = loop_in(
+            world,
+            patch,
+            setup.escs,
+            layout,
+            canopen,
+            further=further,
+        )
         self.loop._housekeeping._recorder = self.recorder
         self.loop.open()
         self.loop.begin()
@@ -86,7 +93,10 @@ def settled() -> Iterator[None]:
 
 @pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 def test_a_thousand_events_leave_no_allocation(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, settled: None, core_language: str
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    settled: None,
+    core_language: str,
 ) -> None:
     """Blocks are counted at the full collections of two minutes in succession."""
     del settled, core_language

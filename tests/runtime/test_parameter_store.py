@@ -55,7 +55,8 @@ def put(store: ParameterStore, name: str, data: bytes) -> str | None:
 
 
 def test_saved_parameters_are_loaded_by_the_next_store(
-    tmp_path: Path, store: ParameterStore
+    tmp_path: Path,
+    store: ParameterStore,
 ) -> None:
     assert store.load("a") == (Stored(), None)
     assert list(tmp_path.iterdir()) == [], "nothing is made by reading"
@@ -72,7 +73,8 @@ def test_saved_parameters_are_loaded_by_the_next_store(
 
 
 def test_files_and_a_new_folder_are_accessible_only_to_their_owner(
-    tmp_path: Path, store: ParameterStore
+    tmp_path: Path,
+    store: ParameterStore,
 ) -> None:
     before = os.umask(0)
     try:
@@ -84,7 +86,8 @@ def test_files_and_a_new_folder_are_accessible_only_to_their_owner(
 
 
 def test_saving_is_refused_if_no_thread_can_be_started(
-    store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+    store: ParameterStore,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def start(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
@@ -108,16 +111,22 @@ def place(tmp_path: Path, data: bytes) -> Path:
 OTHER_VERSION = OLD.replace(b'"version":1', b'"version":9')
 
 
-@pytest.mark.parametrize("data", [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OTHER_VERSION])
+@pytest.mark.parametrize(
+    "data",
+    [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OTHER_VERSION],
+)
 def test_a_damaged_file_is_reported_and_the_newest_one_is_kept(
-    tmp_path: Path, store: ParameterStore, data: bytes
+    tmp_path: Path,
+    store: ParameterStore,
+    data: bytes,
 ) -> None:
     folder = place(tmp_path, b"older rubbish")
     store.load("esc1")
     place(tmp_path, data)
     stored, reason = store.load("esc1")
     assert stored == Stored()
-    assert reason is not None and str(folder / "esc1.params") in reason
+    assert reason is not None
+    assert str(folder / "esc1.params") in reason
     assert [path.name for path in folder.iterdir()] == ["esc1.params.damaged"]
     assert store.load("esc1") == (Stored(), None)
     assert put(store, "esc1", NEW) is None
@@ -126,7 +135,9 @@ def test_a_damaged_file_is_reported_and_the_newest_one_is_kept(
 
 
 def test_an_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
-    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    store: ParameterStore,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A temporary error of the disk must not lose the settings."""
     folder = place(tmp_path, OLD)
@@ -138,7 +149,9 @@ def test_an_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
     with monkeypatch.context() as patched:
         patched.setattr(Path, "read_bytes", fail)
         stored, reason = store.load("esc1")
-    assert stored == Stored() and reason and reason.endswith("Input/output error")
+    assert stored == Stored()
+    assert reason
+    assert reason.endswith("Input/output error")
     assert store.load("esc1") == (decode(OLD), None)
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
 
@@ -183,7 +196,13 @@ class Recorder:
     def _unexpected(self, *arguments: Any) -> None:
         raise AssertionError(f"not a call that may change a parameter file: {arguments}")
 
-    def _open(self, path: Any, flags: int, *more: Any, **options: Any) -> int:
+    def _open(
+        self,
+        path: Any,
+        flags: int,
+        *more: Any,
+        **options: Any,
+    ) -> int:
         if Path(path).is_relative_to(self._folder):
             self._fail_at("create", self._name(path))
         fd: int = self._real["open"](path, flags, *more, **options)
@@ -283,7 +302,10 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
 
 
 def recorded(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, *contents: bytes, load: bool = False
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    *contents: bytes,
+    load: bool = False,
 ) -> list[Step]:
     """Return the steps of the store on disk for one load, or for several savings in succession.
 
@@ -326,7 +348,10 @@ def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
 @pytest.mark.parametrize("left_over", [False, True])
 @pytest.mark.parametrize("first", [False, True])
 def test_a_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_over: bool, first: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    left_over: bool,
+    first: bool,
 ) -> None:
     folder = tmp_path / "params"
     folder.mkdir()
@@ -335,7 +360,13 @@ def test_a_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
         files[TEMPORARY] = "half of so"
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    steps = recorded(monkeypatch, folder, NEW, numbered(3), numbered(4))
+    steps = recorded(
+        monkeypatch,
+        folder,
+        NEW,
+        numbered(3),
+        numbered(4),
+    )
     of_a_new_folder = recorded(monkeypatch, tmp_path / "new", NEW)
     assert of_a_new_folder[:2] == [("mkdir", "new"), ("fsync", ".")]
     assert sum(step[0] == "confirmed" for step in steps) == 3
@@ -343,7 +374,8 @@ def test_a_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
 
 
 def test_a_damaged_file_exists_at_every_instant(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = place(tmp_path, b"rubbish")
     (folder / "esc1.params.damaged").write_bytes(b"older")
@@ -366,7 +398,10 @@ OF_THE_FILE = [(step, TEMPORARY) for step in ("create", "write", "fsync", "close
 
 @pytest.mark.parametrize("failing", [*OF_THE_FILE, ("fsync", "params")])
 def test_a_failure_at_any_step_is_reported_and_leaves_a_complete_file(
-    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, failing: Step
+    tmp_path: Path,
+    store: ParameterStore,
+    monkeypatch: pytest.MonkeyPatch,
+    failing: Step,
 ) -> None:
     folder = place(tmp_path, OLD)
     with monkeypatch.context() as patched:

@@ -44,7 +44,8 @@ def ordinary_user(monkeypatch: pytest.MonkeyPatch) -> int:
 
 
 def test_root_and_the_services_user_share_the_systems_folder(
-    root: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shared = root / "run" / "kontronik-can-gw"
     monkeypatch.setattr(os, "geteuid", lambda: 0)
@@ -57,7 +58,9 @@ def test_root_and_the_services_user_share_the_systems_folder(
 
 
 def test_the_folder_of_a_session_is_preferred_to_the_one_in_tmp(
-    root: Path, ordinary_user: int, monkeypatch: pytest.MonkeyPatch
+    root: Path,
+    ordinary_user: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fallback = root / "tmp" / f"kontronik-can-gw-{ordinary_user}"
     assert folders.runtime_folder("status") == fallback / "status"
@@ -72,7 +75,8 @@ def test_the_folder_of_a_session_is_preferred_to_the_one_in_tmp(
 
 
 def test_without_a_session_the_folder_in_tmp_is_private_and_locks_hold(
-    root: Path, ordinary_user: int
+    root: Path,
+    ordinary_user: int,
 ) -> None:
     said: list[str] = []
     first = Locks(said.append)
@@ -88,7 +92,9 @@ def test_without_a_session_the_folder_in_tmp_is_private_and_locks_hold(
 
 @pytest.mark.parametrize("kind", ["writable by all", "link", "file"])
 def test_a_folder_in_tmp_that_another_user_controls_is_refused(
-    root: Path, ordinary_user: int, kind: str
+    root: Path,
+    ordinary_user: int,
+    kind: str,
 ) -> None:
     folder = root / "tmp" / f"kontronik-can-gw-{ordinary_user}"
     if kind == "writable by all":
@@ -105,4 +111,5 @@ def test_a_folder_in_tmp_that_another_user_controls_is_refused(
     assert not (root / "elsewhere" / "status").exists()
     said: list[str] = []
     assert Locks(said.append).hold(["x"]) == []
-    assert len(said) == 1 and "belongs to another user" in said[0]
+    assert len(said) == 1
+    assert "belongs to another user" in said[0]

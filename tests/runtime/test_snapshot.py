@@ -52,7 +52,8 @@ def test_every_field_of_the_newest_frames_is_shown_in_its_unit() -> None:
         live = bench.newest(number, LiveData)
         info = bench.newest(number, InfoData)
         assert esc["operating_state"] == OperatingState(live.operating_state).name
-        assert (esc["device"], esc["firmware"]) == ("KOSMIK", KONTRONIK.firmware_text(info))
+        assert esc["device"] == "KOSMIK"
+        assert esc["firmware"] == KONTRONIK.firmware_text(info)
         motor_speed = live.electrical_speed / 7
         output_speed = motor_speed / 9.8
         power = live.battery_voltage * live.battery_current / 1000
@@ -70,7 +71,8 @@ def test_values_older_than_the_time_out_are_null() -> None:
     assert heard is not None
     last = bench.document(at=heard + 250 * MS)["escs"][0]
     late = bench.document(at=heard + 250 * MS + 1)["escs"][0]
-    assert last["fresh"] and last["values"]["battery_voltage"] is not None
+    assert last["fresh"]
+    assert last["values"]["battery_voltage"] is not None
     assert not late["fresh"]
     assert late["values"]["battery_voltage"] is late["values"]["motor_speed"] is None
     assert late["operating_state"] is late["errors"] is late["warnings"] is late["statuses"] is None

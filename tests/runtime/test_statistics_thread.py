@@ -74,7 +74,8 @@ def statistics(file: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Statisti
 
 
 def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
-    file: Path, statistics: Statistics
+    file: Path,
+    statistics: Statistics,
 ) -> None:
     (file.parent / ".status.json.tmp").write_text('{"half')  # left by a process that was killed
     for number in (1, 3):
@@ -83,7 +84,8 @@ def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
     assert stat.S_IMODE(file.stat().st_mode) == 0o644
     assert os.listdir(file.parent) == ["status.json"]
     rates = json.loads(file.read_text(encoding="utf-8"))["rates"]
-    assert (rates["sent_frames_per_s"], rates["received_frames_per_s"]) == (1.0, 3.0)
+    assert rates["sent_frames_per_s"] == 1.0
+    assert rates["received_frames_per_s"] == 3.0
     with pytest.raises(RunError, match="another gateway writes it"):
         Statistics(file)
     for _ in range(2):
@@ -93,11 +95,14 @@ def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
     before = os.listdir("/proc/self/fd")
     threads = threading.active_count()
     Statistics(file).close()
-    assert (os.listdir("/proc/self/fd"), threading.active_count()) == (before, threads)
+    assert os.listdir("/proc/self/fd") == before
+    assert threading.active_count() == threads
 
 
 def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
-    file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
+    file: Path,
+    statistics: Statistics,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     free = threading.Event()
     stuck = threading.Event()
@@ -117,7 +122,9 @@ def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
         statistics.publish(numbered(number))  # never waits
     assert statistics.reports(since + STALE_NS) == []
     (report,) = statistics.reports(since + STALE_NS + 1)
-    assert report.begins and str(file) in report.text and "disk does not answer" in report.text
+    assert report.begins
+    assert str(file) in report.text
+    assert "disk does not answer" in report.text
     assert statistics.reports(since + 2 * STALE_NS) == []
     free.set()
     until(lambda: number_in(file) == 501)  # only the newest is written
@@ -129,7 +136,11 @@ def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
     [("no folder", "No such file"), ("no file", "no plain file"), ("full", "No space left")],
 )
 def test_a_file_that_cannot_be_written_is_reported_once_until_it_can(
-    trouble: str, said: str, file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
+    trouble: str,
+    said: str,
+    file: Path,
+    statistics: Statistics,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     moved = file.parent.with_name("moved")
     real = os.write
@@ -149,10 +160,12 @@ def test_a_file_that_cannot_be_written_is_reported_once_until_it_can(
         else:
             patch.setattr(os, "write", full)
         (report,) = put(statistics, 2)
-        assert report.begins and said in report.text
+        assert report.begins
+        assert said in report.text
         assert put(statistics, 3) == []
         if trouble == "full":
-            assert (number_in(file), os.listdir(file.parent)) == (1, ["status.json"])
+            assert number_in(file) == 1
+            assert os.listdir(file.parent) == ["status.json"]
     if trouble == "no folder":
         moved.rename(file.parent)
     if trouble == "no file":

@@ -77,7 +77,8 @@ def test_an_end_read_with_the_last_items_is_not_lost(
 
 
 def test_a_job_that_fails_is_reported_and_the_next_job_is_done(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(worker_module, "FAILURE_PAUSE_S", 0)
     done = []
@@ -100,8 +101,10 @@ def test_a_job_that_fails_is_reported_and_the_next_job_is_done(
         each.put(0)
     assert reached.wait(PATIENCE)
     worker.put(1)
-    assert worker.stop(PATIENCE) and silent.stop(PATIENCE)
-    assert (done, failures) == ([1], ["ZeroDivisionError('of ours')"])
+    assert worker.stop(PATIENCE)
+    assert silent.stop(PATIENCE)
+    assert done == [1]
+    assert failures == ["ZeroDivisionError('of ours')"]
     assert caplog.messages == ["test: ZeroDivisionError('of ours')"], "without a callback"
 
 
@@ -156,7 +159,8 @@ def test_a_blocked_stream_delays_no_caller_and_losses_are_logged() -> None:
 
 
 @pytest.mark.parametrize(
-    "error", [OSError(5, "Input/output error"), ValueError("I/O operation on closed file")]
+    "error",
+    [OSError(5, "Input/output error"), ValueError("I/O operation on closed file")],
 )
 def test_a_stream_that_fails_raises_no_exception(error: Exception) -> None:
     class Broken(io.StringIO):
@@ -206,7 +210,8 @@ def test_the_loop_has_priority_over_the_threads_beside_it(kernel: Scheduler) -> 
 
 
 def test_a_priority_that_is_not_permitted_is_reported_with_the_remedy(
-    kernel: Scheduler, monkeypatch: pytest.MonkeyPatch
+    kernel: Scheduler,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     kernel.permits = False
     monkeypatch.delenv("INVOCATION_ID", raising=False)

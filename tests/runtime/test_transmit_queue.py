@@ -38,13 +38,16 @@ def test_the_queue_is_bounded_and_counts_its_losses() -> None:
     sent = list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
         queue.put_all([queued(n)])
-    assert (len(queue), queue.dropped) == (QUEUE_LENGTH, 10)
+    assert len(queue) == QUEUE_LENGTH
+    assert queue.dropped == 10
     queue.put_all([slot(0x181)])
     assert len(queue) == QUEUE_LENGTH + 1, "slots are not held by a full queue"
     send(queue, sent, 2)
     queue.put_all([queued(7)])
     queue.clear()
-    assert (len(queue), queue.dropped, queue.replaced) == (0, 10 + QUEUE_LENGTH - 1, 1)
+    assert len(queue) == 0
+    assert queue.dropped == 10 + QUEUE_LENGTH - 1
+    assert queue.replaced == 1
     assert send(queue, sent, 9) == 0
 
 
@@ -96,7 +99,8 @@ STEPS = st.lists(st.one_of(PUTS, st.integers(0, 6)), max_size=80)
 @settings(deadline=None)  # a busy machine must not fail the test
 @given(STEPS, st.booleans())
 def test_queued_frames_keep_their_order_and_each_slot_sends_its_newest(
-    steps: list[tuple[bool, int] | int], one_by_one: bool
+    steps: list[tuple[bool, int] | int],
+    one_by_one: bool,
 ) -> None:
     """A step puts a frame, given as (is queued, id), or lets the interface take frames.
 
@@ -134,7 +138,8 @@ def test_queued_frames_keep_their_order_and_each_slot_sends_its_newest(
     slots_put = sum(not f.queued for f in put)
     slots_sent = sum(not f.queued for f in sent)
     assert slots_sent + queue.replaced == slots_put
-    assert (len(queue), queue.dropped) == (0, 0)
+    assert len(queue) == 0
+    assert queue.dropped == 0
 
 
 def test_pages_of_a_message_are_never_parts_of_a_transfer() -> None:

@@ -111,7 +111,13 @@ class Wire:
         self._bytes += data
         self.arrivals += times
 
-    def stream(self, begin: int, end: int, period: int, bundled: bool = False) -> None:
+    def stream(
+        self,
+        begin: int,
+        end: int,
+        period: int,
+        bundled: bool = False,
+    ) -> None:
         for at in range(begin, end, period):
             self.send(at, bundled)
 
@@ -192,7 +198,12 @@ class Bus(CanPort):
         self.on_send: Callable[[CanFrame], None] = lambda _frame: None
         self._world = world
 
-    def came(self, can_id: int, data: bytes = b"", at: int | None = None) -> None:
+    def came(
+        self,
+        can_id: int,
+        data: bytes = b"",
+        at: int | None = None,
+    ) -> None:
         self.inbox.append((CanFrame(can_id, data), self._world.now if at is None else at))
 
     def take(self) -> list[tuple[int, bytes]]:
@@ -224,7 +235,10 @@ class Bus(CanPort):
         return self._out[-3] if len(self._out) > 2 else 0
 
     def _send_each(
-        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+        self,
+        frames: Sequence[CanFrame],
+        clock: Callable[[], int],
+        latest: int,
     ) -> tuple[int, Sent]:
         for count, frame in enumerate(frames):
             if clock() > latest:
@@ -292,7 +306,11 @@ class World:
     def unregister(self, fd: int) -> None:
         del self.handlers[fd]
 
-    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+    def wait(
+        self,
+        last: int,
+        due: int,
+    ) -> list[tuple[Handler, int]]:
         pause = max(0, due - self.now)
         whole_ms = -(-pause // MS) * MS
         for_room = self._events.get(CAN_FD, 0) & select.POLLOUT
@@ -342,14 +360,22 @@ class FakePoller(Poller):
         self._world = world
 
     def register(
-        self, fd: int, handler: Handler, events: int = select.POLLIN, esc: int | None = None
+        self,
+        fd: int,
+        handler: Handler,
+        events: int = select.POLLIN,
+        esc: int | None = None,
     ) -> None:
         self._world.register(fd, handler, events)
 
     def unregister(self, fd: int) -> None:
         self._world.unregister(fd)
 
-    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+    def wait(
+        self,
+        last: int,
+        due: int,
+    ) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
         self.before = self._world.before
         self.now = self._world.looked
@@ -381,11 +407,25 @@ def loop_in(
     if in_c:
         patch.setattr(load, "library", lambda: (native_world.library(), ""))
     layout = layout or layout_of(escs)
-    gateway = Gateway(escs, layout, world.now, canopen=canopen, further=further)
+    gateway = Gateway(
+        escs,
+        layout,
+        world.now,
+        canopen=canopen,
+        further=further,
+    )
     config = CanConfig(interface="virtual", channel="world")
     paths = list(by_path)
     poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller
-    return Loop(gateway, paths, config, True, clock=world.clock, poller=poller, notifier=notifier)
+    return Loop(
+        gateway,
+        paths,
+        config,
+        True,
+        clock=world.clock,
+        poller=poller,
+        notifier=notifier,
+    )
 
 
 def run(loop: Loop, world: World, until: int) -> None:

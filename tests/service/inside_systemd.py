@@ -33,7 +33,13 @@ Facts = dict[str, Any]
 
 
 def run(*words: str) -> dict[str, Any]:
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+    done = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LIMIT_S,
+    )
     return {"code": done.returncode, "out": done.stdout, "talk": done.stderr}
 
 

@@ -65,7 +65,9 @@ def test_ready_status_watchdog_and_end_are_notified(manager: Manager) -> None:
     ],
 )
 def test_a_status_is_one_line_that_is_notified_when_it_changes(
-    manager: Manager, texts: tuple[str, ...], told: list[str]
+    manager: Manager,
+    texts: tuple[str, ...],
+    told: list[str],
 ) -> None:
     notifier = Notifier(manager.environment)
     for text in texts:
@@ -137,7 +139,8 @@ def test_a_manager_that_returns_is_notified_again(tmp_path: Path) -> None:
     ],
 )
 def test_the_watchdog_is_used_only_by_the_named_process(
-    variables: dict[str, str], half: int | None
+    variables: dict[str, str],
+    half: int | None,
 ) -> None:
     assert Notifier({"NOTIFY_SOCKET": "/none"} | variables).watchdog_ns == half
 
@@ -146,7 +149,8 @@ def test_the_watchdog_is_used_only_by_the_named_process(
 
 
 def test_each_line_has_its_priority_if_the_journal_reads_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     with (tmp_path / "log").open("w") as stream:
         status = os.fstat(stream.fileno())
@@ -157,5 +161,13 @@ def test_each_line_has_its_priority_if_the_journal_reads_it(
         formatter = log_formatter(stream)
     assert not is_journal(stream, {"JOURNAL_STREAM": named}), "a closed one"
     assert formatter is not None
-    lost = logging.LogRecord("x", logging.ERROR, __file__, 1, "lost\nfor good", (), None)
+    lost = logging.LogRecord(
+        "x",
+        logging.ERROR,
+        __file__,
+        1,
+        "lost\nfor good",
+        (),
+        None,
+    )
     assert formatter.format(lost) == "<3>lost\n<3>for good"

@@ -69,7 +69,8 @@ def test_an_edited_configuration_is_kept_and_changed_files_are_backed_up(tmp_pat
     said = install(tmp_path, "--now").err
     unit = "kontronik-can-gw.service"
     assert said.endswith(f"{unit} is enabled. See: systemctl status {unit}\n")
-    assert "new" not in said and "replaced" not in said
+    assert "new" not in said
+    assert "replaced" not in said
     assert (tmp_path / CONFIGURATION).read_text() == text
     assert enabled(tmp_path) == {"kontronik-can-gw.service": f"/{UNIT}"}
     rules = tmp_path / RULES
@@ -119,7 +120,8 @@ def test_a_link_out_of_the_root_is_not_followed(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     (tmp_path / "root/etc").symlink_to(tmp_path / "elsewhere")
     done = install(tmp_path / "root")
-    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert done.code == 1
+    assert done.err.count("\n") == 1
     assert "leads out of" in done.err
     assert tree(tmp_path / "elsewhere") == []
 
@@ -140,7 +142,9 @@ def test_a_wrong_use_is_reported_in_the_last_line(words: str, said: str) -> None
 
 @pytest.mark.parametrize("action", ["install", "uninstall"])
 def test_the_command_needs_systemd_and_root(
-    action: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    action: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(service, "_own_program", lambda: EXECUTABLE)
     monkeypatch.setattr(service, "_BOOTED", tmp_path / "none")
@@ -151,10 +155,14 @@ def test_the_command_needs_systemd_and_root(
     assert said.startswith(f"only root may do that: sudo {EXECUTABLE} service {action} ")
 
 
-@pytest.mark.parametrize("program", ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExec=/x"])
+@pytest.mark.parametrize(
+    "program",
+    ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExec=/x"],
+)
 def test_a_program_that_a_unit_cannot_contain_is_refused(tmp_path: Path, program: str) -> None:
     done = install(tmp_path, executable=program)
-    assert (done.code, tree(tmp_path)) == (2, [])
+    assert done.code == 2
+    assert tree(tmp_path) == []
     assert "is not an absolute path without spaces" in done.err
 
 

@@ -117,8 +117,10 @@ def test_the_service_runs_as_its_own_user_without_any_right(facts: Facts) -> Non
     assert "0" not in process["Uid"].split() + process["Gid"].split()
     assert len(process["Groups"].split()) == 3  # its own group and the groups of serial ports
     assert {process[f"Cap{kind}"] for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb")} == {"0" * 16}
-    assert (process["NoNewPrivs"], process["Seccomp"]) == ("1", "2")
-    assert (facts["nice"], facts["oom"]) == (-10, "-500")
+    assert process["NoNewPrivs"] == "1"
+    assert process["Seccomp"] == "2"
+    assert facts["nice"] == -10
+    assert facts["oom"] == "-500"
 
 
 def test_telemetry_of_a_port_of_its_groups_reaches_the_bus(facts: Facts) -> None:

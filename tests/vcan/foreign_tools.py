@@ -36,7 +36,11 @@ class Refused(Exception):
         self.code = code
 
 
-def refusal(transfer: Callable[..., object], *arguments: object, **more: object) -> int | None:
+def refusal(
+    transfer: Callable[..., object],
+    *arguments: object,
+    **more: object,
+) -> int | None:
     """Return the code of a transfer that must be refused."""
     with pytest.raises(Refused) as refused:
         transfer(*arguments, **more)
@@ -52,7 +56,11 @@ class NodeMaster:
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._ready = threading.Event()
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
         )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -78,11 +86,31 @@ class NodeMaster:
             raise Refused(answer["error"], answer.get("code"))
         return answer["result"]
 
-    def upload(self, node: int, index: int, sub: int = 0, block: bool = False) -> bytes:
+    def upload(
+        self,
+        node: int,
+        index: int,
+        sub: int = 0,
+        block: bool = False,
+    ) -> bytes:
         return bytes.fromhex(self("upload", node=node, index=index, sub=sub, block=block))
 
-    def download(self, node: int, index: int, sub: int, data: bytes, block: bool = False) -> None:
-        self("download", node=node, index=index, sub=sub, data=data.hex(), block=block)
+    def download(
+        self,
+        node: int,
+        index: int,
+        sub: int,
+        data: bytes,
+        block: bool = False,
+    ) -> None:
+        self(
+            "download",
+            node=node,
+            index=index,
+            sub=sub,
+            data=data.hex(),
+            block=block,
+        )
 
     def of(self, event: str) -> list[dict[str, Any]]:
         """Return the events of one kind so far."""

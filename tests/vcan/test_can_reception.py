@@ -26,7 +26,11 @@ def peer_on(interface: str) -> RawBus:
 
 
 @contextmanager
-def port_on(interface: str, ids: Sequence[int], fd: bool = False) -> Iterator[CanPort]:
+def port_on(
+    interface: str,
+    ids: Sequence[int],
+    fd: bool = False,
+) -> Iterator[CanPort]:
     port = open_can(CanConfig("socketcan", interface, fd=fd))
     try:
         port.set_receive_ids(frozenset(ids))

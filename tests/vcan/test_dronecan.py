@@ -20,7 +20,12 @@ dronecan: Any = import_module("dronecan")
 Start = Callable[..., GatewayProcess]
 
 
-def started(interface: str, ports: list[PtyPort], start: Start, more: str) -> GatewayProcess:
+def started(
+    interface: str,
+    ports: list[PtyPort],
+    start: Start,
+    more: str,
+) -> GatewayProcess:
     """Start a gateway with DroneCAN alone, and wait until its ports are open."""
     tables = f"[dbc]\nenabled = false\n[dronecan]\nenabled = true\nper_esc_nodes = true\n{more}"
     gateway = start(configuration(interface, ports, tables))
@@ -97,7 +102,10 @@ def check_statuses(ports: list[PtyPort], peer: Peer) -> None:
 
 @pytest.mark.parametrize("escs", [1, 4])
 def test_a_foreign_node_reads_status_info_and_parameters(
-    vcan: str, start_gateway: Start, tmp_path: Path, escs: int
+    vcan: str,
+    start_gateway: Start,
+    tmp_path: Path,
+    escs: int,
 ) -> None:
     with feeding(tmp_path, escs) as ports, closing(Peer(vcan)) as peer:
         gateway = started(vcan, ports, start_gateway, "node_id = 20")
@@ -121,7 +129,10 @@ def test_a_foreign_node_reads_status_info_and_parameters(
 
 @pytest.mark.parametrize("escs", [1, 4])
 def test_a_foreign_allocator_sets_the_node_ids(
-    vcan: str, start_gateway: Start, tmp_path: Path, escs: int
+    vcan: str,
+    start_gateway: Start,
+    tmp_path: Path,
+    escs: int,
 ) -> None:
     with feeding(tmp_path, escs) as ports, closing(Peer(vcan)) as peer:
         gateway = started(vcan, ports, start_gateway, "")

@@ -31,7 +31,11 @@ EIGHT = [Identity(i + 1, LAYOUTS[i % 2], cells=6 + i, alarms=i > 5) for i in ran
     ids=["KOSMIK", "JIVEPRO", "eight"],
 )
 def test_every_frame_is_on_the_bus_and_the_last_status_is_stopping(
-    vcan: str, tmp_path: Path, identities: list[Identity], times: int, number: int
+    vcan: str,
+    tmp_path: Path,
+    identities: list[Identity],
+    times: int,
+    number: int,
 ) -> None:
     with chain(vcan, tmp_path, *identities) as run, run.running() as gateway:
         run.feed(times=times)

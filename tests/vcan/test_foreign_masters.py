@@ -58,7 +58,11 @@ def master(vcan: str) -> Iterator[NodeMaster]:
 
 
 def start_nodes(
-    vcan: str, start: Start, ports: list[PtyPort], folder: Path, node_id: int
+    vcan: str,
+    start: Start,
+    ports: list[PtyPort],
+    folder: Path,
+    node_id: int,
 ) -> GatewayProcess:
     """Start the gateway with nodes and without DBC. Telemetry runs."""
     tables = "[dbc]\nenabled = false\n" + canopen_table(folder, node_id)
@@ -74,7 +78,10 @@ def u32(value: int) -> bytes:
 
 
 def test_node_canopen_reads_every_object_and_writes_in_every_way(
-    vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
+    vcan: str,
+    master: NodeMaster,
+    start_gateway: Start,
+    tmp_path: Path,
 ) -> None:
     with feeding(tmp_path) as ports:
         start_nodes(vcan, start_gateway, ports, tmp_path / "store", 5)
@@ -132,7 +139,10 @@ def named(master: NodeMaster, node_id: int) -> None:
 
 
 def test_node_canopen_sets_node_ids_by_lss(
-    vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
+    vcan: str,
+    master: NodeMaster,
+    start_gateway: Start,
+    tmp_path: Path,
 ) -> None:
     with feeding(tmp_path, 2) as ports, recording(vcan) as watch:
         gateway = start_nodes(vcan, start_gateway, ports, tmp_path / "store", 255)
@@ -189,7 +199,10 @@ def is_abort(frame: SimpleNamespace) -> bool:
 
 
 def test_tshark_decodes_all_frames_of_a_session(
-    vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
+    vcan: str,
+    master: NodeMaster,
+    start_gateway: Start,
+    tmp_path: Path,
 ) -> None:
     need(has_tshark(), "tshark")
     with feeding(tmp_path) as ports:
@@ -224,4 +237,5 @@ def test_tshark_decodes_all_frames_of_a_session(
     assert {int(f.lss_command, 0) for f in of(0x7E5)} == {0x51, 0x11, 0x04}
     contents = [bytes.fromhex(frame.pdo.replace(":", "")) for frame in of(0x1D5)]
     pdos = {struct.unpack("<IHh", data) for data in contents}
-    assert pdos and pdos <= {tuple(live[:3]) for live in sent_by(ports[0])}
+    assert pdos
+    assert pdos <= {tuple(live[:3]) for live in sent_by(ports[0])}

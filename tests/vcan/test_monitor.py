@@ -10,7 +10,9 @@ Start = Callable[..., GatewayProcess]
 
 
 def test_a_monitor_reports_a_lost_interface_and_recovers(
-    vcan: str, escs: list[PtyPort], start_gateway: Start
+    vcan: str,
+    escs: list[PtyPort],
+    start_gateway: Start,
 ) -> None:
     gateway = start_gateway(configuration(vcan, escs))
     gateway.wait_for_line("esc1: /")

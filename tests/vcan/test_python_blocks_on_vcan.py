@@ -57,12 +57,24 @@ PATIENT = "import canopen.sdo.client; canopen.sdo.client.SdoClient.RESPONSE_TIME
 """Code before an example, so that the master waits for answers even on a busy machine."""
 
 
-def output_of(block: Block, folder: Path, node_id: int = 1, after: str = "") -> str:
+def output_of(
+    block: Block,
+    folder: Path,
+    node_id: int = 1,
+    after: str = "",
+) -> str:
     """Run an example with a gateway with one ESC on can0. Return the output of the example."""
     (folder / "example.py").write_text(block.text)
     started = f"python -c \"{PATIENT}; exec(open('example.py').read(), {{}})\""
     shown = Block(block.place, "", f"{started} >example.out\n{after}")
-    run_block(shown, folder, GATEWAY.format(node_id=node_id), "unshare", "--net", "--mount")
+    run_block(
+        shown,
+        folder,
+        GATEWAY.format(node_id=node_id),
+        "unshare",
+        "--net",
+        "--mount",
+    )
     return (folder / "example.out").read_text()
 
 

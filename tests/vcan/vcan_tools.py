@@ -54,7 +54,12 @@ def wait_for(condition: Callable[[], object], what: object) -> None:
 class GatewayProcess(LoggedProcess):
     """``kontronik-can-gw run``, or another command of the program, in a separate process."""
 
-    def __init__(self, config: Path | None, *options: object, command: str = "run") -> None:
+    def __init__(
+        self,
+        config: Path | None,
+        *options: object,
+        command: str = "run",
+    ) -> None:
         words: list[object] = [*PROGRAM, command]
         if config is not None:
             words += ["-c", config]
@@ -113,7 +118,13 @@ class Witness(BusWatch):
     """
 
     def __init__(self, interface: str, table: Table, escs: Sequence[PtyPort]) -> None:
-        super().__init__(interface, table, escs, slack_ns=NO_LIMIT_NS, ignore_local=False)
+        super().__init__(
+            interface,
+            table,
+            escs,
+            slack_ns=NO_LIMIT_NS,
+            ignore_local=False,
+        )
         self.recorded: list[Recorded] = []
         self._mark = b""
         self.start()
@@ -146,7 +157,10 @@ def recording(interface: str) -> Iterator[Witness]:
 
 
 def configuration(
-    interface: str, ports: Iterable[PtyPort], dbc: str = "", esc: str = NEVER_STALE
+    interface: str,
+    ports: Iterable[PtyPort],
+    dbc: str = "",
+    esc: str = NEVER_STALE,
 ) -> str:
     """Return the text of a configuration for these ports."""
     can = f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n'
@@ -163,7 +177,12 @@ class Chain:
     """ESCs that send frames on request, the gateway, and a judge of each value on the bus."""
 
     def __init__(
-        self, interface: str, folder: Path, identities: Sequence[Identity], toml: str, esc: str
+        self,
+        interface: str,
+        folder: Path,
+        identities: Sequence[Identity],
+        toml: str,
+        esc: str,
     ) -> None:
         self.escs = [PtyPort(folder / f"port{n}", each) for n, each in enumerate(identities)]
         for fed in self.escs:
@@ -225,7 +244,11 @@ class Chain:
 
 @contextmanager
 def chain(
-    interface: str, folder: Path, *identities: Identity, toml: str = "", esc: str = NEVER_STALE
+    interface: str,
+    folder: Path,
+    *identities: Identity,
+    toml: str = "",
+    esc: str = NEVER_STALE,
 ) -> Iterator[Chain]:
     """Yield a chain. Check its values at the end unless the test has failed."""
     made = Chain(interface, folder, identities, toml, esc)

@@ -114,7 +114,10 @@ def native_prefix() -> list[str] | None:
     for prefix in ([], namespace, as_root):
         with contextlib.suppress(OSError):
             done = subprocess.run(
-                prefix + probe, check=False, stdin=subprocess.DEVNULL, capture_output=True
+                prefix + probe,
+                check=False,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
             )
             if done.returncode == 0:
                 return prefix
@@ -218,7 +221,12 @@ def under_tmpfs(folder: str) -> bool:
     return any(folder == tmpfs or folder.startswith(tmpfs + "/") for tmpfs in TMPFS)
 
 
-def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence[str]) -> None:
+def write_job(
+    job: str,
+    backend: str,
+    command: Sequence[str],
+    writable: Sequence[str],
+) -> None:
     """Fill the job folder with the guest's script and the list of the host folders to mount."""
     without = os.path.join(job, "without")
     os.mkdir(without)
@@ -285,7 +293,11 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def start_vm(
-    backend: str, job: str, out: int, err: int, log: BinaryIO
+    backend: str,
+    job: str,
+    out: int,
+    err: int,
+    log: BinaryIO,
 ) -> "subprocess.Popen[bytes]":
     if backend == "uml":
         command = uml_command(job, out, err)
@@ -305,7 +317,10 @@ def start_vm(
 
 
 def run_in_vm(
-    backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
+    backend: str,
+    command: Sequence[str],
+    writable: Sequence[str],
+    timeout_s: float,
 ) -> tuple[int, bool]:
     """Run a command in a VM. Return its exit code, and whether it was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
@@ -317,7 +332,13 @@ def run_in_vm(
         pipes = [os.pipe() for _ in range(2)]
         try:
             with open(os.path.join(job, "log"), "wb") as log:
-                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log)
+                process = start_vm(
+                    backend,
+                    job,
+                    pipes[0][1],
+                    pipes[1][1],
+                    log,
+                )
         finally:
             for _, end in pipes:
                 os.close(end)
