@@ -120,7 +120,7 @@ NEEDS = {
 }
 """Programs that a step needs besides Python, and the command that installs them.
 
-"vcan" is no program but a kernel with a vcan interface.
+"vcan" means a kernel that has vcan interfaces.
 """
 
 printing = threading.Lock()

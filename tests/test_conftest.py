@@ -1,4 +1,7 @@
-"""The tests do not depend on how they were started: under nohup, in the background, or without a session."""
+"""The tests do not depend on how they were started.
+
+They may run under nohup, in the background, or without a session.
+"""
 
 import os
 import re

@@ -93,9 +93,9 @@ def info(**fields: int) -> bytes:
 class Bench(Talker):
     """A gateway with ``nodes`` ESCs and nodes. The test sets the time.
 
-    The node-IDs are 1, 2, … and the serial numbers 77, 78, …. ``changes`` are made to the shipped
-    EDS. ``settings`` are further fields of every NodeSettings. ``escs`` has further fields of every
-    EscSettings, or is a list of EscSettings.
+    The node-IDs are 1, 2, … and the serial numbers 77, 78, and so on. ``changes`` are made to the
+    shipped EDS. ``settings`` are further fields of every NodeSettings. ``escs`` has further fields
+    of every EscSettings, or is a list of EscSettings.
     """
 
     def __init__(

@@ -40,7 +40,9 @@ def variable(
 
 def with_object(source: str, index: int, content: str) -> str:
     """Return the text with a further manufacturer object, whose section has this content."""
-    count = int(re.search(r"\[ManufacturerObjects\]\r\nSupportedObjects=(\d+)", source)[1])  # type: ignore[index]
+    found = re.search(r"\[ManufacturerObjects\]\r\nSupportedObjects=(\d+)", source)
+    assert found is not None
+    count = int(found[1])
     source = with_key(source, "ManufacturerObjects", "SupportedObjects", str(count + 1))
     source = with_key(source, "ManufacturerObjects", str(count + 1), f"0x{index:04X}")
     return f"{source.rstrip()}\r\n\r\n[{index:04X}]\r\n{content}\r\n"

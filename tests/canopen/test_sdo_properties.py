@@ -1,4 +1,4 @@
-"""The SDO server with random traffic, with our client that loses segments, and with ``canopen``'s."""
+"""The SDO server with random traffic, our client that loses segments, and ``canopen``'s client."""
 
 import random
 from binascii import crc_hqx

@@ -97,7 +97,7 @@ def test_unit_codes_agree_with_the_table_of_fields(entries: dict[tuple[int, int]
         assert entry.access == "const"
         assert entry.data_type == U32
         assert entry.name.lower() == f"unit of {title(name).lower()}"
-        if row.unit == "mAh":  # 3.6 C, for which there is no code
+        if row.unit == "mAh":  # 3.6 C has no code
             assert entry.default == 0
             continue
         power = PREFIX.get(row.unit, 0) - (len(str(row.per_unit)) - 1)

@@ -11,8 +11,8 @@ Exchange = Callable[[int, bytes, bool], Iterable[tuple[int, bytes]]]
 class Wire(canopen.Network):
     """A network whose other end is the function ``exchange``.
 
-    ``exchange`` gets COB-ID, data and the remote flag of a frame. It returns COB-ID and data of each
-    answer.
+    ``exchange`` gets COB-ID, data and the remote flag of a frame. It returns COB-ID and data of
+    each answer.
     """
 
     def __init__(self, exchange: Exchange) -> None:

@@ -201,7 +201,7 @@ class Bench:
                 ]
             )
             gateway.status.received_frames += 1
-            if can_id >> 31:  # a block of ids, of which one is used
+            if can_id >> 31:  # one id of a block of ids
                 frame = CanFrame(can_id & 0x1FFFFFFF | rng.randrange(0x80), data, True)
             else:
                 frame = CanFrame(can_id, data)

@@ -1,8 +1,8 @@
 """The format of captures.
 
 Every entry is read as it was written, every intact block is found, and damage is reported without
-further losses. If the content is wrong although the checksum is right, the sensible part is read, or
-one line reports the reason. No other exception and no hang may occur.
+further losses. If the content is wrong although the checksum is right, the sensible part is read,
+or one line reports the reason. No other exception and no hang may occur.
 """
 
 import copy

@@ -1,4 +1,4 @@
-"""The recorder writes all entries even if the disk fails for a while, and never delays its caller."""
+"""The recorder never delays its caller, and continues when a failed disk works again."""
 
 import errno
 import os

@@ -370,7 +370,10 @@ def test_the_core_of_an_arm_package_runs_in_the_releases_python(
     architecture: str,
     release: str,
 ) -> None:
-    """It converts a capture to the same table as on this machine. Each release has one architecture."""
+    """It converts a capture to the same table as on this machine.
+
+    Each release is tested with one architecture.
+    """
     kept = CACHE / f"{release}.{architecture}"
     options = (f"--arch={architecture}", "--variant=minbase", "--include=python3")
     archives = "var/cache/apt/archives"
@@ -384,7 +387,8 @@ def test_the_core_of_an_arm_package_runs_in_the_releases_python(
             subprocess.run(["dpkg-deb", "-x", package, folder], check=True)
         script = (
             f"import sys; sys.path.insert(0, '{folder}/usr/lib/kontronik-can-gw')\n"
-            "from kontronik_can_gw.cli import main; from kontronik_can_gw.native.load import library\n"
+            "from kontronik_can_gw.cli import main\n"
+            "from kontronik_can_gw.native.load import library\n"
             f"assert library()[0] is not None, library()[1]\nsys.exit(main(sys.argv[1:]))"
         )
         words = ["convert", str(CAPTURE)]

@@ -21,7 +21,8 @@ TELEMETRY_LIFE = 5 * SECOND
 RUNNING_LIFE = 210 * MS
 """Times for which ArduPilot uses a value.
 
-They are for a speed, for a voltage, and for a speed that shows before take-off that the motor turns.
+They are for a speed, for a voltage, and for a speed that shows before take-off that the motor
+turns.
 """
 PX4_ONLINE = 1200 * MS
 BETAFLIGHT_LIFE = SECOND

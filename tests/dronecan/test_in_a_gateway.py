@@ -99,7 +99,7 @@ def test_check_warns_of_unusual_settings(
     code: int,
     said: str,
 ) -> None:
-    """One of the warnings is for a machine without an id, whose unique ids depend on names alone."""
+    """One warning is for a machine without an id, whose unique ids depend on names alone."""
     if not given:
         monkeypatch.setattr("kontronik_can_gw.assembly.assemble.identity_digest", lambda: b"")
     found, _, err = checked(tmp_path, f"node_id = 42\n{more}", **given)  # type: ignore[arg-type]

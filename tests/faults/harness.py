@@ -186,7 +186,7 @@ class PtyPort(FedEsc):
 class Bench:
     """One gateway and everything that runs around it.
 
-    ``interface`` is the gateway's interface, and ``watched`` its far end, where the judge receives.
+    ``interface`` is the gateway's interface. The judge receives at ``watched``, its far end.
     With ``canopen`` there is a node for each ESC. ``more`` has further tables of the configuration.
     """
 
@@ -383,7 +383,7 @@ class Bench:
         return losses
 
     def inject(self, fault: Fault, row: Row, given: Any) -> bool:
-        """Inject a fault once and note the result in the row. Return True if the bench is usable."""
+        """Inject a fault once, and note the result. Return True if the bench is still usable."""
         row.injected += 1
         try:
             self.check_alive()

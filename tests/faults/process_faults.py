@@ -118,7 +118,7 @@ def second(bench: Bench, injection: Injection, reason: str) -> None:
 
 
 class Supervisor:
-    """Replacement for systemd that receives notifications, and records when the watchdog was fed."""
+    """Replacement for systemd that receives notifications and records when it was fed."""
 
     def __init__(self, path: str, watchdog_s: float) -> None:
         self.watchdog_s = watchdog_s

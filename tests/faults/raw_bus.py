@@ -108,7 +108,7 @@ class RawBus:
         sub: int,
         seconds: float = 2,
     ) -> int | None:
-        """Read a number of at most four bytes by SDO upload. Return None without answer or on abort."""
+        """Read a number of at most four bytes by SDO upload. Return None if that fails."""
         answer = self._ask(node, struct.pack("<BHB4x", 0x40, index, sub), seconds)
         if answer is None or answer[0] >> 5 != 2:
             return None

@@ -115,8 +115,8 @@ def _message(message: Any, count: int) -> Message:
 def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:
     """Return the table of the DBC that ``kontronik-can-gw dbc`` prints.
 
-    With ``canopen`` it includes the messages of the nodes. The command runs in this process, because
-    starting a process takes long in a virtual machine.
+    With ``canopen`` it includes the messages of the nodes. The command runs in this process,
+    because starting a process takes long in a virtual machine.
     """
     import cantools.database
 

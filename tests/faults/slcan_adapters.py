@@ -1,8 +1,9 @@
 """Simulated Lawicel adapters on pseudo terminals, used by the kernel's slcan driver.
 
 They form a CAN bus with bit rates and error states. A frame reaches every adapter that is open at
-the same bit rate. Without such an adapter the frame is not acknowledged, and the sender's controller
-becomes error passive, as a real one does. The adapters report the state of their controllers.
+the same bit rate. Without such an adapter the frame is not acknowledged, and the sender's
+controller becomes error passive, as a real one does. The adapters report the state of their
+controllers.
 """
 
 import contextlib

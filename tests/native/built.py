@@ -19,7 +19,7 @@ COMPILERS = ["gcc", pytest.param("clang", marks=pytest.mark.extended)]
 
 
 def there(program: str | None = None) -> str:
-    """Return a compiler, by default the machine's. Skip the test if there is none."""
+    """Return a compiler, by default the machine's. Skip the test if it is missing."""
     found = compiler() if program is None else shutil.which(program)
     if found is None:
         pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev clang")

@@ -1,4 +1,4 @@
-"""The files of `export c` compile alone and without a warning, and send the Python core's frames."""
+"""The files of `export c` compile alone without a warning, and send the Python core's frames."""
 
 import re
 import subprocess

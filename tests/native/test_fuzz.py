@@ -1,4 +1,7 @@
-"""The core under fuzzers, with sanitizers: 30 s each here, ten minutes each in `make release` (KCG_FUZZ_SECONDS)."""
+"""The core under fuzzers with sanitizers.
+
+Each fuzzer runs for 30 s here, and for ten minutes in `make release` (KCG_FUZZ_SECONDS).
+"""
 
 import os
 import random

@@ -306,7 +306,7 @@ def test_an_output_that_is_due_sends_between_turns_in_c(
 def test_an_emergency_on_a_full_bus_after_a_long_pause_is_sent_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The time without a sent frame counts only from then, so it is no stall, and no loss."""
+    """The time without a sent frame counts only from then. It is not a stall and not a loss."""
     it = InC(monkeypatch, Layout("", "", ()), canopen=_nodes(ESCS))
     it.feed(LiveData(operating_errors=(n >= 530) << 20) for n in range(600))
     it.run(1)

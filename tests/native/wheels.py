@@ -2,8 +2,8 @@
 
     python tests/native/wheels.py [FOLDER]
 
-No object may need a library or a version of one. If one does, the exit code is 1. tests/deb runs the
-same objects on their machines.
+No object may need a library or a version of one. If one does, the exit code is 1. tests/deb runs
+the same objects on their machines.
 """
 
 import os

@@ -44,7 +44,7 @@ _REFUSALS = {
     Sent.DOWN: errno.ENETDOWN,
     Sent.GONE: errno.ENODEV,
 }
-"""The errno by which a socket reports each answer of a bus."""
+"""The errno of a socket for each answer of a bus."""
 
 
 class _Kernel(c.Structure):

@@ -492,7 +492,7 @@ def test_a_python_can_interface_that_refuses_a_frame_is_busy() -> None:
 
 
 class ReturningBus:
-    """A bus that returns each sent frame as if another device had sent it, as udp_multicast does."""
+    """A bus that returns each sent frame like a frame of another device, as udp_multicast does."""
 
     def __init__(self) -> None:
         self.inbox: queue.Queue[can.Message] = queue.Queue()
@@ -528,7 +528,7 @@ def test_frames_that_the_interface_returns_are_not_received() -> None:
         bus.is_full = True
         assert port.send(own) is Sent.BUSY
         bus.is_full = False
-        bus.send(message(0x680, b"own"), 0)  # another device sends what we could not send
+        bus.send(message(0x680, b"own"), 0)  # another device sends the same frame
         assert receive(port, 1) == [own._replace(page=0)]
     finally:
         port.close()

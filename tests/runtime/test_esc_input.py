@@ -342,7 +342,8 @@ def test_settings_changed_by_another_program_are_restored(core_language: str) ->
         def hold() -> bool:
             if core_language == "Python":
                 return port.settings_hold()
-            turns = Gateway([EscSettings()], Layout("", "", ()), 0).core.turns()  # type: ignore[attr-defined]
+            gateway = Gateway([EscSettings()], Layout("", "", ()), 0)
+            turns = gateway.core.turns()  # type: ignore[attr-defined]
             turns.inputs[0].settings[:] = port.settings
             assert turns.watch([(port.fileno(), select.POLLIN, 0)])
             turns.leave()

@@ -1,4 +1,4 @@
-"""A process that was held up sends no value that is older than its time-out, and loses no fresh one.
+"""A process that was held up sends no value older than its time-out, and loses no fresh one.
 
 On the CAN side it obeys commands that waited, sends the answers, and computes measurements again.
 """
@@ -142,7 +142,7 @@ def test_the_loop_checks_its_ports_four_times_per_shortest_time_out(
     monkeypatch: pytest.MonkeyPatch,
     sends: bool,
 ) -> None:
-    """A master may change the time-out. No message wakes the loop, and it checks no more often."""
+    """A master may change the time-out. No message wakes the loop, and it does not check more."""
     world = World(2)
     escs = (EscSettings("esc1", timeout_ns=SECOND), EscSettings("esc2"))
     loop = loop_in(world, monkeypatch, escs, Layout("", "", ()))
@@ -264,7 +264,7 @@ def shown_of_all(world: World) -> Iterator[tuple[int, int, int, int]]:
 def test_bytes_faster_than_the_wire_allows_are_not_dated_in_the_future(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """More than two reads arrive at once, as from a device that is no ESC. A frame is at the end."""
+    """More than two reads arrive at once, as from another device. A frame is at the end."""
     world = World()
     (wire,) = world.wires
     timeout = 100 * MS

@@ -1,4 +1,7 @@
-"""Advised `ip link` commands fit the kind of the interface: vcan refuses the options of a controller."""
+"""Advised `ip link` commands fit the kind of the interface.
+
+A vcan refuses the options of a controller.
+"""
 
 import errno
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The parameter files: order, results, damage, failing disks, and loss of power at every instant."""
+"""The parameter files: order, results, damage, failing disks, and loss of power at any time."""
 
 import errno
 import itertools

@@ -127,7 +127,7 @@ class Wire:
 
     @property
     def next_arrival(self) -> int | None:
-        """The time at which the port becomes readable. It is in the past if the port is readable."""
+        """The time at which the port becomes readable. In the past if it is readable."""
         times = self.arrivals[self._read : self._read + 1]
         if self.fails_at is not None:
             times.append(self.fails_at)
@@ -192,7 +192,7 @@ class Bus(CanPort):
         self.refused: list[int] = []
         """Times at which a frame was refused with ``answer``. A refusal takes 0.1 ms."""
         self.frame_ns = 0
-        """Duration of a frame on the bus. Unless it is 0, the kernel takes six frames in advance."""
+        """Duration of a frame on the bus. Unless it is 0, the kernel buffers six frames."""
         self._out: list[int] = []
         """Times at which the frames in the kernel will have been sent."""
         self.on_send: Callable[[CanFrame], None] = lambda _frame: None
@@ -231,7 +231,7 @@ class Bus(CanPort):
 
     @property
     def room_at(self) -> int:
-        """The time at which the socket becomes writable: the kernel has less than half its limit."""
+        """The time at which the socket becomes writable: its buffer is less than half full."""
         return self._out[-3] if len(self._out) > 2 else 0
 
     def _send_each(
@@ -282,7 +282,7 @@ class World:
         self.hold_up: Callable[[], int] = lambda: 0
         """Returns in ns how long the process is held up after a wait, before it reads the clock."""
         self.poll_fault: Callable[[bool], int] = lambda _is_all: 0
-        """Returns the errno with which a poll in C fails, or 0.
+        """Returns the errno of a failing poll in C, or 0.
 
         Its argument is True if the poll is for all descriptors.
         """

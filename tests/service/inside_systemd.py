@@ -1,7 +1,7 @@
-"""systemd runs this script in a VM (boot_systemd.sh). It installs, disturbs and removes the service.
+"""Installs, disturbs and removes the service. systemd runs this in a VM (boot_systemd.sh).
 
 inside_systemd.py FOLDER        writes its observations to FOLDER/facts.json
-inside_systemd.py --probe       prints as JSON what a process in the service's sandbox can do
+inside_systemd.py --probe       prints the abilities of a process in the service's sandbox as JSON
 """
 
 import contextlib

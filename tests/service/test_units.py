@@ -97,7 +97,7 @@ EVERY = [*NAMES, *BESIDE]
 
 @pytest.mark.parametrize("name", EVERY)
 def test_a_service_never_gives_up_and_has_no_rights_of_root(name: str) -> None:
-    """test_under_systemd.py tries under a real systemd what the sandbox forbids."""
+    """test_under_systemd.py tries the forbidden actions under a real systemd."""
     unit = settings(files()[name])
     kept = {"Restart": "always", "StartLimitIntervalSec": "0", "TimeoutStopSec": "5s"}
     kept |= {"User": "kontronik-can-gw", "Group": "kontronik-can-gw", "NoNewPrivileges": "yes"}

@@ -104,7 +104,11 @@ def test_bit_rate_and_state_of_a_real_driver_are_judged(
     assert found["can.restart"]["severity"] == "note"
     for letter, state, severity in (("p", "passive", "warning"), ("b", "bus-off", "error")):
         adapter.tell_state(letter, 0, 128)
-        wait_for(lambda state=state: state.upper() in shown(adapter.name), state)  # type: ignore[misc]
+
+        def is_shown(state: str = state) -> bool:
+            return state.upper() in shown(adapter.name)
+
+        wait_for(is_shown, state)
         found, _ = doctor(file)
         assert found["can.state"]["severity"] == severity
         assert state in found["can.state"]["text"]

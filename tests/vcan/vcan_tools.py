@@ -27,7 +27,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIMIT_S = 60.0
 NEVER_STALE = "telemetry_timeout_ms = 60000"
-"""Key of an [[esc]] with which a machine that is held up for a while loses no telemetry."""
+"""Key of an [[esc]], so that a hold-up of the machine causes no loss of telemetry."""
 
 NO_LIMIT_NS = 3600 * 10**9
 """Slack of a chain's judge, which judges values and their order but not their age."""
@@ -195,7 +195,7 @@ class Chain:
 
     @contextmanager
     def running(self, *options: str) -> Iterator[GatewayProcess]:
-        """Start a gateway and wait until its ports are open. Kill it at the end if it still runs."""
+        """Start a gateway and wait until its ports are open. Kill it at the end if necessary."""
         self.gateway = GatewayProcess(self.config, *options)
         try:
             self.gateway.wait_for_line(f"esc{len(self.escs)}: /")

@@ -13,21 +13,22 @@ uml     User Mode Linux. It boots in 2 s and runs Python at full speed. It has v
         gateway, BCM, J1939, slcan, tbf and netem. Its time is virtual (uml_time.c, which needs a C
         compiler): the result does not depend on the speed or load of the machine, and waiting takes
         no time. Only --timeout is in the machine's time.
-qemu    An emulated machine, in which Python is 15 times slower. It has the same features and ISO-TP,
-        two kvaser_pci controllers on one bus (can0, can1), and a 16550A UART (/dev/ttyS1, whose other
-        end is /dev/virtio-ports/com1). The command can simulate USB devices and plug them in by
-        vhci_hcd (driver ftdi_sio). Its time is the number of executed instructions, 2 ns each.
+qemu    An emulated machine, in which Python is 15 times slower. It has the same features and
+        ISO-TP, two kvaser_pci controllers on one bus (can0, can1), and a 16550A UART (/dev/ttyS1,
+        with the other end at /dev/virtio-ports/com1). The command can simulate USB devices and plug
+        them in by vhci_hcd (driver ftdi_sio). Its time is the number of executed instructions, 2 ns
+        each.
 
-In a VM the host's file system is read-only at the same paths, with an empty /tmp, /var/tmp, /run and
-/dev/shm. Each --rw DIR is writable. COMMAND is root, lo is up, the CAN modules are loaded, and no
+In a VM the host's file system is read-only at the same paths, with an empty /tmp, /var/tmp, /run
+and /dev/shm. Each --rw DIR is writable. COMMAND is root, lo is up, the CAN modules are loaded, and no
 vcan interface exists yet. The environment has PATH, HOME, LANG, CI, VIRTUAL_ENV and the variables
 that begin with KCG_, PYTHON, PYTEST_, HYPOTHESIS_ or COVERAGE_. Python does not find asammdf.
 python-can would import it if it is installed, and numpy and pandas with it, which would take 4 s of
 each process in UML and a minute in QEMU.
 
 Limits of the virtual machines: UML does not save the AVX-512 registers over a signal, so glibc and
-OpenSSL are configured not to use them. Libraries that choose instructions themselves, such as numpy,
-cannot be used. /dev/kvm may exist without working, so QEMU always emulates. SIGKILL leaves UML's
+OpenSSL are configured not to use them. Libraries that choose instructions themselves, such as
+numpy, cannot be used. /dev/kvm may exist without working, so QEMU always emulates. SIGKILL leaves UML's
 children behind, so SIGTERM is sent first.
 """
 
@@ -93,7 +94,7 @@ def extend_path() -> None:
 
 
 def native_prefix() -> list[str] | None:
-    """Return the prefix with which a command can create vcan interfaces on this kernel.
+    """Return the prefix that a command needs to create vcan interfaces on this kernel.
 
     The list is empty if no prefix is needed. None if the command cannot create them.
     """
