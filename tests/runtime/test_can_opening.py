@@ -250,7 +250,7 @@ def test_a_port_that_opens_after_the_end_is_closed(
 
 
 @pytest.mark.parametrize("error", [None, RunError("CAN slcan /dev/none: there is none.")])
-def test_a_driver_that_does_not_return_from_opening_is_logged_until_it_does(
+def test_a_driver_that_does_not_return_from_opening_is_logged(
     error: RunError | None,
     uart: tuple[int, str],
     monkeypatch: pytest.MonkeyPatch,
