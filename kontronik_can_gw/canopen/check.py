@@ -149,7 +149,8 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
             tpdo.read()
             tpdo.check()
         except SdoAbort as error:
-            index, mapping = tpdo.indices
+            index = tpdo.communication_index
+            mapping = tpdo.mapping_index
             yield (
                 f"TPDO {tpdo.number + 1}: the defaults of {index:04X}h and {mapping:04X}h do not make a PDO of node {node_id} ({error}). "
                 "Map objects with PDOMapping=1, in their own lengths, 64 bits in all, at a COB-ID that is free."
