@@ -1,4 +1,7 @@
-"""COB-IDs: predefined and restricted ones (CiA 301, 7.3.3 and 7.3.5), which of them a node uses, and what takes the frames that come."""
+"""COB-IDs: predefined and restricted ones (CiA 301, 7.3.3 and 7.3.5), and the use by a node.
+
+Also routes received frames to the services of a node.
+"""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,20 +17,28 @@ if TYPE_CHECKING:
     from kontronik_can_gw.canopen.node import Node
 
 FrameTaker = Callable[[bytes, int, int], None]
-"""Is given a frame's data, the time, and when the frame came."""
+"""Called with a frame's data, the present time, and the frame's time of arrival."""
 Taken = Callable[[int, object], bool]
-"""Whether another user than this has a COB-ID, see ``Use``."""
+"""Returns True if another user than the given one has a COB-ID, see ``Use``."""
 
-NMT, EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
-"""Those of EMERGENCY and after are first ids: the node-ID is added."""
-LSS_ANSWER, LSS_REQUEST = 0x7E4, 0x7E5
+NMT = 0x000
+LSS_ANSWER = 0x7E4
+LSS_REQUEST = 0x7E5
+# The node-ID is added to these.
+EMERGENCY = 0x080
+SDO_ANSWER = 0x580
+SDO_REQUEST = 0x600
+HEARTBEAT = 0x700
 OF_NODE_ID = (EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
 INVALID_BIT = 1 << 31
 SYNC = "SYNC"
 
 
 def restricted(cob_id: int) -> bool:
-    """True for COB-IDs that no PDO, SYNC or EMCY may use (CiA 301, table of restricted CAN-IDs)."""
+    """Return True for COB-IDs that no PDO, SYNC or EMCY may use.
+
+    See the table of restricted CAN-IDs in CiA 301.
+    """
     return (
         cob_id <= 0x07F
         or 0x101 <= cob_id <= 0x180
@@ -39,7 +50,10 @@ def restricted(cob_id: int) -> bool:
 
 
 def check_free(cob_id: int, user: object, taken: Taken) -> None:
-    """Whether a service may have a COB-ID. SdoAbort 06090030h for a restricted one, 06040043h for one in use."""
+    """Check if a service may use a COB-ID.
+
+    Raises SdoAbort 06090030h for a restricted COB-ID, and 06040043h for one in use.
+    """
     if restricted(cob_id):
         raise SdoAbort(Abort.VALUE)
     if taken(cob_id, user):
@@ -47,11 +61,12 @@ def check_free(cob_id: int, user: object, taken: Taken) -> None:
 
 
 def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int, int]]:
-    """Valid COB-IDs of emergencies and PDOs by their defaults: index, sub-index, id."""
+    """Yield the valid default COB-IDs of emergencies and PDOs: index, sub-index, COB-ID."""
     if dictionary.get(0x1014) is None:
         yield 0x1014, 0, EMERGENCY + node_id
     for number, variable in dictionary.variables.items():
-        index, sub = number >> 8, number & 0xFF
+        index = number >> 8
+        sub = number & 0xFF
         if index == 0x1014 or (0x1800 <= index < 0x1A00 and sub == 1):
             cob_id = int(variable.default(node_id))
             if not cob_id & INVALID_BIT:
@@ -64,13 +79,16 @@ class Use(NamedTuple):
     cob_id: int
     what: str
     user: object = None
-    """The service for which a master can choose it; that of SYNC is one for all nodes. None: it cannot be chosen."""
+    """The service for which a master can choose the COB-ID. None: it cannot be chosen.
+
+    All nodes share the service SYNC.
+    """
     own: bool = False
-    """No other device on the bus may send with it."""
+    """True if no other device on the bus may send with the COB-ID."""
 
 
 def uses(node: "Node") -> Iterator[Use]:
-    """All COB-IDs that a node sends with or listens to as its own."""
+    """Yield all COB-IDs with which a node sends, or which it receives for itself."""
     yield Use(NMT, "NMT")
     yield Use(LSS_REQUEST, "LSS")
     yield Use(LSS_ANSWER, "LSS")
@@ -90,7 +108,10 @@ def uses(node: "Node") -> Iterator[Use]:
 
 
 def routes(node: "Node") -> Iterator[tuple[int, FrameTaker]]:
-    """COB-IDs the node listens to, those of heartbeats that it watches too, and what takes their frames."""
+    """Yield the COB-IDs that a node receives, with the functions that process their frames.
+
+    They include the monitored heartbeats of other nodes.
+    """
     yield LSS_REQUEST, lambda data, now, _at: node.lss.receive(data, now)
     if node.node_id != UNCONFIGURED:
         yield NMT, partial(_on_nmt, node)

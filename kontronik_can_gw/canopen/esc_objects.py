@@ -1,4 +1,7 @@
-"""What a node does for its ESC: settings 2100h, status register 1002h, texts of 2010h, statistics 2102h, emergencies of ESC and link."""
+"""The objects of a node that depend on its ESC, and the emergencies of ESC and link.
+
+The objects are settings 2100h, status register 1002h, texts of 2010h, and statistics 2102h.
+"""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -15,28 +18,35 @@ if TYPE_CHECKING:
 
 
 class EscObjects:
-    """``changed`` is called with other settings of the ESC."""
+    """Serves the objects of a node's ESC. ``changed`` is called with new settings of the ESC."""
 
     def __init__(
         self, node: "Node", gateway: GatewayStatus, changed: Callable[[EscSettings], None]
     ) -> None:
-        dictionary, esc = node.dictionary, node.esc
-        self._node, self._esc = node, esc
+        dictionary = node.dictionary
+        esc = node.esc
+        self._node = node
+        self._esc = esc
         self._base = esc.settings
         self._errors = esc.protocol.by_name.get("operating_errors")
         self._gateway = gateway
         self._changed = changed
-        self._live = False  # for the edge of 1029h:2
+        self._live = False
+        """True if live data was fresh at the last call. 1029h:02 acts once when it is lost."""
         dictionary.bind(0x1002, read=self._status_register)
         dictionary.bind(at.INFO, 6, read=self._device_name)
         dictionary.bind(at.INFO, 7, read=self._firmware)
         for variable in dictionary.subs(at.SETTINGS):
             variable.written = self.apply_settings
-        reset = at.RESET_STATISTICS, 1
-        dictionary.bind(*reset, check=signature(b"rset"), written=lambda _: esc.reset_statistics())
+        dictionary.bind(
+            at.RESET_STATISTICS,
+            1,
+            check=signature(b"rset"),
+            written=lambda _now: esc.reset_statistics(),
+        )
 
     def apply_settings(self, now: int) -> None:
-        """Take over 2100h."""
+        """Apply the settings in 2100h."""
         self._node.emergencies.mask = self._node.dictionary.number(at.SETTINGS, 6)
         if self._esc.live is not None and self._errors is not None:
             self._node.emergencies.set_word(self._errors.of(self._esc.live), now, force=True)
@@ -45,7 +55,7 @@ class EscObjects:
             self._changed(settings)
 
     def on_event(self, events: int, now: int) -> None:
-        """Something of the ESC changed: bits of telemetry.Event."""
+        """Follow a change of the ESC. ``events`` are bits of telemetry.Event."""
         live = self._esc.live
         if events & Event.STATE and live is not None and self._errors is not None:
             errors = self._errors.of(live)
@@ -54,18 +64,22 @@ class EscObjects:
             self._follow_link(events, now)
 
     def _follow_link(self, events: int, now: int) -> None:
-        esc, found, expected = self._esc, self._node.emergencies, self._node.settings.device
+        esc = self._esc
+        emergencies = self._node.emergencies
+        expected = self._node.settings.device
         link = esc.link
         if events & Event.LINK:
+            # The port's error begins before other errors end, so that no 0000h is sent in between.
             if link is LinkState.PORT_ERROR:
-                found.set(GatewayError.PORT_GONE, True, now)
+                emergencies.set(GatewayError.PORT_GONE, True, now)
             expired_ns = esc.live_bound_ns + esc.settings.timeout_ns
-            found.set(GatewayError.TELEMETRY_LOST, link is LinkState.LOST, now, at=expired_ns)
-            found.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
-            found.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
+            is_lost = link is LinkState.LOST
+            emergencies.set(GatewayError.TELEMETRY_LOST, is_lost, now, at=expired_ns)
+            emergencies.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
+            emergencies.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
         if events & Event.INFO and esc.info is not None and expected is not None:
             device = esc.protocol.value("device_raw", esc.info)
-            found.set(GatewayError.OTHER_DEVICE, device != expected, now)
+            emergencies.set(GatewayError.OTHER_DEVICE, device != expected, now)
         if self._live and esc.live is None and link in (LinkState.LOST, LinkState.PORT_ERROR):
             self._node.nmt.behave(2, now)
         self._live = esc.live is not None
@@ -73,17 +87,26 @@ class EscObjects:
     # --- objects
 
     def _status_register(self, now: int) -> int:
-        """1002h: bits 7..0 link status as 2020h:1, 15..8 CAN state, 16 telemetry fresh, 17 information fresh."""
-        esc, gateway = self._esc, self._gateway
-        fresh = (esc.live is not None) | (esc.info is not None) << 1
-        return at.link_status(esc, gateway, now) | int(gateway.can_state) << 8 | fresh << 16
+        """Return 1002h.
+
+        Bits 7..0: link status as in 2020h:01, 15..8: CAN state, 16: live data is fresh, 17: info
+        data is fresh.
+        """
+        esc = self._esc
+        link = at.link_status(esc, self._gateway, now)
+        can_state = int(self._gateway.can_state)
+        has_live = esc.live is not None
+        has_info = esc.info is not None
+        return link | can_state << 8 | has_live << 16 | has_info << 17
 
     def _device_name(self, _now: int) -> bytes:
-        protocol, info = self._esc.protocol, self._esc.last_info
+        protocol = self._esc.protocol
+        info = self._esc.last_info
         device = protocol.value("device_raw", info)
         if device is None:
             raise SdoAbort(Abort.NO_DATA)
-        return (protocol.device_name(info) or f"device {device}").encode("ascii", "replace")
+        name = protocol.device_name(info) or f"device {device}"
+        return name.encode("ascii", "replace")
 
     def _firmware(self, _now: int) -> bytes:
         text = self._esc.protocol.firmware_text(self._esc.last_info)

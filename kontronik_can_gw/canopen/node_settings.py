@@ -1,4 +1,8 @@
-"""What the configuration says of a node; how it, the EDS and stored values make the dictionary and the ESC's settings (2100h)."""
+"""The configured settings of a node.
+
+The dictionary of a node, and the settings of its ESC (2100h), are made from them, from the EDS and
+from the stored parameters.
+"""
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -11,32 +15,33 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.times import MS
 
 _SELF_START_OFF = 4
-# whatever the limits of an EDS are
-_MIN_TIMEOUT_MS, _MAX_TIMEOUT_MS = 20, 60_000
+# Limits that also hold if the limits of the EDS are wider
+_MIN_TIMEOUT_MS = 20
+_MAX_TIMEOUT_MS = 60_000
 _MAX_CELLS = 0xFF
 
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """What the configuration says of a node.
-
-    ``node_id``: 1..127, or 255 for a node that waits for LSS. ``vendor_id`` None: as the EDS says. ``segment_ns``: distance of the
-    segments of a block upload. ``device``: number of the device that is expected on the line, None for any.
-    """
+    """The configured settings of a node."""
 
     node_id: int
+    """1..127, or 255 for a node that waits for LSS."""
     serial: int = 0
     vendor_id: int | None = None
+    """None: the vendor-ID of the EDS."""
     self_start: bool = False
     read_only: bool = False
     bitrate: int = 500_000
     segment_ns: int = 0
+    """Time between the segments of a block upload."""
     version: str = ""
     device: int | None = None
+    """Number of the expected device on the line. None: any device."""
 
 
 def _entries(settings: EscSettings) -> dict[int, int]:
-    """Settings of an ESC as the sub-indices of 2100h."""
+    """Return the settings of an ESC by their sub-indices of 2100h."""
     return {
         1: settings.pole_pairs,
         2: settings.gear.numerator,
@@ -48,7 +53,7 @@ def _entries(settings: EscSettings) -> dict[int, int]:
 
 
 def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
-    """The settings of 2100h; ``base`` where the EDS has no object for one."""
+    """Return the settings in 2100h. ``base`` has the settings that the EDS does not contain."""
     held = {sub: dictionary.number(at.SETTINGS, sub, own) for sub, own in _entries(base).items()}
     return replace(
         base,
@@ -61,7 +66,7 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
 
 
 def configured_settings(base: EscSettings) -> dict[int, int]:
-    """Sub-indices of 2100h that the configuration sets, and to what."""
+    """Return the values that the configuration sets, by their sub-indices of 2100h."""
     standard = _entries(EscSettings())
     return {sub: given for sub, given in _entries(base).items() if given != standard[sub]}
 
@@ -69,9 +74,10 @@ def configured_settings(base: EscSettings) -> dict[int, int]:
 def make_dictionary(
     eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored
 ) -> Dictionary:
-    """The dictionary of a node before its first reset, the configuration's values as power-on values and the stored ones in place.
+    """Return the dictionary of a node before its first reset.
 
-    Where the configuration leaves a setting at its default, the EDS's default holds.
+    The power-on values are those of the configuration. If it does not change a setting, the default
+    of the EDS is used. The application parameters have their stored values.
     """
     dictionary = Dictionary(eds)
     power_on = {(at.SETTINGS, sub): given for sub, given in configured_settings(base).items()}
@@ -79,10 +85,12 @@ def make_dictionary(
         power_on[0x1018, 1] = settings.vendor_id
     power_on[0x1018, 4] = settings.serial
     for (index, sub), given in power_on.items():
-        if (variable := dictionary.get(index, sub)) is not None:
+        variable = dictionary.get(index, sub)
+        if variable is not None:
             variable.power_on = given
-    if settings.self_start and (variable := dictionary.get(0x1F80)) is not None:
-        variable.power_on = int(variable.power_on) & ~_SELF_START_OFF
+    startup = dictionary.get(0x1F80)
+    if startup is not None and settings.self_start:
+        startup.power_on = int(startup.power_on) & ~_SELF_START_OFF
     dictionary.read_only = settings.read_only
     dictionary.reset(APPLICATION, settings.node_id, stored.application)
     return dictionary
