@@ -140,8 +140,10 @@ class CaptureInput(PlayedInput):
     ) -> "Iterator[list[TimedFrame] | Frames]":
         replay = Replay(gateway, self.header.get("state"), self.marked)
         for frames in self._steps(replay, player):
-            if player is not None and len(sent := player.take_frames()):
-                yield sent
+            if player is not None:
+                sent = player.take_frames()
+                if len(sent):
+                    yield sent
             yield frames
         if player is not None:
             yield player.take_frames(final=True)

@@ -71,7 +71,8 @@ class LogClock:
                 self.steps.append(ClockStep(time_ns, time_ns - last, is_kept=True))
                 last = before = time_ns
             elif time_ns >= last:
-                before, last = last, time_ns
+                before = last
+                last = time_ns
             elif last - time_ns > _DISORDER_NS:
                 if last - before > _LONE_NS and time_ns >= before - _DISORDER_NS:
                     last = max(before, time_ns)  # the frame before this one was too far ahead

@@ -259,11 +259,7 @@ class RowsOfFrames:
                 row_ns = None
                 in_row.clear()
             while (due := freshness.next_expiry) is not None and due < now:
-                expired = freshness.expire(due + 1)
-                if expired:
-                    for part in expired:
-                        changes[part].append((len(times), None))
-                    times.append(due + 1)
+                if self._add_expiry(due + 1):
                     if len(times) == count:
                         yield self._take_block()
                     row_ns = None
@@ -285,6 +281,15 @@ class RowsOfFrames:
             times.append(row_ns)
         if times:
             yield self._take_block()
+
+    def _add_expiry(self, now: int) -> bool:
+        """Add a row without the values that have expired. Return False if there are none."""
+        expired = self._freshness.expire(now)
+        for part in expired:
+            self._changes[part].append((len(self._times), None))
+        if expired:
+            self._times.append(now)
+        return bool(expired)
 
     def _take_block(self) -> tuple[Sequence[int], Sequence[Sequence[Value]]]:
         """Return times and columns of the complete rows, and begin a new block."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _MAX_INT64 = 1 << 63
 _KEPT_TEXTS = 1024
-"""Number of texts that are kept for each column. More texts would not save enough time."""
+"""Number of texts that are kept for each column. More would cost memory and save little time."""
 GROUP = 1 << 16
 """Number of rows in a row group. Its columns stay in memory until it is full."""
 
@@ -45,7 +45,8 @@ def utc_text(wall_ns: int) -> str:
 
 @lru_cache
 def _second_text(second: int) -> str:
-    return f"{datetime.fromtimestamp(second, UTC_ZONE):%Y-%m-%dT%H:%M:%S}"
+    moment = datetime.fromtimestamp(second, UTC_ZONE)
+    return f"{moment:%Y-%m-%dT%H:%M:%S}"
 
 
 def csv_text(text: str) -> str:
