@@ -34,7 +34,9 @@ def copies_of(
     shift = 0
     if settings.base_id is not None:
         shift = settings.base_id - min(message.frame_id for message in ours)
-    copied = _messages_of_each(ours, Binder(escs, settings.bind)) if len(escs) > 1 else set()
+    copied: set[int] = set()
+    if len(escs) > 1:
+        copied = _messages_of_each(ours, Binder(escs, settings.bind))
     ids = []
     for message in messages:
         can_id = message.frame_id

@@ -169,7 +169,8 @@ def _crc_problems(
     own = crc.name.removeprefix(copy.prefix)
     is_bound = job.binder.bound(copy, own) is not None
     is_configured = is_bound or copy.name in job.settings.e2e_data_ids
-    fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
+    is_one_byte = len(crc.pieces) == 1 and crc.length == 8
+    fits = is_one_byte and crc.pieces[0].at % 8 == 0
     has_counter = len(alive) == 1 and alive[0].high >= 14
     has_known_names = False
     if has_counter:

@@ -23,7 +23,7 @@ _E2E = {
 }
 """Endings that together in a message mean AUTOSAR E2E profile 1 without configuration.
 
-They are the endings of the first versions.
+They are the endings that the first versions of the gateway supported.
 """
 _FURTHER = {
     Role.ALIVE: "livecnt livecntr alivectr messagecount msgcounter msgcount msgcntr msgcnt msgctr "
@@ -32,7 +32,7 @@ _FURTHER = {
     Role.CRC: "chksum chksm cksum pruefsumme",
 }
 _E2E_ENDINGS = {role: tuple(texts.split()) for role, texts in _E2E.items()}
-_ENDINGS = {role: (*_E2E_ENDINGS[role], *texts.split()) for role, texts in _FURTHER.items()}
+_ENDINGS = {role: _E2E_ENDINGS[role] + tuple(texts.split()) for role, texts in _FURTHER.items()}
 _LAST_WORDS = {Role.ALIVE: {"bz", "sqc"}, Role.CRC: {"cs", "cks", "chk"}}
 """Words that are too short to be endings, because other words end with them, too."""
 _WHOLE = {"counter", "cntr", "cnt", "ctr"}

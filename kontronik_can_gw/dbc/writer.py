@@ -96,36 +96,71 @@ def dbc_text(
     their bits, each entry is a line, and lines end with LF.
     """
     dbc: Any = database.dbc
-    signals = [(m.key, s) for m in messages for s in _sorted(m)]
-    definitions = [("", d) for d in dbc.attribute_definitions.values()]
-    definitions += [("REL_", d) for d in dbc.relation_attribute_definitions.values()]
-    sections = (
-        [f'VERSION "{_escaped((version or database.version) or "")}"'],
+    nodes = [node.name for node in database.nodes]
+    version = (version or database.version) or ""
+    sections = [
+        [f'VERSION "{_escaped(version)}"'],
         ["NS_ :"],
         ["BS_:"],
-        [" ".join(["BU_:", *(node.name for node in database.nodes)])],
+        [" ".join(["BU_:", *nodes])],
         [f"VAL_TABLE_ {name} {_texts(table)} ;" for name, table in dbc.value_tables.items()],
-        *([_head(m), *map(_line, _sorted(m))] for m in messages),
-        [f"BO_TX_BU_ {m.key} : {','.join(m.senders)};" for m in messages if len(m.senders) > 1],
-        [*_environment(dbc.environment_variables.values())],
-        [*_comments(database, messages)],
-        [f"BA_DEF_{rel} {_definition(d)};" for rel, d in definitions],
-        [
-            f'BA_DEF_DEF_{rel} "{d.name}" {_default(d)};'
-            for rel, d in definitions
-            if d.default_value is not None
-        ],
+    ]
+    for message in messages:
+        lines = [_line(signal) for signal in _sorted(message)]
+        sections.append([_head(message), *lines])
+    sections += [
+        _further_senders(messages),
+        list(_environment(dbc.environment_variables.values())),
+        list(_comments(database, messages)),
+        *_definitions(dbc),
         [*_attributes(database, messages), *relations],
-        [f"VAL_ {key} {s.name} {_texts(s.texts)} ;" for key, s in signals if s.texts],
-        [f"SIG_GROUP_ {m.key} {group};" for m in messages for group in m.groups],
-        [
-            f"SIG_VALTYPE_ {key} {s.name} : {1 if s.length == 32 else 2};"
-            for key, s in signals
-            if s.is_float
-        ],
-        [f"SG_MUL_VAL_ {key} {s.name} {s.pages};" for key, s in signals if s.pages],
-    )
-    return "\n\n".join("\n".join(section) for section in sections if section) + "\n"
+        *_details(messages),
+    ]
+    texts = ["\n".join(section) for section in sections if section]
+    return "\n\n".join(texts) + "\n"
+
+
+def _further_senders(messages: Sequence[MessageRow]) -> list[str]:
+    """Return the lines of messages with several senders."""
+    lines = []
+    for message in messages:
+        if len(message.senders) > 1:
+            lines.append(f"BO_TX_BU_ {message.key} : {','.join(message.senders)};")
+    return lines
+
+
+def _definitions(dbc: Any) -> tuple[list[str], list[str]]:
+    """Return the sections with the definitions and the defaults of attributes."""
+    definitions: list[str] = []
+    defaults: list[str] = []
+    kinds = (("", dbc.attribute_definitions), ("REL_", dbc.relation_attribute_definitions))
+    for suffix, table in kinds:
+        for definition in table.values():
+            definitions.append(f"BA_DEF_{suffix} {_definition(definition)};")
+            if definition.default_value is not None:
+                default = _default(definition)
+                defaults.append(f'BA_DEF_DEF_{suffix} "{definition.name}" {default};')
+    return definitions, defaults
+
+
+def _details(messages: Sequence[MessageRow]) -> tuple[list[str], ...]:
+    """Return the sections with value tables, signal groups, float types and multiplexing."""
+    tables: list[str] = []
+    groups: list[str] = []
+    types: list[str] = []
+    pages: list[str] = []
+    for message in messages:
+        groups += [f"SIG_GROUP_ {message.key} {group};" for group in message.groups]
+        for signal in _sorted(message):
+            place = f"{message.key} {signal.name}"
+            if signal.texts:
+                tables.append(f"VAL_ {place} {_texts(signal.texts)} ;")
+            if signal.is_float:
+                number = 1 if signal.length == 32 else 2
+                types.append(f"SIG_VALTYPE_ {place} : {number};")
+            if signal.pages:
+                pages.append(f"SG_MUL_VAL_ {place} {signal.pages};")
+    return tables, groups, types, pages
 
 
 # --- rows of a database
@@ -220,40 +255,48 @@ def _head(message: MessageRow) -> str:
     return f"BO_ {message.key} {message.name}: {message.length} {sender}"
 
 
-def _line(s: SignalRow) -> str:
-    multiplexing = f" {s.multiplexing}" if s.multiplexing else ""
-    byte_order = "1" if s.is_little_endian else "0"
-    sign = "-" if s.is_signed else "+"
-    place = f"{s.start}|{s.length}@{byte_order}{sign}"
-    scale = f"({_number(s.factor)},{_number(s.offset)})"
-    limits = "|".join(map(_number, s.limits))
-    receivers = ",".join(s.receivers) or "Vector__XXX"
-    unit = _escaped(s.unit)
-    return f' SG_ {s.name}{multiplexing} : {place} {scale} [{limits}] "{unit}" {receivers}'
+def _line(signal: SignalRow) -> str:
+    name = signal.name
+    if signal.multiplexing:
+        name += f" {signal.multiplexing}"
+    byte_order = "1" if signal.is_little_endian else "0"
+    sign = "-" if signal.is_signed else "+"
+    place = f"{signal.start}|{signal.length}@{byte_order}{sign}"
+    scale = f"({_number(signal.factor)},{_number(signal.offset)})"
+    limits = "|".join(map(_number, signal.limits))
+    receivers = ",".join(signal.receivers) or "Vector__XXX"
+    unit = _escaped(signal.unit)
+    return f' SG_ {name} : {place} {scale} [{limits}] "{unit}" {receivers}'
 
 
 def _environment(variables: Any) -> Iterator[str]:
-    for v in variables:
-        limits = f"[{_number(v.minimum)}|{_number(v.maximum)}]"
-        nodes = ",".join(v.access_nodes)
+    for variable in variables:
+        limits = f"[{_number(variable.minimum)}|{_number(variable.maximum)}]"
+        unit = _escaped(variable.unit)
+        initial = _number(variable.initial_value)
+        nodes = ",".join(variable.access_nodes)
         yield (
-            f'EV_ {v.name}: {v.env_type} {limits} "{_escaped(v.unit)}" '
-            f"{_number(v.initial_value)} {v.env_id} {v.access_type} {nodes};"
+            f'EV_ {variable.name}: {variable.env_type} {limits} "{unit}" '
+            f"{initial} {variable.env_id} {variable.access_type} {nodes};"
         )
-    for v in variables:
-        if v.data_size is not None:
-            yield f"ENVVAR_DATA_ {v.name}: {v.data_size};"
+    for variable in variables:
+        if variable.data_size is not None:
+            yield f"ENVVAR_DATA_ {variable.name}: {variable.data_size};"
 
 
 def _comments(database: "Database", messages: Sequence[MessageRow]) -> Iterator[str]:
     dbc: Any = database.dbc
     found = [("", bus.comment) for bus in database.buses]
     found += [(f"BU_ {node.name} ", node.comment) for node in database.nodes]
-    for m in messages:
-        found.append((f"BO_ {m.key} ", m.comment))
-        found += [(f"SG_ {m.key} {s.name} ", s.comment) for s in _sorted(m)]
-    found += [(f"EV_ {v.name} ", v.comment) for v in dbc.environment_variables.values()]
-    return (f'CM_ {owner}"{_escaped(text)}";' for owner, text in found if text is not None)
+    for message in messages:
+        found.append((f"BO_ {message.key} ", message.comment))
+        for signal in _sorted(message):
+            found.append((f"SG_ {message.key} {signal.name} ", signal.comment))
+    for variable in dbc.environment_variables.values():
+        found.append((f"EV_ {variable.name} ", variable.comment))
+    for owner, text in found:
+        if text is not None:
+            yield f'CM_ {owner}"{_escaped(text)}";'
 
 
 def _definition(definition: Any) -> str:
@@ -287,10 +330,12 @@ def _attributes(database: "Database", messages: Sequence[MessageRow]) -> Iterato
     dbc: Any = database.dbc
     owners = [("", _own_attributes(database))]
     owners += [(f"BU_ {node.name} ", _own_attributes(node)) for node in database.nodes]
-    owners += [(f"BO_ {m.key} ", m.attributes) for m in messages]
-    owners += [(f"SG_ {m.key} {s.name} ", s.attributes) for m in messages for s in _sorted(m)]
-    variables = dbc.environment_variables.values()
-    owners += [(f"EV_ {variable.name} ", _own_attributes(variable)) for variable in variables]
+    owners += [(f"BO_ {message.key} ", message.attributes) for message in messages]
+    for message in messages:
+        for signal in _sorted(message):
+            owners.append((f"SG_ {message.key} {signal.name} ", signal.attributes))
+    for variable in dbc.environment_variables.values():
+        owners.append((f"EV_ {variable.name} ", _own_attributes(variable)))
     for owner, attributes in owners:
         for name, value in attributes.items():
             text = _value(value, dbc.attribute_definitions[name])
