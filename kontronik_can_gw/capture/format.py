@@ -141,8 +141,10 @@ def block(kind: bytes, number: int, payload: bytes) -> bytes:
     packed = zlib.compress(payload, 1)
     deflated = len(packed) < len(payload)
     stored = packed if deflated else payload
-    head = _HEAD.pack(MAGIC, kind, deflated, 0, len(stored), len(payload), number & 0xFFFFFFFF)
-    return head + _CRC.pack(zlib.crc32(stored, zlib.crc32(head))) + stored
+    number &= 0xFFFFFFFF
+    head = _HEAD.pack(MAGIC, kind, deflated, 0, len(stored), len(payload), number)
+    crc = zlib.crc32(stored, zlib.crc32(head))
+    return head + _CRC.pack(crc) + stored
 
 
 def json_payload(content: Mapping[str, Any]) -> bytes:

@@ -67,7 +67,8 @@ class RecordedGateway(Gateway):
         super().receive_overrun(now)
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
-        self._note(now, Kind.SAVED, esc, (error or "").encode(), flags=int(error is not None))
+        reason = (error or "").encode()
+        self._note(now, Kind.SAVED, esc, reason, flags=int(error is not None))
         super().saved(esc, error, now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:

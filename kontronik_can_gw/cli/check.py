@@ -38,7 +38,8 @@ def main(args: argparse.Namespace) -> int:
     except UserError as error:
         if not args.json:
             raise
-        print(printable_json({"file": str(path), "mistakes": list(error.problems)}, indent=2))
+        result = {"file": str(path), "mistakes": list(error.problems)}
+        print(printable_json(result, indent=2))
         return error.exit_code
     examples = [
         f"{loaded.config.file}: port of {esc.name}: {esc.port} is the example's. "
@@ -119,7 +120,8 @@ def details(loaded: Loaded) -> Iterator[str]:
         yield from ("", *output.lines())
     if loaded.database is not None:
         bus = BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
-        yield from ("", *markdown("What is sent", [], dbc(bus, loaded.escs)).splitlines())
+        text = markdown("What is sent", [], dbc(bus, loaded.escs))
+        yield from ("", *text.splitlines())
 
 
 def _counted(number: int, noun: str) -> str:
@@ -157,7 +159,9 @@ def document(
         "mistakes": [],
         "warnings": warnings,
         "configuration": tomllib.loads(as_toml(config)),
-        "escs": [{"name": e.name, "port": e.port, "protocol": e.protocol} for e in config.esc],
+        "escs": [
+            {"name": esc.name, "port": esc.port, "protocol": esc.protocol} for esc in config.esc
+        ],
         "can": {"interface": can.interface, "channel": can.channel, "bitrate": can.bitrate},
         "bus_load": load,
         "frames_per_second": frames,

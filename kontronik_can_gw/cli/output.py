@@ -89,7 +89,8 @@ def output_of(args: argparse.Namespace, name: str, default: str | None = None) -
 
     Raises UserError if both are given, and if there is neither an output nor a default.
     """
-    given = [each for each in (args.output, getattr(args, name.lower())) if each is not None]
+    outputs = (args.output, getattr(args, name.lower()))
+    given = [output for output in outputs if output is not None]
     if len(given) > 1:
         raise UserError(f"{name} and -o: are two outputs. Give one of them.")
     if not given and default is None:

@@ -200,8 +200,8 @@ def settle_memory() -> None:
 
     Garbage collections never scan frozen objects again. The hot path makes no reference cycles
     (tests/runtime/test_garbage.py), so later collections scan only the young generations. Full
-    collections return the memory of freed objects to the system. They run here and once a minute
-    (runtime/housekeeping.py).
+    collections also free the memory that the interpreter keeps of freed objects. They run here and
+    once a minute (runtime/housekeeping.py).
     """
     from kontronik_can_gw.native.load import give_back
 

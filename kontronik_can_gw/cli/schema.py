@@ -16,5 +16,6 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    write_output(args.output, json.dumps(schema(), indent=2) + "\n", force=args.force)
+    text = json.dumps(schema(), indent=2)
+    write_output(args.output, text + "\n", force=args.force)
     return 0

@@ -234,7 +234,8 @@ def _not_ready(config: Path) -> list[str]:
 
 def _own_program() -> str:
     """Return the path of this Python's installed program. Raises UserError if there is none."""
-    for folder in (Path(sysconfig.get_path("scripts")), Path(sys.argv[0]).absolute().parent):
+    scripts = Path(sysconfig.get_path("scripts"))
+    for folder in (scripts, Path(sys.argv[0]).absolute().parent):
         if os.access(folder / NAME, os.X_OK):
             return str(folder / NAME)
     raise UserError(f"no installed {NAME} belongs to this Python. Name it with --executable.")

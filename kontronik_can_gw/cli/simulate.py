@@ -167,7 +167,8 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _to_files(escs: list[SimulatedEsc], output: str, time_ns: int, *, force: bool) -> None:
-    names = [output.replace("{n}", str(number)) for number in range(1, len(escs) + 1)]
+    numbers = range(1, len(escs) + 1)
+    names = [output.replace("{n}", str(number)) for number in numbers]
     for name in names:
         check_output(name, (), force=force)
     for number, (esc, name) in enumerate(zip(escs, names, strict=True), 1):

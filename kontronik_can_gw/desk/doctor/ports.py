@@ -105,9 +105,15 @@ def _users(machine: Machine, findings: Findings, status: os.stat_result, is_pty:
 
     The simulator has a pseudo terminal open, too. A getty is reported by another check.
     """
-    holders = [each for each in machine.openers(status) if "getty" not in each.name]
-    own = [each for each in holders if each.is_gateway]
-    others = [] if is_pty else [each for each in holders if not each.is_gateway]
+    own = []
+    others = []
+    for process in machine.openers(status):
+        if "getty" in process.name:
+            continue
+        if process.is_gateway:
+            own.append(process)
+        elif not is_pty:
+            others.append(process)
     for process in own:
         findings.say("port.users", "gateway", who=process)
     if others:

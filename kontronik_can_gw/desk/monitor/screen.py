@@ -281,7 +281,8 @@ def _page(esc: Esc, width: int, height: int) -> list[Text]:
         ]
         chart = sparkline(esc, quantity, seconds, lines)
         rows += _chart_rows(cells, chart)
-    return [*_page_head(esc), *table(rows, width, 2, (*_PAGE_WIDTHS, seconds))]
+    least = (*_PAGE_WIDTHS, seconds)
+    return [*_page_head(esc), *table(rows, width, 2, least)]
 
 
 def _page_head(esc: Esc) -> list[Text]:
@@ -348,7 +349,8 @@ def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
         ]
         chart = sparkline(esc, quantity, seconds, lines)
         rows += _chart_rows(cells, chart)
-    return [line(), *table(rows, width, 3, (names, *_HISTORY_WIDTHS, seconds))]
+    least = (names, *_HISTORY_WIDTHS, seconds)
+    return [line(), *table(rows, width, 3, least)]
 
 
 def _is_supplied(quantity: Quantity, escs: Sequence[Esc]) -> bool:
@@ -373,7 +375,8 @@ def table_of(escs: Sequence[Esc], width: int) -> list[Text]:
     for column in range(kept):
         room -= _widest([row[column] for row in values], _VALUE_WIDTH) + 1
     name_width, state_width = _name_and_state_widths(escs, room)
-    rows: list[list[Part]] = [[("ESC", "dim"), ("link", "dim"), ("state", "dim"), *values[0]]]
+    head: list[Part] = [("ESC", "dim"), ("link", "dim"), ("state", "dim")]
+    rows = [head + values[0]]
     for esc, link, cells in zip(escs, links, values[1:], strict=True):
         state = line(_state_part(esc))
         state.truncate(state_width, overflow="ellipsis")

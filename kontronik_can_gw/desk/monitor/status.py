@@ -42,7 +42,19 @@ FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """Exceptions caused by a document whose values have unexpected types."""
 _WIDTH = 80
-_WIDTHS = {"ESC": 3, "link": 10, "Hz": 3, "age": 6, "V": 5, "A": 6, "1/min": 6, "°C": 3, "CRC": 5, "line": 4, "lost": 4}  # fmt: skip
+_WIDTHS = {
+    "ESC": 3,
+    "link": 10,
+    "Hz": 3,
+    "age": 6,
+    "V": 5,
+    "A": 6,
+    "1/min": 6,
+    "°C": 3,
+    "CRC": 5,
+    "line": 4,
+    "lost": 4,
+}
 """Heads and widths of the table's columns."""
 
 Document = Mapping[str, Any]
@@ -111,8 +123,11 @@ def look_at_first(files: Sequence[Path], now: int, config: Path | None = None) -
     If no gateway runs, the result that best shows the reason is returned. ``config`` is the
     configuration that the gateway must have.
     """
-    seen = [look_at(file, now, config) for file in files]
-    return min(seen, key=lambda each: (each.document is None, each.code, each.is_missing))
+
+    def rank(seen: Seen) -> tuple[bool, int, bool]:
+        return seen.document is None, seen.code, seen.is_missing
+
+    return min([look_at(file, now, config) for file in files], key=rank)
 
 
 def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
@@ -233,7 +248,8 @@ def lines_of(seen: Seen) -> Iterator[Text]:
         yield from _head(seen, document)
         yield from _can_lines(document)
         yield line()
-        yield from table(list(_esc_rows(document)), _WIDTH, 2, tuple(_WIDTHS.values()))
+        rows = list(_esc_rows(document))
+        yield from table(rows, _WIDTH, 2, tuple(_WIDTHS.values()))
         for trouble in seen.troubles:
             yield from wrapped(trouble, "bold red", _WIDTH)
         yield from alarm_lines(alarms(document), _WIDTH)

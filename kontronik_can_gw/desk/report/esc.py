@@ -176,9 +176,11 @@ class EscFlight:
         present = nothing if self._live is None else columns[self._live]
         self._find_gaps(times, present)
         parts = [columns.get(source, nothing) for source in DEVICE]
-        for row, about in self._changes("device", [*zip(*parts, strict=True)]):
+        devices = [*zip(*parts, strict=True)]
+        for row, about in self._changes("device", devices):
             self._name_device(times[row], *about)
-        for row, state in self._changes("state", columns.get(_state_of(columns), ())):
+        states = columns.get(_state_of(columns), ())
+        for row, state in self._changes("state", states):
             self._change_state(times[row], state)
         for source, word, bits, shift in self._words:
             for row, value in self._changes(source, columns[source]):

@@ -86,7 +86,9 @@ class Flight:
         low, high = window
         self._from_ns = 0 if low is None else round(low * SECOND)
         self._to_ns = None if high is None else round(high * SECOND)
-        self._gap_ns = max(500 * MS, *(settings.timeout_ns + 250 * MS for settings in escs))
+        timeouts = [settings.timeout_ns for settings in escs]
+        self._gap_ns = max(500 * MS, max(timeouts) + 250 * MS)
+        """Two rows further apart than this have a gap between them."""
         self._blank = ((None,),) * len(fields)
         self._gateway_state = column_of(fields, "gateway_state", None)
         self.seen = Events()
