@@ -49,9 +49,22 @@ enum { KCG_PAGES = 64 };
 #define KCG_BYTE_NS (11 * INT64_C(1000000000) / 115200) /* A byte on the wire (8E1), in ns. */
 
 /* Events of an ESC (twin: telemetry.Event). */
-enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8, KCG_NEW_STATE = 16 };
+enum {
+    KCG_LIVE = 1,      /* Live data were received, or expired. */
+    KCG_INFO = 2,      /* Info was received, or expired. */
+    KCG_LINK = 4,      /* The state of the link, the layout or the device has changed. */
+    KCG_SECOND = 8,    /* A second of the statistics has ended. */
+    KCG_NEW_STATE = 16 /* The first reading, other error bits, or another device. */
+};
 /* States of an ESC's link (twin: telemetry.LinkState). */
-enum { KCG_NEVER_SEEN, KCG_SEARCHING, KCG_OK, KCG_DEGRADED, KCG_LOST, KCG_PORT_ERROR };
+enum {
+    KCG_NEVER_SEEN, /* No byte was received. */
+    KCG_SEARCHING,  /* Bytes, but no frame. */
+    KCG_OK,
+    KCG_DEGRADED,   /* Frames, but too many errors in the last second. */
+    KCG_LOST,       /* Live data have expired. */
+    KCG_PORT_ERROR  /* The port is unusable. */
+};
 
 /* A CAN frame with the same layout as SocketCAN's struct can_frame or canfd_frame. */
 typedef struct {
@@ -82,17 +95,53 @@ enum {
 /* Indices of kcg.gateway. The core writes KCG_ESCS_OK, kcg_init writes KCG_STARTED_NS, and the
    owner writes all others. */
 enum {
-    KCG_ESCS_OK, KCG_GATEWAY_STATE, KCG_CAN_STATE, KCG_ESC_COUNT, KCG_SENT_FRAMES, KCG_REPLACED_FRAMES, KCG_SEND_FAILURES,
-    KCG_RECEIVED_FRAMES, KCG_BUS_OFF_COUNT, KCG_DROPPED_FRAMES, KCG_ID_CONFLICTS, KCG_STARTED_NS, KCG_OF_GATEWAY_COUNT
+    KCG_ESCS_OK, /* Number of ESCs with fresh live data. */
+    KCG_GATEWAY_STATE,
+    KCG_CAN_STATE,
+    KCG_ESC_COUNT,
+    KCG_SENT_FRAMES,
+    KCG_REPLACED_FRAMES, /* Frames that a newer one replaced before they were sent. */
+    KCG_SEND_FAILURES,
+    KCG_RECEIVED_FRAMES,
+    KCG_BUS_OFF_COUNT,
+    KCG_DROPPED_FRAMES,
+    KCG_ID_CONFLICTS,
+    KCG_STARTED_NS, /* Time of kcg_init. */
+    KCG_OF_GATEWAY_COUNT
 };
-/* kcg_signal.divisor: 1, pole pairs, pole pairs times gear, or number of cells. */
-enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
+/* kcg_signal.divisor. */
+enum {
+    KCG_BY_ONE,
+    KCG_BY_POLES,  /* Pole pairs. */
+    KCG_BY_OUTPUT, /* Pole pairs times gear. */
+    KCG_BY_CELLS   /* Number of cells. */
+};
 /* Arguments of kcg_count. First the counters of a stream (twin: deframer.Counters), which are
    stored in kcg_esc.count. From KCG_COUNTS on, states of the ESC and sums of counters. */
 enum {
-    KCG_N_BYTES, KCG_N_LIVE_V4, KCG_N_LIVE_LEGACY, KCG_N_INFO_V4, KCG_N_INFO_LEGACY, KCG_N_HEADERS, KCG_N_CRC_ERRORS, KCG_N_UNKNOWN_KINDS,
-    KCG_N_DROPPED_NOISE, KCG_N_DROPPED_CRC, KCG_N_DROPPED_UNKNOWN_KIND, KCG_N_DROPPED_INCOMPLETE, KCG_N_LONG_RUN_BYTES, KCG_N_LONGER_CRCS, KCG_N_LOSSES, KCG_N_LATE_FRAMES, KCG_N_SUSPECT_FRAMES, KCG_COUNTS,
-    KCG_N_LINK_STATE = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE_FRAMES, KCG_N_INFO_FRAMES, KCG_N_DROPPED_BYTES
+    KCG_N_BYTES,
+    KCG_N_LIVE_V4,
+    KCG_N_LIVE_LEGACY,
+    KCG_N_INFO_V4,
+    KCG_N_INFO_LEGACY,
+    KCG_N_HEADERS,
+    KCG_N_CRC_ERRORS,
+    KCG_N_UNKNOWN_KINDS,
+    KCG_N_DROPPED_NOISE,
+    KCG_N_DROPPED_CRC,
+    KCG_N_DROPPED_UNKNOWN_KIND,
+    KCG_N_DROPPED_INCOMPLETE,
+    KCG_N_LONG_RUN_BYTES,
+    KCG_N_LONGER_CRCS,
+    KCG_N_LOSSES,         /* Times that live data expired. */
+    KCG_N_LATE_FRAMES,    /* Frames that were too old when they were read. */
+    KCG_N_SUSPECT_FRAMES, /* Legacy frames with an impossible operating state. */
+    KCG_COUNTS,
+    KCG_N_LINK_STATE = KCG_COUNTS,
+    KCG_N_LAYOUT,
+    KCG_N_LIVE_FRAMES,
+    KCG_N_INFO_FRAMES,
+    KCG_N_DROPPED_BYTES
 };
 /* kcg_signal.flags. */
 enum {
@@ -163,9 +212,15 @@ typedef struct {
     uint8_t page;      /* `page` of its frames. */
     uint8_t reserved[5];
 } kcg_slot_row;
-/* Settings of an ESC. timeout: in ns. crc_errors: CRC errors in a second that make the link
-   KCG_DEGRADED. cells: number of cells; 0: the number that the ESC reports. */
-typedef struct { int64_t timeout; uint32_t crc_errors, poles, gear_numerator, gear_denominator; uint8_t cells, reserved[7]; } kcg_settings;
+/* Settings of an ESC. */
+typedef struct {
+    int64_t timeout;     /* Live data expire after this time, in ns. */
+    uint32_t crc_errors; /* CRC errors in a second that make the link KCG_DEGRADED. */
+    uint32_t poles;      /* Pole pairs. */
+    uint32_t gear_numerator, gear_denominator;
+    uint8_t cells;       /* Number of cells. 0: the number that the ESC reports. */
+    uint8_t reserved[7];
+} kcg_settings;
 /* All constant tables. */
 typedef struct {
     const kcg_message *message;
@@ -183,37 +238,55 @@ typedef struct {
 } kcg_plan;
 
 /* State of an ESC. Fields that are used often are at the beginning, because the instructions of
-   small processors reach them with short offsets.
-   has_live, has_info: the data are fresh. had_live, had_info: some were received since the start.
-   has_time: live_ns is valid. turns: the electrical speed is not 0. cells: the number in use.
-   need: bytes that are missing before the next decision of the deframer. */
+   small processors reach them with short offsets. Times are in ns. */
 typedef struct {
-    uint8_t has_live, has_info, had_live, had_info, has_time, turns, cells, held_count, need, arrivals, blame, reported, link, layout;
-    int32_t rate, power; /* rate: in 0.1 Hz, or -1 if unknown. power: in mW. */
+    uint8_t has_live, has_info; /* The data are fresh. */
+    uint8_t had_live, had_info; /* Data were received since the start, in the current layout. */
+    uint8_t has_time;           /* live_ns is valid. */
+    uint8_t turns;              /* The electrical speed is not 0. */
+    uint8_t cells;              /* The number of cells in use. */
+    uint8_t held_count;         /* Bytes in `held`. */
+    uint8_t need;               /* Bytes that the deframer needs for its next decision. */
+    uint8_t arrivals;           /* Entries of arrival_bound and arrival_end. */
+    uint8_t blame;              /* Counter for bytes dropped before `blame_until`. */
+    uint8_t reported;           /* Events that were not yet returned. */
+    uint8_t link;               /* State of the link. */
+    uint8_t layout;             /* 0: unknown, 1: V4, 2: legacy. */
+    int32_t rate;               /* Live frames per second in 0.1 Hz, or -1 if unknown. */
+    int32_t power;              /* In mW. */
     kcg_settings settings;
     uint64_t count[KCG_COUNTS];
     /* Live frames, dropped bytes, bytes and CRC errors at the beginning of the current second. */
     uint32_t window[4];
-    /* Positions in the stream. They overflow, so compare them by their difference. */
+    /* Positions in the stream. They overflow, so compare them by their difference.
+       base: of the first held byte. blame_until: end of the last frame that was rejected. */
     uint32_t base, blame_until;
-    uint64_t energy; /* In mW s. energy_rest: the rest in mW ns. */
-    int64_t energy_rest, run_time;
-    int64_t live_ns, live_bound, info_bound, last_info_ns, window_ns, interval;
+    uint64_t energy;            /* In mW s. */
+    int64_t energy_rest;        /* The rest in mW ns. */
+    int64_t run_time;
+    int64_t live_ns, live_bound; /* Newest live frame: its time, and the earliest possible time. */
+    int64_t info_bound, last_info_ns;
+    int64_t window_ns;          /* Beginning of the current second. */
+    int64_t interval;           /* Mean time between live frames in the last second, or 0. */
+    /* Held bytes before the position arrival_end arrived at arrival_bound at the earliest. */
     int64_t arrival_bound[KCG_MAX_HELD + 1];
     uint32_t arrival_end[KCG_MAX_HELD + 1];
-    /* Increases when live data or info data change or expire. */
-    uint32_t generation;
+    uint32_t generation;        /* Increases when live data or info data change or expire. */
     uint8_t live[KCG_BODY_SIZE], info[KCG_BODY_SIZE], held[KCG_MAX_HELD + KCG_LONGEST_FRAME];
 } kcg_esc;
 
-/* State of a message or slot. */
+/* State of a message or slot. Times are in ns. */
 typedef struct {
-    uint16_t place_in_heap, alive; /* alive: the alive counter. */
-    /* page: index of the next page. why: reasons why it is pending, or 0. */
-    uint8_t page, pages_to_send, cycle_deferred, why;
-    /* last: time of the last frame. cycle_due, deferred: next times, or KCG_NEVER. since: time
-       since which it is pending. */
-    int64_t last, cycle_due, deferred, since;
+    uint16_t place_in_heap;
+    uint16_t alive;         /* The alive counter. */
+    uint8_t page;           /* Index of the next page. */
+    uint8_t pages_to_send;  /* Number of pages that must be sent without a further event. */
+    uint8_t cycle_deferred; /* A cycle was due while the minimum distance did not allow a frame. */
+    uint8_t why;            /* Reasons why it is pending, or 0. */
+    int64_t last;           /* Time of the last frame. */
+    int64_t cycle_due;      /* Next cycle, or KCG_NEVER. */
+    int64_t deferred;       /* When the minimum distance allows the next frame, or KCG_NEVER. */
+    int64_t since;          /* Time since which it is pending. */
 } kcg_sending;
 
 /* State of a slot, besides its kcg_sending. */
@@ -221,18 +294,22 @@ typedef struct {
     uint64_t seen_bits;      /* The watched bits of the last event or frame. */
     uint64_t frames_sent;
     uint8_t state;           /* Started, changed since the last frame, `seen_bits` is valid. */
-    uint8_t transfer_number; /* Number of the next transfer with this id; in the first slot with it. */
+    uint8_t transfer_number; /* Next transfer of this id, kept in the first slot with the id. */
     uint8_t reserved[6];
 } kcg_slot;
 
-/* A UART frame that was found but not processed. end: its position in the stream. */
-typedef struct { uint32_t end; uint8_t is_info, layout, length, body[KCG_BODY_SIZE]; } kcg_found;
+/* A UART frame that was found but not processed. */
+typedef struct {
+    uint32_t end; /* Position in the stream. */
+    uint8_t is_info, layout;
+    uint8_t body[KCG_BODY_SIZE];
+} kcg_found;
 
 /* The core. The owner writes only `mask` and `gateway`. */
 typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;
-    kcg_sending *sending; /* Of the messages, then of the slots. */
+    kcg_sending *sending; /* For the messages, then for the slots. */
     kcg_slot *slot;
     /* Bits of the last frame of each page, for messages that are sent on change. */
     uint64_t *last;
@@ -240,14 +317,20 @@ typedef struct {
     uint8_t *report; /* ESCs with events that were not yet returned, oldest first. */
     /* heap: messages by their next deadline. pending: messages to be sent. */
     uint16_t *heap, *pending;
-    uint32_t pendings, taken, heaped, reports;
-    uint32_t mask; /* Events that functions return. */
-    int read_esc;  /* ESC whose bytes are being processed, or -1. */
-    uint32_t found_count, found_at, read_end;
-    int64_t read_now, read_shown, read_bound;
-    int64_t second, next_expiry;
+    uint32_t pendings, heaped, reports; /* Number of entries of `pending`, `heap` and `report`. */
+    uint32_t taken;        /* Frames that the last kcg_take returned. */
+    uint32_t mask;         /* Events that functions return. */
+    int read_esc;          /* ESC whose bytes are being processed, or -1. */
+    uint32_t found_count, found_at; /* Frames in `found`; how many of them were processed. */
+    uint32_t read_end;     /* Position in the stream after the bytes that were read. */
+    int64_t read_now;      /* Time of the read. */
+    int64_t read_bound;    /* The last byte arrived at this time at the earliest. */
+    int64_t read_shown;    /* Time that the last byte is given. */
+    int64_t second;        /* Beginning of the current second of the gateway's values. */
+    int64_t next_expiry;   /* The earliest deadline of all ESCs; 0: unknown. */
     int64_t gateway[KCG_OF_GATEWAY_COUNT]; /* States and counters of the gateway. */
-    uint8_t stopping, again;
+    uint8_t stopping;      /* kcg_stop was called. */
+    uint8_t again;         /* The last kcg_receive returned KCG_AGAIN. */
     kcg_found found[KCG_FOUND];
 } kcg;
 
@@ -331,9 +414,9 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
    are packed again with newer values. The rest of a transfer that was sent in part is dropped. */
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
 #if KCG_SLOTS
-/* Slots (twin: core/slots.py) are messages that their owner starts and stops. A slot has one page, one
-   ESC and at most 8 bytes (a transfer: 16 bytes, with KCG_DATA 64). `cycle` counts from the last
-   frame.
+/* Slots (twin: core/slots.py) are messages that their owner starts and stops. A slot has one page,
+   one ESC and at most 8 bytes (a transfer: 16 bytes, with KCG_DATA 64). `cycle` counts from the
+   last frame.
    slot: a number from 0, less than kcg_plan.slots.
    The owner may write the rows of a stopped slot in `message`, `signal` and `piece` at any time.
    While a slot is started it may write all rows except the signals, and must then call
@@ -357,7 +440,8 @@ uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
 void kcg_end(kcg *g, int esc);
 /* Reads a value: x * over / by, in steps. Returns 0 if it is not available.
    s: a row of the plan, or another row that refers to the plan. */
-int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over);
+int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by,
+              int64_t *over);
 /* Returns a counter or state of an ESC: KCG_N_... */
 uint64_t kcg_count(const kcg_esc *e, int what);
 /* Returns the CRC-32 of `size` bytes, continued from `crc`, which is 0 at the beginning. With

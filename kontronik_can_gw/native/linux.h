@@ -33,8 +33,8 @@ typedef struct {
 /* A recorded call of the core. The data follow, filled up to a multiple of 8 bytes. */
 typedef struct { int64_t now, came; uint32_t size; uint8_t kind, esc, reserved[2]; } kcg_entry;
 
-/* What the owner wants. It writes this before kcg_begin, and the deadlines also after an event.
-   All times are in ns. */
+/* The owner's request. It is written before kcg_begin, and its deadlines also after an event. All
+   times are in ns. */
 typedef struct {
     int64_t due;          /* Next deadline of the loop: return at this time. */
     int64_t outputs_due;  /* Next deadline of the outputs: return KCG_OUTPUTS at this time. */
@@ -54,7 +54,7 @@ typedef struct {
     int64_t settings_checked; /* Last check of the ports' settings. */
 } kcg_turn_times;
 
-/* What came of a run. */
+/* The result of a run. */
 typedef struct {
     int64_t late;      /* Time of the last turn and its wait beyond the planned pause, in ns. */
     int32_t event;     /* An event of the core, or KCG_OUTPUTS; less than 0: none. */
@@ -67,7 +67,7 @@ typedef struct {
 
 /* The reads of the current turn. */
 typedef struct {
-    int64_t since;               /* None of the bytes in `data` had arrived at this time. */
+    int64_t since;               /* The bytes in `data` arrived after this time. */
     uint32_t ready, at;          /* Number of ports that are ready; how many of them were served. */
     uint32_t size;               /* Bytes in `data` that the core has not processed. */
     uint32_t has_advanced;       /* 1: kcg_advance was called. */
@@ -111,7 +111,7 @@ int kcg_watch(kcg_turns *t);
 /* Starts a run. Call it before the first kcg_turn. */
 void kcg_begin(kcg_turns *t);
 /* Makes turns until the loop has something to do.
-   Returns 0 if the loop has to make the next turn: `ports.fds` contains what is ready.
+   Returns 0 if the loop has to make the next turn: `ports.fds` shows which descriptors are ready.
    Returns 1 if the owner has to follow `result.event`. Then it calls kcg_turn again, after it has
    put the frames that outputs made of the event into `queue`. Or it calls kcg_leave: then the loop
    makes the rest of the turn. After KCG_OUTPUTS the owner must have changed request.outputs_due. */
