@@ -1,4 +1,4 @@
-"""Slots of the core in C (core.h, kcg_slot_start ...): their rows in its tables, and each as its owner sees it."""
+"""Slots of the core in C (core.h, kcg_slot_start): their rows in its tables, and their interface."""
 
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.core import NativeCore
 
 MAX_SIGNALS = 8
-"""Of a slot."""
+"""Number of signals of a slot."""
 _MAX_PLANS = 256
-"""Kept."""
+"""Number of plans whose rows are kept."""
 _WORD = (1 << 64) - 1
 _MAX_IN_ONE_FRAME = 7
-"""Bytes of a transfer of one frame."""
+"""Largest transfer in bytes that one frame can hold."""
 
 
 class Place(NamedTuple):
-    """Where a slot's rows are: its number, its message, its first signal and piece."""
+    """The number of a slot, and the indices of its message, first signal and first piece."""
 
     number: int
     message: int
@@ -33,7 +33,10 @@ class Place(NamedTuple):
 
 
 def reserve(tables: Tables, slots: int) -> list[list[Place]]:
-    """Add empty rows for ``slots`` of each ESC, or as many as there is room for. Returns the places of each ESC."""
+    """Add empty rows for ``slots`` slots of each ESC, or for as many as there is room.
+
+    Return the places of each ESC.
+    """
     count = len(tables.listeners_of)
     used = max(len(tables.signals), len(tables.messages), len(tables.listeners), tables.pages)
     slots = min(slots, (MAX_ROWS - used) // (MAX_SIGNALS * count))
@@ -70,9 +73,9 @@ def _add(tables: Tables, esc: int) -> Place:
 def merge(
     core: "NativeCore", frames: list[CanFrame], in_python: list[PendingSlot]
 ) -> list[CanFrame]:
-    """The frames that kcg_take returned, with Python's slots at their places among them.
+    """Return the frames of kcg_take, with frames of slots in Python at their places among them.
 
-    Slots that were placed are removed from ``in_python``; slots that remain come after all frames.
+    Removes these slots from ``in_python``. The slots that remain are sent after all frames.
     """
     merged: list[CanFrame] = []
     first_slot = core.plan.messages
@@ -92,14 +95,14 @@ def merge(
 
 
 def _count_frames(message: Any) -> int:
-    """The number of frames of a row of kcg_message."""
+    """Return the number of frames of a row of kcg_message (twin: core.c, parts_of)."""
     is_long = message.flags & KCG.TRANSFER and message.length > _MAX_IN_ONE_FRAME
     return (int(message.length) + 8) // 7 if is_long else 1
 
 
 @lru_cache(_MAX_PLANS)
 def _rows(plan: SlotPlan, protocol: str) -> Tables:
-    """The rows of a slot for ESC 0. NotInCore where the core in C cannot express it."""
+    """Return the rows of a slot for ESC 0. Raises NotInCore if the core in C cannot express it."""
     if plan.only_python:
         raise NotInCore(plan.only_python)
     tables = Tables(Layout("", "", (plan.message,)), (EscSettings(protocol=protocol),))
@@ -109,7 +112,7 @@ def _rows(plan: SlotPlan, protocol: str) -> Tables:
 
 
 class NativeSlot:
-    """As Slot: in C where it can be, else ``python`` is at work."""
+    """A Slot that runs in C if the core has all of its values. Otherwise ``python`` runs it."""
 
     def __init__(
         self, core: "NativeCore", place: Place | None, esc: int, python: PythonSlot
@@ -176,7 +179,7 @@ class NativeSlot:
         return found
 
     def _write(self, settings: SlotSettings) -> bool:
-        """Write the rows; False where the slot cannot be in C."""
+        """Write the slot's rows. Return False if it cannot run in C."""
         plan, place, core = settings.plan, self._place, self._core
         if place is None:
             return False

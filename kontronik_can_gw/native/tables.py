@@ -1,7 +1,9 @@
-"""Compiled messages -> the tables of the core in C (core.h, kcg_plan), in this machine's layout. NotInCore for what it cannot express.
+"""Makes the tables of the core in C (core.h, kcg_plan) from compiled messages.
 
-The proofs are in scale.py: no product leaves int64, whatever value comes and whatever settings within the limits. What cannot be proven
-runs on the Python core; settings beyond them that a master writes to 2100h leave the speeds that they divide not available.
+Raises NotInCore for a message that the core in C cannot express. scale.py proves that no product
+leaves int64, for any value and any settings within the limits. A message without this proof runs
+on the core in Python. If a CANopen master writes settings beyond the limits to object 2100h, the
+speeds that they divide are not available.
 """
 
 import struct
@@ -37,7 +39,7 @@ from kontronik_can_gw.status import GatewayState
 
 ALL_ESCS = 255
 MAX_ROWS = 0xFFFF
-"""Of a table that is addressed by 16 bits."""
+"""Number of rows of a table whose index has 16 bits."""
 MAX_ALIVE, MAX_BITS = 1 << 16, 64
 _DIVISORS = {
     Divisor.ONE: KCG.BY_ONE,
@@ -49,7 +51,7 @@ _M64 = (1 << 64) - 1
 
 
 class Tables:
-    """Rows of each table, in the order of their fields."""
+    """The tables of the core for a layout."""
 
     def __init__(self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False) -> None:
         self._plans = layout.messages
@@ -62,7 +64,7 @@ class Tables:
         self.slots: list[Any] = []
         """A row of kcg_slot_row for each slot."""
         self.listeners_of: list[list[int]] = [[] for _ in escs]
-        """The messages that follow events of each ESC."""
+        """For each ESC, the messages that follow its events."""
         self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
@@ -83,7 +85,7 @@ class Tables:
 
     @property
     def names(self) -> dict[str, list[str]]:
-        """Names of the rows of messages and signals."""
+        """Names of the rows of the tables of messages and signals."""
         signals = [
             f"{plan.name}.{signal.name}"
             for plan in self._plans
@@ -94,17 +96,17 @@ class Tables:
 
     @property
     def listeners(self) -> list[int]:
-        """``listeners_of`` all ESCs, one after the other."""
+        """``listeners_of`` of all ESCs, one after the other."""
         return [index for each in self.listeners_of for index in each]
 
     @property
     def first_listeners(self) -> list[int]:
-        """Where those of each ESC begin in ``listeners``, and where the last end."""
+        """The first index in ``listeners`` of each ESC, and the length of ``listeners``."""
         return [*accumulate(map(len, self.listeners_of), initial=0)]
 
     @property
     def arrays(self) -> dict[str, tuple[Any, Any]]:
-        """The tables of kcg_plan in its order: their type and rows."""
+        """Type and rows of each table of kcg_plan, by name."""
         return {
             "message": (Message, self.messages),
             "signal": (Signal, self.signals),
@@ -118,7 +120,7 @@ class Tables:
 
     @property
     def counts(self) -> dict[str, int]:
-        """The numbers of kcg_plan in its order."""
+        """The numbers of kcg_plan, by name."""
         words, escs, slots = len(self.constants), len(self.settings), len(self.slots)
         counts = {"words": words, "messages": len(self.messages) - slots, "escs": escs}
         return counts | {"pages": self.pages, "slots": slots}
@@ -170,7 +172,7 @@ class Tables:
         if signal.length > MAX_BITS:
             raise NotInCore(f"{plan.name}.{signal.name}: {signal.length} bits")
         first_piece = len(self.pieces)
-        for piece in signal.pieces:  # never across 64 bits
+        for piece in signal.pieces:  # split at borders of 64 bits
             width = min(piece.width, 64 - piece.at % 64)
             self.pieces.append(Piece(piece.shift, width, piece.at))
             if width < piece.width:
@@ -209,7 +211,7 @@ class Tables:
 
 
 Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
-"""Offset after the header and wire type of each word of live data and of info."""
+"""Offset after the header and wire type of each word, for live data and info data."""
 _KINDS = {
     Kind.INTEGRAL: KCG.OF_ENERGY,
     Kind.RUN_TIME: KCG.OF_RUN_TIME,
@@ -217,11 +219,11 @@ _KINDS = {
     Kind.RATE: KCG.OF_RATE,
 }
 _NAME_OF = {"received_bytes": "bytes", "live_counter": "live_frames"}
-"""Of values that are one of COUNTS under another name."""
+"""Values that have another name in COUNTS."""
 
 
 def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
-    """Where the steps of a value come from, in a row of Signal. NotInCore where the core does not have it."""
+    """Enter the source of a value into a row of Signal. Raises NotInCore if the core has none."""
     row.divisor = _DIVISORS[value.divisor]
     name = _NAME_OF.get(value.name, value.name)
     if value.kind in (Kind.WIRE, Kind.BITS):
@@ -254,7 +256,7 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
 
 
 def places_of(protocol: EscProtocol) -> Places:
-    """Offset after the header and wire type of each word of live data and of info."""
+    """Return offset and wire type of each word. Raises NotInCore if C cannot decode the protocol."""
     if protocol.wire is None:
         raise NotInCore(f"ESC protocol {protocol.name}")
     found: Places = ([], [])
