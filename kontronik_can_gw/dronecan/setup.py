@@ -17,9 +17,11 @@ from kontronik_can_gw.status import GatewayStatus
 
 _USUAL_BITRATE = 1_000_000
 _LOWEST_RATE_HZ = 10
-"""ArduPilot takes a motor for stopped if it hears nothing of it for 210 ms."""
-_STATUS, _BEC = (8, 8, 3), (8, 6)
-"""Data bytes of the frames of esc.Status, of CircuitStatus and Temperature."""
+"""ArduPilot assumes that a motor has stopped if it receives no status for 210 ms."""
+_STATUS = (8, 8, 3)
+"""Data bytes of the frames of esc.Status."""
+_BEC = (8, 6)
+"""Data bytes of the frames of CircuitStatus and Temperature."""
 _RESOLUTION = (
     "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V, 0.063 V from 64 V; "
     "current 0.031 A from 32 A, 0.063 A from 64 A, 0.125 A from 128 A; temperature 0.25 K"
@@ -48,27 +50,38 @@ class DronecanSetup:
     @property
     def nodes(self) -> tuple[NodeSetup, ...]:
         """The gateway's node, or one for each ESC."""
-        table, numbers = self.given.table, tuple(range(len(self.escs)))
+        table = self.given.table
         first = table.node_id
         if not table.per_esc_nodes:
+            numbers = tuple(range(len(self.escs)))
             return (NodeSetup(first, table.name, self._unique_id(table.name), numbers),)
-        names = [f"{table.name}.{esc.name.lower()}" for esc in self.escs]
-        return tuple(
-            NodeSetup(first and first + n, name, self._unique_id(name), (n,))
-            for n, name in enumerate(names)
-        )
+        found = []
+        for number, esc in enumerate(self.escs):
+            name = f"{table.name}.{esc.name.lower()}"
+            node_id = first + number if first else 0
+            found.append(NodeSetup(node_id, name, self._unique_id(name), (number,)))
+        return tuple(found)
 
     def _unique_id(self, name: str) -> bytes:
-        """The same for this machine and name; others' are others from the first bytes on, for they are asked for by parts."""
-        machine, of_name = self.given.identity, name.encode()
-        checks = crc32(machine + of_name).to_bytes(4, "big") + crc32(of_name).to_bytes(4, "big")
-        return checks + machine[:8].ljust(8, b"\0")
+        """Return the unique id of a node, which is always the same for this machine and name.
+
+        The unique ids of other nodes differ already in the first bytes, because an allocator is
+        asked with a part of the id.
+        """
+        machine = self.given.identity
+        name_bytes = name.encode()
+        both_check = crc32(machine + name_bytes).to_bytes(4, "big")
+        name_check = crc32(name_bytes).to_bytes(4, "big")
+        return both_check + name_check + machine[:8].ljust(8, b"\0")
 
     def make(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> Dronecan:
         return Dronecan(self, escs, gateway)
 
     def taken_ids(self) -> Mapping[int, str]:
-        """Whatever parses as a frame of one of our nodes; of a node-ID that is not known yet, everything."""
+        """Return the ids of all possible frames of our nodes.
+
+        While a node-ID is unknown, these are all ids.
+        """
         if not self.given.table.node_id:
             return {id_block(0, 0): "DroneCAN, whose node-ID an allocator chooses"}
         return {
@@ -87,18 +100,21 @@ class DronecanSetup:
         found = []
         if bitrate != _USUAL_BITRATE:
             found.append(
-                f"dronecan: can.bitrate is {bitrate // 1000} kbit/s; autopilots run DroneCAN at 1000 kbit/s"
+                f"dronecan: can.bitrate is {bitrate // 1000} kbit/s; "
+                "autopilots run DroneCAN at 1000 kbit/s"
             )
         table = self.given.table
         if table.rate_hz < _LOWEST_RATE_HZ:
             found.append(
-                f"dronecan.rate_hz is {table.rate_hz}: below {_LOWEST_RATE_HZ} ArduPilot may take a running motor for "
-                f"stopped. Set it to {_LOWEST_RATE_HZ} or more"
+                f"dronecan.rate_hz is {table.rate_hz}: "
+                f"below {_LOWEST_RATE_HZ} ArduPilot may take a running motor for stopped. "
+                f"Set it to {_LOWEST_RATE_HZ} or more"
             )
         if table.extended_hz:
             found.append(
-                "dronecan.extended_hz: the motor temperature in esc.StatusExtended is not known and sent as -256 degC, which PX4 "
-                "takes for the temperature. Set extended_hz = 0 for PX4"
+                "dronecan.extended_hz: the motor temperature in esc.StatusExtended is not known "
+                "and sent as -256 degC, which PX4 takes for the temperature. "
+                "Set extended_hz = 0 for PX4"
             )
         if not self.given.identity:
             found.append(
@@ -108,41 +124,43 @@ class DronecanSetup:
         plain = [esc.name for esc in self.escs if esc.pole_pairs == 1]
         if plain and table.rpm != "electrical":
             found.append(
-                f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: set pole_pairs in [[esc]], "
-                'or dronecan.rpm = "electrical" if it is one'
+                f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: "
+                'set pole_pairs in [[esc]], or dronecan.rpm = "electrical" if it is one'
             )
         return found
 
     def summary(self) -> list[str]:
         first = self.given.table.first_index
-        return [
-            f"DroneCAN  {f'node {node.node_id}' if node.node_id else 'node-ID by an allocator'}, {node.name}: esc_index "
-            + " to ".join(dict.fromkeys(str(first + n) for n in (node.escs[0], node.escs[-1])))
-            for node in self.nodes
-        ]
+        found = []
+        for node in self.nodes:
+            node_id = f"node {node.node_id}" if node.node_id else "node-ID by an allocator"
+            indices = str(first + node.escs[0])
+            if len(node.escs) > 1:
+                indices += f" to {first + node.escs[-1]}"
+            found.append(f"DroneCAN  {node_id}, {node.name}: esc_index {indices}")
+        return found
 
     def lines(self) -> list[str]:
-        table, escs, found = self.given.table, self.escs, []
+        table = self.given.table
+        escs = self.escs
+        found = []
         for node in self.nodes:
-            who = ", ".join(
+            reported = ", ".join(
                 f"{escs[n].name} is esc_index {table.first_index + n}" for n in node.escs
             )
             node_id = node.node_id or "asks an allocator"
-            found.append(f"node {node_id}, {node.name}, unique id {node.unique_id.hex()}: {who}")
+            unique_id = node.unique_id.hex()
+            found.append(f"node {node_id}, {node.name}, unique id {unique_id}: {reported}")
         sent = f"esc.Status at {table.rate_hz} Hz while telemetry is fresh"
         if table.extended_hz:
             sent += f", esc.StatusExtended at {table.extended_hz} Hz"
-        return [
-            *found,
-            f"{sent}; NodeStatus, CircuitStatus and Temperature of the BEC each second",
-            f"rpm is {SPEEDS[table.rpm]}, at most {MAX_RPM}: what is more is sent as that; "
-            + (
-                "negative while the motor turns backward"
-                if table.negative_rpm
-                else "never negative"
-            ),
-            _RESOLUTION,
-        ]
+        sign = "negative while the motor turns backward" if table.negative_rpm else "never negative"
+        found.append(f"{sent}; NodeStatus, CircuitStatus and Temperature of the BEC each second")
+        found.append(
+            f"rpm is {SPEEDS[table.rpm]}, at most {MAX_RPM}: what is more is sent as that; {sign}"
+        )
+        found.append(_RESOLUTION)
+        return found
 
 
 def configured(given: Given, escs: Sequence[EscSettings]) -> DronecanSetup:
@@ -157,7 +175,8 @@ def configured(given: Given, escs: Sequence[EscSettings]) -> DronecanSetup:
     last = given.table.first_index + len(escs) - 1
     if last > MAX_ESC_INDEX:
         problems.append(
-            f"dronecan.first_index: esc_index of the last ESC would be {last}. There are 0 to {MAX_ESC_INDEX}."
+            f"dronecan.first_index: esc_index of the last ESC would be {last}. "
+            f"There are 0 to {MAX_ESC_INDEX}."
         )
     if problems:
         raise UserError(*problems)

@@ -1,4 +1,7 @@
-"""Turns of the loop in C, while the core is there, too, and nothing but plain reads and frames that are due is to be done."""
+"""Runs turns of the loop in C, if the core is in C, too.
+
+The loop in C only reads ports, and sends due frames. It returns for all other work.
+"""
 
 import contextlib
 import os
@@ -19,12 +22,12 @@ if TYPE_CHECKING:
 
 
 def poller_for(gateway: Gateway) -> Poller:
-    """The one that suits the gateway's core."""
+    """Return the poller for the gateway's core."""
     return NativePoller(gateway) if gateway.core.language == "C" else Poller()
 
 
 class NativePoller(Poller):
-    """A poller that can turn. ``count``: turns in C so far."""
+    """A poller that also runs turns of the loop in C. ``count`` is their number."""
 
     is_native = True
 
@@ -44,7 +47,7 @@ class NativePoller(Poller):
         return cast(PortInput, self._turns.inputs[esc])
 
     def begin(self) -> None:
-        """A signal is followed when C is left: let it wake that, at whatever moment it comes."""
+        """Let each signal wake the loop in C, because signal handlers run only after C returns."""
         if threading.current_thread() is threading.main_thread():
             self._signals = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
             self._woken_before = signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
@@ -67,15 +70,17 @@ class NativePoller(Poller):
     def turn(
         self, can: "CanLink", last: int, due: int, leave: int, period: int
     ) -> list[tuple[Handler, int]] | None:
-        """Turn until something is to be done that is the loop's; the handlers of what is ready then.
+        """Run turns in C until there is work for the loop. Returns the handlers to call then.
 
-        ``last``: the last turn; ``due``: what the loop has to do apart from the gateway; ``leave``: when to come back in any case;
-        ``period``: how long a wait is at most. All in ns. None where it is not the time for that.
+        Returns None if turns in C are not possible now. ``last`` is the time of the last turn,
+        ``due`` of the loop's own next work, and ``leave`` of the latest return. ``period`` is the
+        longest duration of a wait. All are in ns.
         """
         gateway = self._gateway
         if self._core.reports_live or gateway.frames_wait:
             return None
-        if (bus := _plain_socket(can, gateway)) is None or not self._watches():
+        bus = _plain_socket(can, gateway)
+        if bus is None or not self._watches():
             return None
         turns = self._turns
         request, times, result = turns.request, turns.times, turns.result
@@ -148,7 +153,7 @@ class NativePoller(Poller):
 
 
 def _plain_socket(can: "CanLink", gateway: Gateway) -> int | None:
-    """The interface's socket, while frames can be handed to it without further ado."""
+    """Return the interface's socket if C can hand frames to it now, otherwise None."""
     port = can.port
     is_plain = can.is_proven and can.transmitter.is_idle and not can.controller.is_off
     if port is None or port.gone or not is_plain or port.state is not gateway.status.can_state:
